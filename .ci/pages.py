@@ -509,7 +509,7 @@ def comparison() -> str:
     print_comparison(Terminal(file=output, width=120, emoji=False), validation()["elbow_summaries"])
     kept = ("electrical energy", "hand error", "deepest", "ledger", "two_elbows", "───")
     text = [line[1:].rstrip() for line in output.getvalue().split("warning: ")[0].splitlines()]
-    rows = [row for row in text if any(label in row for label in kept)]
+    rows = [row for row in text if any(label in row for label in kept) and "times the minimum" not in row]
     return "```\n" + "\n".join(rows) + "\n```\n"
 
 

@@ -1,4 +1,4 @@
-"""The command line ``dynsim``: one module for each command or group of commands; here its entry point."""
+"""Command line ``dynsim``: one module for each command or group of commands; this file is the entry point."""
 
 import atexit
 import gc
@@ -7,10 +7,10 @@ import sys
 
 
 def main() -> None:
-    """Entry point of ``dynsim``."""
-    # Before numpy is imported: dynsim's matrices are small, and idle threads take a tenth of a run's processor time.
+    """Run ``dynsim``."""
+    # Before numpy is imported: matrices are small, and idle threads would take a tenth of the processor time.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    # Imported objects stay: garbage collection at its default rate, and at the end, takes a third of `dynsim check`.
+    # Imported objects are never freed; default garbage collection, and one at exit, take a third of `dynsim check`.
     gc.set_threshold(200_000)
     atexit.register(gc.freeze)
     from dynsim.system import interruption

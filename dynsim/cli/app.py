@@ -1,4 +1,4 @@
-"""The Typer application, and the options that several commands share."""
+"""The Typer application and the options that several commands share."""
 
 from __future__ import annotations
 
@@ -25,35 +25,44 @@ ScenarioArgument = Annotated[
     str,
     typer.Argument(
         metavar="SCENARIO",
-        help="Scenario file, or the name of a shipped one.",
+        help="Path of a scenario file, or the name of a shipped scenario (see `dynsim list`).",
         autocompletion=completion.scenarios,
     ),
 ]
 SetOption = Annotated[
-    list[str] | None, typer.Option("--set", metavar="a.b.c=VALUE", help="Override a value; may be repeated.")
+    list[str] | None,
+    typer.Option(
+        "--set", metavar="a.b.c=VALUE", help="Override one scenario key, e.g. `integrator.rtol=1e-8`; repeatable."
+    ),
 ]
 VariantOption = Annotated[
     str | None,
-    typer.Option(metavar="VARIANT", help="Variant to run; default: the first.", autocompletion=completion.variants),
+    typer.Option(
+        metavar="VARIANT",
+        help="Variant to use; default: the first in the file.",
+        autocompletion=completion.variants,
+    ),
 ]
-QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
+QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")]
 TrustOption = Annotated[
     bool,
-    typer.Option("--trust", help="Also read records without a right digest: other programs wrote or changed them."),
+    typer.Option(
+        "--trust", help="Accept records whose digest is missing or wrong (written or changed by another program)."
+    ),
 ]
-FiguresOption = Annotated[bool, typer.Option("--no-figures", help="Do not draw figures.")]
+FiguresOption = Annotated[bool, typer.Option("--no-figures", help="Skip the figures and view.html.")]
 
 
 def parsed_overrides(texts: list[str] | None) -> dict[str, Any]:
-    """Values by key of ``--set``."""
+    """Return the values of ``--set`` by key."""
     from dynsim.scenario import SetOptions, parse_override
 
     return SetOptions(parse_override(text) for text in texts or ())
 
 
 def folder_option(default: str) -> Any:
-    """``--out`` of a command that writes several files."""
-    return typer.Option(metavar="FOLDER", help=f"For the files; default: {default}.")
+    """Return the option ``--out`` of a command that writes several files."""
+    return typer.Option(metavar="FOLDER", help=f"Output folder; default: {default}.")
 
 
 class FigureFormat(StrEnum):
@@ -62,7 +71,7 @@ class FigureFormat(StrEnum):
     svg = "svg"
 
 
-FormatOption = Annotated[FigureFormat, typer.Option("--format", help="Files that figures are drawn to.")]
+FormatOption = Annotated[FigureFormat, typer.Option("--format", help="File format of the figures.")]
 
 
 def _print_version(wanted: bool) -> None:
@@ -77,7 +86,7 @@ def _options(
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
     ] = False,
     verbose: Annotated[
-        bool, typer.Option("--verbose", "-v", help="Say on stderr what takes long, and the warnings of runs.")
+        bool, typer.Option("--verbose", "-v", help="Log slow steps and run warnings to stderr.")
     ] = False,
 ) -> None:
     if verbose:
@@ -85,11 +94,11 @@ def _options(
 
 
 def _log_to_stderr() -> None:
-    # Imported here: --help and --version need not wait for it.
+    # Imported here so that --help and --version start faster.
     import logging
 
     class OnStderr(logging.StreamHandler[TextIO]):
-        """Stderr; on a terminal the one of the moment: a progress bar puts what is written there above itself."""
+        """Handler for the current stderr of a terminal: a progress bar replaces stderr to print above itself."""
 
         def __init__(self) -> None:
             super().__init__(sys.stderr)

@@ -23,13 +23,32 @@ from dynsim.cli.app import (
     folder_option,
     parsed_overrides,
 )
-from dynsim.cli.drawing import Figures, Page, animate, draw, draw_all, open_page, saved_before, tell_of_view, view
+from dynsim.cli.drawing import (
+    Figures,
+    Page,
+    animate,
+    draw,
+    draw_all,
+    interruptible_drawing,
+    open_page,
+    print_page,
+    view,
+)
 from dynsim.cli.export import export
 from dynsim.cli.hardware import EXAMPLE, hw, hw_drive
 from dynsim.cli.plan import EXAMPLE as PLAN_EXAMPLE
 from dynsim.cli.plan import plan
 from dynsim.cli.sweep import sweep
-from dynsim.cli.tables import console, errors, labelled, progress, record_files, say, say_written, told_in
+from dynsim.cli.tables import (
+    console,
+    errors,
+    labelled,
+    print_line,
+    print_written,
+    progress,
+    record_files,
+    show_compilation,
+)
 from dynsim.cli.teleop import teleop
 from dynsim.config import completion
 from dynsim.errors import DynsimError, RecordError, SimulationInterrupted, SimulationStopped
@@ -48,12 +67,13 @@ def run(
     out: Annotated[Path | None, folder_option("results/SCENARIO/VARIANT")] = None,
     no_figures: FiguresOption = False,
     format_: FormatOption = FigureFormat.png,
-    view: Annotated[bool, typer.Option("--view", help="Open the page that shows the run in a browser.")] = False,
+    view: Annotated[bool, typer.Option("--view", help="Open the 3D page in a browser when the run is done.")] = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Simulate one scenario and write its record, summary, figures and a page to look at it.
+    """Simulate one scenario; write its record, summary, figures and a 3D page.
 
-    The method of integration follows from the system, integrator.method auto; the summary says which it is and why.
+    The integration method is chosen automatically (`integrator.method: auto`); the summary reports the method and the
+    reason. Exit codes: 0 done, 2 bad input, 3 the run stopped early (results up to then are saved).
     """
     from dynsim.engine.recording import RUN_FILES, save_run
     from dynsim.scenario import load_scenario
@@ -70,12 +90,12 @@ def run(
     except SimulationStopped as stop:
         if stop.record is not None:
             save_run(stop.record, folder)
-            errors.print(f"what was simulated until then is in {escaped(folder)}, marked incomplete")
+            errors.print(f"results up to the stop are in {escaped(folder)}, marked incomplete")
         raise
     save_run(record, folder)
     shown = Page({loaded.variant or loaded.name: record}, folder)
     page = None
-    with saved_before(folder):
+    with interruptible_drawing(folder):
         if not no_figures:
             page = draw_all([Figures({loaded.variant: record}, folder / "figures", format_)], shown, quiet)
         elif view:
@@ -84,8 +104,8 @@ def run(
         from dynsim.cli.tables import print_summary
 
         print_summary(console, record.summary)
-        say_written(folder)
-    tell_of_view(page, quiet)
+        print_written(folder)
+    print_page(page, quiet)
     if view and page is not None:
         open_page(page)
 
@@ -95,12 +115,12 @@ def compare(
     scenario: ScenarioArgument,
     overrides: SetOption = None,
     out: Annotated[Path | None, folder_option("results/SCENARIO")] = None,
-    jobs: Annotated[int, typer.Option(metavar="N", min=1, help="Processes that simulate variants.")] = 1,
+    jobs: Annotated[int, typer.Option(metavar="N", min=1, help="Number of worker processes.")] = 1,
     no_figures: FiguresOption = False,
     format_: FormatOption = FigureFormat.png,
     quiet: QuietOption = False,
 ) -> None:
-    """Simulate all variants of a scenario and compare them in a table and in figures."""
+    """Simulate all variants of a scenario and compare them in a table and figures."""
     from dynsim.engine.recording import COMPARISON_FILES, RUN_FILES, save_run
     from dynsim.scenario import load_scenario, variant_names
     from dynsim.system.files import check_writable, discard
@@ -117,7 +137,7 @@ def compare(
     records: dict[str, Record] = {}
 
     def finished(name: str, record: Record) -> None:
-        # What described the old records goes before the first of them does.
+        # Delete the old comparison before the first of its records is replaced.
         discard(folder, COMPARISON_FILES)
         save_run(record, folder / name)
         records[name] = record
@@ -127,7 +147,7 @@ def compare(
             discard(folder, COMPARISON_FILES)
             save_run(stop.record, folder / name)
             where = escaped(folder / name)
-            errors.print(f"what was simulated of {escaped(name)} until then is in {where}, marked incomplete")
+            errors.print(f"results of {escaped(name)} up to the stop are in {where}, marked incomplete")
 
     failure: SimulationStopped | None = None
     try:
@@ -137,11 +157,11 @@ def compare(
         raise
     except SimulationStopped as stop:
         failure = stop
-    # In the order of the file, whichever was ready first.
+    # In the order of the file, not of completion.
     records = {s.variant: records[s.variant] for s in loaded if s.variant in records}
     if records:
         save_comparison(records, folder)
-        with saved_before(folder):
+        with interruptible_drawing(folder):
             if not no_figures:
                 wanted = [
                     Figures({name: record}, folder / name / "figures", format_) for name, record in records.items()
@@ -152,9 +172,9 @@ def compare(
             from dynsim.cli.tables import print_comparison
 
             print_comparison(console, {name: record.summary for name, record in records.items()})
-            say_written(folder)
+            print_written(folder)
         if not no_figures:
-            tell_of_view(page, quiet)
+            print_page(page, quiet)
     if failure is not None:
         raise failure
 
@@ -165,16 +185,17 @@ def check(
         list[str],
         typer.Argument(
             metavar="SCENARIO",
-            help="Scenario files, or names of shipped ones.",
+            help="Paths of scenario files, or names of shipped scenarios.",
             autocompletion=completion.scenarios,
         ),
     ],
     overrides: SetOption = None,
 ) -> None:
-    """Validate scenarios without running them: schema, model, contacts and forces at the start, reachable references.
+    """Validate scenarios without simulating them: keys, model, contacts at the start, reachable references.
 
-    Prints where hand and contact points start, in full digits, to be copied into a surface or a path, how far contacts
-    are from their surfaces, the joints that initial.on_surface has moved, and the tip margin of a base at rest.
+    Prints for each variant the start position of the hand and of each contact point (full precision, ready to copy into
+    a path or surface), the gap of each contact, the joints that `initial.on_surface` moved, and the tip margin of a
+    mobile base at rest.
     """
     from dynsim.cli.tables import print_starts
     from dynsim.engine import check as check_scenario
@@ -188,33 +209,33 @@ def check(
             variants: Sequence[str | None] = variant_names(name) or [None]
             for variant in variants:
                 task = f"checking {escaped(name)} {escaped(variant or '')}"
-                with console.status(task) as status, watched(partial(told_in, status, task)):
+                with console.status(task) as status, watched(partial(show_compilation, status, task)):
                     loaded = load_scenario(name, variant, parsed_overrides(overrides))
-                    # Known before it is refused, and then all of it.
+                    # Stored early, so that the start is printed even if a later check fails.
                     starts[variant or ""] = check_scenario(loaded, partial(starts.__setitem__, variant or ""))
         except SimulationInterrupted:
             raise
         except DynsimError as error:
             failed = True
-            # Where it starts helps to find out what is wrong.
+            # The start positions help to find the error.
             print_starts(console, starts)
             errors.print(f"[red]error:[/] {escaped(str(error))}")
         else:
             count = f"{len(variants)} variants" if len(variants) > 1 else "1 variant"
-            say(f"{escaped(name)}: ok ({count})")
+            print_line(f"{escaped(name)}: ok ({count})")
             print_starts(console, starts)
-    _warn_of_plugins()
+    _warn_about_plugins()
     if failed:
         raise typer.Exit(2)
 
 
 @app.command("list", epilog="Example: dynsim list")
 def list_() -> None:
-    """Show shipped scenarios, plants, surfaces, controllers, paths and motors."""
+    """List shipped scenarios, plants, surfaces, controllers, paths and motors."""
     from dynsim.cli.tables import print_choices
 
     print_choices(console)
-    _warn_of_plugins()
+    _warn_about_plugins()
 
 
 @app.command(epilog="Example: dynsim plot results/elbow_comparison/two_elbows/record.h5")
@@ -222,12 +243,12 @@ def plot(
     records: Annotated[list[Path], typer.Argument(metavar="RECORD", help="Records (HDF5), or folders of runs.")],
     out: Annotated[
         Path | None,
-        typer.Option(metavar="FOLDER", help="For the figures; default: figures/ beside each record."),
+        typer.Option(metavar="FOLDER", help="Output folder; default: figures/ next to each record."),
     ] = None,
     format_: FormatOption = FigureFormat.png,
     trust: TrustOption = False,
 ) -> None:
-    """Draw the figures of records; two or more are also laid over each other."""
+    """Draw the figures of one record, or overlay several."""
     files = record_files(records)
     named = labelled(files, trust=trust)
     for path, (label, record) in zip(files, named.items(), strict=True):
@@ -248,15 +269,15 @@ app.command(epilog="Example: dynsim animate results/elbow_comparison/two_elbows 
 
 @app.command(epilog="Example: dynsim schema > scenario.schema.json")
 def schema() -> None:
-    """Print the JSON schema of scenario files, for editors."""
+    """Print the JSON schema of scenario files for your editor."""
     from dynsim.scenario import json_schema
 
     print(json.dumps(json_schema(), indent=2))
-    _warn_of_plugins()
+    _warn_about_plugins()
 
 
 app.command(epilog="Example: dynsim sweep elbow_comparison --variants all --grid contacts.friction=0:1:5")(sweep)
-# These load serial ports and servos only when called.
+# Modules for serial ports and servos are loaded only when these commands run.
 hw.command("drive", epilog=EXAMPLE)(hw_drive)
 app.add_typer(hw, name="hw")
 app.command(
@@ -264,8 +285,8 @@ app.command(
 )(export)
 
 
-def _warn_of_plugins() -> None:
-    """Say on stderr which plug-ins do not work; a run says so only of those that it needs."""
+def _warn_about_plugins() -> None:
+    """Print a warning for each plug-in that cannot be loaded; a run warns only about plug-ins that it needs."""
     from dynsim.library.families import faults
 
     for fault in faults():

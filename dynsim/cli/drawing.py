@@ -1,4 +1,4 @@
-"""Drawing of figures and pages after runs, in this process or, for several runs, in one process per core."""
+"""Figures and pages after runs, drawn in this process or in one process per core, and the commands view and animate."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from dynsim.cli.app import QuietOption, TrustOption
-from dynsim.cli.tables import console, drawing, errors, film_progress, labelled, record_files, say, say_written
+from dynsim.cli.tables import console, drawing, errors, film_progress, labelled, print_line, print_written, record_files
 from dynsim.errors import RecordError
 from dynsim.system import interruption
 from dynsim.system.terminal import escaped
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Figures:
-    """Figures of records, each alone or all in the same axes (``together``), as files of a kind in a folder."""
+    """Task to draw figures of records to a folder: one set per record, or overlays of all records (``together``)."""
 
     records: dict[str, Record]
     folder: Path
@@ -34,7 +34,7 @@ class Figures:
     together: bool = False
 
     def draw(self) -> None:
-        """See :func:`dynsim.draw.figures.draw`."""
+        """Draw the figures, see :func:`dynsim.draw.figures.draw`."""
         from dynsim.draw import figures
 
         if self.together:
@@ -46,13 +46,13 @@ class Figures:
 
 @dataclass(frozen=True)
 class Page:
-    """The page that shows records in 3D."""
+    """Task to write the page that shows records in 3D."""
 
     records: dict[str, Record]
     folder: Path
 
     def draw(self) -> Path | None:
-        """Write it; None where the records have nothing to be seen."""
+        """Write the page and return its path, or None if no record can be shown."""
         from dynsim.draw.page import viewable, write
         from dynsim.engine.recording import VIEW
 
@@ -61,32 +61,32 @@ class Page:
 
 
 @contextmanager
-def saved_before(folder: Path) -> Iterator[None]:
-    """Within, signals are handled again, and one is answered with where the results are."""
+def interruptible_drawing(folder: Path) -> Iterator[None]:
+    """Handle signals again in the block; on a signal, print where the results are."""
     interruption.heed()
     try:
         interruption.check()
         yield
     except KeyboardInterrupt:
-        errors.print(f"interrupted; all results are in {escaped(folder)}, not all figures and pages")
+        errors.print(f"interrupted; all results are in {escaped(folder)}, but some figures or pages are missing")
         raise
 
 
 def draw(figures: Figures, quiet: bool) -> None:
-    """Draw here, and say so."""
+    """Draw figures in this process and show a status."""
     with drawing(figures.folder, quiet):
         figures.draw()
 
 
 def draw_all(wanted: Sequence[Figures], page: Page, quiet: bool) -> Path | None:
-    """Draw, and write a page, in several processes if there are several cores; returns the file of the page.
+    """Draw figures and write a page, using one process per core; return the path of the page, if any.
 
     Raises
     ------
     RecordError
-        See :func:`dynsim.draw.figures.draw`; or a process was ended from outside.
+        See :func:`dynsim.draw.figures.draw`; also if a worker process was killed from outside.
     KeyboardInterrupt
-        After Ctrl-C, which costs what was not drawn yet.
+        After Ctrl-C; figures that were not finished are missing.
     """
     from dynsim.studies.processes import WorkerInterrupted, WorkerLost, cores, run_in_processes
 
@@ -98,11 +98,11 @@ def draw_all(wanted: Sequence[Figures], page: Page, quiet: bool) -> Path | None:
         except WorkerInterrupted:
             return
         except WorkerLost as lost:
-            raise RecordError(f"{task.folder}: could not be drawn: {lost}") from lost
+            raise RecordError(f"{task.folder}: drawing failed: {lost}") from lost
         if isinstance(task, Page):
             pages.append(done)
 
-    # The longest first, the shortest last.
+    # Longest tasks first.
     tasks: list[Figures | Page] = [*wanted, page]
     workers = min(cores(), len(tasks))
     with drawing(page.folder, quiet):
@@ -116,31 +116,31 @@ def draw_all(wanted: Sequence[Figures], page: Page, quiet: bool) -> Path | None:
 
 
 def _draw(task: Figures | Page, _: Any) -> Path | None:
-    """In a worker."""
+    """Draw in a worker process."""
     return task.draw()
 
 
-# Command ``dynsim view``, and the pages that ``run`` and ``compare`` write.
+# Command ``dynsim view``, and the pages written by ``run`` and ``compare``.
 
 
 def view(
     records: Annotated[
-        list[Path], typer.Argument(metavar="RECORD", help="Records (HDF5), measured ones too, or folders of runs.")
+        list[Path], typer.Argument(metavar="RECORD", help="Records (HDF5), simulated or measured, or folders of runs.")
     ],
     ghost: Annotated[
-        bool, typer.Option("--ghost", help="Lay several over each other, the first one solid; default: side by side.")
+        bool, typer.Option("--ghost", help="Overlay the records, the first one solid; default: side by side.")
     ] = False,
     open_: Annotated[bool, typer.Option("--open/--no-open", help="Open the page in a browser.")] = True,
     out: Annotated[
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="For the page; default: view.html beside the record or in the folder, here for several.",
+            help="Output file; default: view.html next to the record, or in the working directory for several.",
         ),
     ] = None,
     trust: TrustOption = False,
 ) -> None:
-    """Write a page that shows records in 3D, with plots and forces over time, for any browser and without a network."""
+    """Write a self-contained 3D page of records; opens in any browser, offline."""
     from dynsim.draw.page import write
     from dynsim.engine.recording import VIEW
 
@@ -149,40 +149,40 @@ def view(
     page = out or (first if len(records) == 1 else Path()) / VIEW
     with console.status(f"writing {escaped(page)}"):
         write(named, page, ghost=ghost)
-    say_written(page)
+    print_written(page)
     if open_:
         open_page(page)
 
 
 def write_view(records: Mapping[str, Record], folder: Path, quiet: bool) -> Path | None:
-    """The page of records in a folder, and say where; None where they have nothing to be seen."""
+    """Write the page of records to a folder and print its path; return None if no record can be shown."""
     page = Page(dict(records), folder).draw()
-    tell_of_view(page, quiet)
+    print_page(page, quiet)
     return page
 
 
-def tell_of_view(page: Path | None, quiet: bool) -> None:
-    """Say where a page is that was written."""
+def print_page(page: Path | None, quiet: bool) -> None:
+    """Print the path of a page, if there is one."""
     if page is not None and not quiet:
-        say(f"To be seen in a browser: {escaped(page)}")
+        print_line(f"3D page (open in a browser): {escaped(page)}")
 
 
 def open_page(page: Path) -> None:
-    """Open a page in the user's browser, or say that there is no display to open one on."""
+    """Open a page in the default browser, or print that there is no display."""
     open_address(page.absolute().as_uri(), escaped(page))
 
 
 def open_address(address: str, name: str = "") -> None:
-    """Open an address in the user's browser, or say that there is no display to open one on."""
+    """Open an address in the default browser, or print that there is no display."""
     import webbrowser
 
-    # Without a display some systems start a browser within the terminal.
+    # Without a display some systems start a browser inside the terminal.
     display = sys.platform in ("win32", "darwin") or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER")))
     if not display or not webbrowser.open(address):
-        say(f"No browser opened; open {name or address} in one")
+        print_line(f"No browser was opened; open {name or address} in a browser")
 
 
-# Command ``dynsim animate``: writes a film of one or several records.
+# Command ``dynsim animate``.
 
 
 class ViewName(StrEnum):
@@ -194,26 +194,24 @@ class ViewName(StrEnum):
 def animate(
     records: Annotated[
         list[Path],
-        typer.Argument(
-            metavar="RECORD", help="Records (HDF5) or folders of runs; several are shown beside each other."
-        ),
+        typer.Argument(metavar="RECORD", help="Records (HDF5) or folders of runs; several are shown side by side."),
     ],
-    out: Annotated[Path, typer.Option(metavar="FILE", help="The film: FILE.mp4 or FILE.gif.")],
-    view: Annotated[ViewName, typer.Option(help="From where it is seen.")] = ViewName.iso,
+    out: Annotated[Path, typer.Option(metavar="FILE", help="Output file, FILE.mp4 or FILE.gif.")],
+    view: Annotated[ViewName, typer.Option(help="View direction.")] = ViewName.iso,
     speed: Annotated[
-        float, typer.Option(metavar="X", help="1: as fast as the motion was; 0.1: ten times slower.")
+        float, typer.Option(metavar="X", help="Playback speed; 1 is real time, 0.1 is ten times slower.")
     ] = 1.0,
     size: Annotated[str, typer.Option(metavar="WxH", help="Width and height [pixel].")] = "960x540",
-    fps: Annotated[int, typer.Option(metavar="N", help="Frames a second.")] = 25,
-    hold: Annotated[float, typer.Option(metavar="S", help="How long the last frame stays [s].")] = 1.0,
+    fps: Annotated[int, typer.Option(metavar="N", help="Frame rate [1/s].")] = 25,
+    hold: Annotated[float, typer.Option(metavar="S", help="Duration of the last frame [s].")] = 1.0,
     plot: Annotated[
         str | None,
-        typer.Option(metavar="SIGNAL", help="Signal to plot below; default: one that suits, none: no plot."),
+        typer.Option(metavar="SIGNAL", help="Signal to plot below the scene, or none; default: chosen automatically."),
     ] = None,
     quiet: QuietOption = False,
     trust: TrustOption = False,
 ) -> None:
-    """Write a film of records, without display or browser: bodies, forces, time, and a plot with a cursor."""
+    """Write a GIF or MP4 film of records; needs no display."""
     from dynsim.draw.film import write
     from dynsim.draw.film.film import check
 
@@ -233,11 +231,11 @@ def animate(
             progress=report,
         )
     if not quiet:
-        say_written(out)
+        print_written(out)
 
 
 def _size(text: str) -> tuple[int, int]:
     match = re.fullmatch(r"([0-9]{1,5})[x×]([0-9]{1,5})", text)
     if match is None:
-        raise RecordError(f"--size is WIDTHxHEIGHT, such as 960x540, not {text!r}")
+        raise RecordError(f"--size {text!r}: must be WIDTHxHEIGHT, such as 960x540")
     return int(match[1]), int(match[2])

@@ -21,9 +21,10 @@ from dynsim.system.terminal import escaped, lenient_streams
 
 
 def main(received: Sequence[int]) -> None:
-    """Errors become one line and an exit code. On Ctrl-C where nothing can be saved typer exits with 130.
+    """Run the command line and exit; errors become one line and an exit code.
 
-    ``received`` : what :func:`dynsim.system.interruption.handled` gives, within which this runs
+    ``received`` is the list of signals from :func:`dynsim.system.interruption.handled`, whose block encloses this call.
+    Without results to save, Ctrl-C ends with exit code 130.
     """
     with lenient_streams() as output, _plain_warnings():
         code = _exit_code()
@@ -33,7 +34,7 @@ def main(received: Sequence[int]) -> None:
                 code = _explain_lost_output(output.failure)
     code = interruption.exit_code(received) if code == SimulationInterrupted.exit_code else code
     if interruption.is_left():
-        # At its end the interpreter would free data that a thread in compiled code still uses.
+        # At exit the interpreter would free data that a thread in compiled code still uses.
         with suppress(OSError, ValueError):
             sys.stderr.flush()
         os._exit(code)
@@ -41,7 +42,7 @@ def main(received: Sequence[int]) -> None:
 
 
 def _exit_code() -> int:
-    """Run the command that the arguments name; print its error, if any."""
+    """Run the command in the arguments, print its error, if any, and return the exit code."""
     try:
         _command()(prog_name="dynsim")
     except SystemExit as finished:
@@ -51,7 +52,7 @@ def _exit_code() -> int:
     except MemoryError as error:
         problem, code = f"not enough memory: {error}".removesuffix(": "), DynsimError.exit_code
     except OSError as error:
-        # What nobody could name better: of the system, not of dynsim.
+        # An error of the operating system that no caller could explain better.
         problem, code = _explain_system(error), DynsimError.exit_code
     except KeyboardInterrupt:
         return SimulationInterrupted.exit_code
@@ -62,7 +63,7 @@ def _exit_code() -> int:
 
 
 def _command() -> Any:
-    """The command of ``app``; its flags do not show a type, which they do not take."""
+    """Return the command of ``app``, without a metavar for flags, which take no value."""
     command = typer.main.get_command(app)
     waiting = [command]
     while waiting:
@@ -79,21 +80,21 @@ def _explain_system(error: OSError) -> str:
         try:
             os.getcwd()
         except OSError:
-            return "the working directory is no longer there; change to another folder"
+            return "the working directory no longer exists; change to another folder"
     return f"{error.filename}: {error.strerror}" if error.filename is not None else str(error.strerror or error)
 
 
 def _explain_lost_output(failure: OSError) -> int:
-    """Exit code when not all could be printed; a reader that wants no more (``| head``) is no error to speak of."""
+    """Return the exit code after a failed write to stdout; a closed pipe (``| head``) is not reported as an error."""
     if failure.errno == errno.EPIPE:
         return interruption.exit_code([signal.SIGPIPE]) if hasattr(signal, "SIGPIPE") else 1
-    errors.print(f"[red]error:[/] standard output cannot be written ({failure.strerror})")
+    errors.print(f"[red]error:[/] cannot write to standard output ({failure.strerror})")
     return DynsimError.exit_code
 
 
 @contextmanager
 def _plain_warnings() -> Iterator[None]:
-    """Warnings about what the user gave, or keeps on disk, are a line on stderr without the place in dynsim's code."""
+    """Print warnings about input or files as one line on stderr, without their location in the code."""
     shown = warnings.showwarning
 
     def show(message: Warning | str, category: type[Warning], *location: Any, **options: Any) -> None:

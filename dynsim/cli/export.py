@@ -23,39 +23,48 @@ class ExportFormat(StrEnum):
     mjcf = "mjcf"
 
 
-OF_ROBOTS = {ExportFormat.urdf: ".urdf", ExportFormat.mjcf: ".mjcf.xml"}
+ROBOT_SUFFIXES = {ExportFormat.urdf: ".urdf", ExportFormat.mjcf: ".mjcf.xml"}
 EXAMPLE = "Example: dynsim export elbow_comparison --format mjcf"
 
 
 def export(
-    source: Annotated[str, typer.Argument(metavar="SOURCE", help="record.h5 of a run; for urdf and mjcf a scenario.")],
+    source: Annotated[
+        str, typer.Argument(metavar="SOURCE", help="Record of a run (record.h5); for urdf and mjcf, a scenario.")
+    ],
     format_: Annotated[
         ExportFormat,
         typer.Option(
             "--format",
-            help="Of a record: csv, joint-trajectory (ROS), urdf-log (JSON lines), mcap (ROS 2 messages). "
-            "Of a scenario's robot: urdf, mjcf (MuJoCo).",
+            help="Record: csv, joint-trajectory (ROS), urdf-log (JSON lines), mcap (ROS 2 messages). "
+            "Robot of a scenario: urdf, mjcf (MuJoCo).",
         ),
     ],
     rate: Annotated[
-        float | None, typer.Option("--rate", help="Resample joint motion [Hz]; default: the record's samples.")
+        float | None,
+        typer.Option("--rate", help="Resample the joint motion to this rate [Hz]; default: the samples of the record."),
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option("--out", help="File; default: beside the record, or NAME.urdf, NAME.mjcf.xml of a scenario."),
+        typer.Option(
+            "--out", help="Output file; default: next to the record, or NAME.urdf or NAME.mjcf.xml for a scenario."
+        ),
     ] = None,
     variant: VariantOption = None,
     overrides: SetOption = None,
     trust: TrustOption = False,
 ) -> None:
-    """Write the motion of a record, or the robot of a scenario, for other programs."""
-    if format_ in OF_ROBOTS:
+    """Export a record (CSV, ROS, ROS 2) or a robot (URDF, MuJoCo)."""
+    if format_ in ROBOT_SUFFIXES:
         if rate is not None or trust:
-            raise ScenarioError(f"--rate and --trust are for records; {format_.value} is of a scenario's robot")
+            raise ScenarioError(
+                f"--rate and --trust require a record; --format {format_.value} exports the robot of a scenario"
+            )
         target = _export_robot(source, format_, variant, parsed_overrides(overrides), out)
     else:
         if variant is not None or overrides:
-            raise RecordError(f"--variant and --set are for urdf and mjcf; {format_.value} is of a record")
+            raise RecordError(
+                f"--variant and --set require --format urdf or mjcf; --format {format_.value} exports a record"
+            )
         target = _export_record(Path(source), format_, rate, out, trust)
     console.print(f"written: {escaped(target)}")
 
@@ -67,10 +76,10 @@ def _export_robot(
     from dynsim.system.files import write_text
 
     if Path(source).suffix == ".h5":
-        raise ScenarioError(f"{source}: is a record; {format_.value} is of a scenario: name its file, or a shipped one")
+        raise ScenarioError(f"{source} is a record; --format {format_.value} needs a scenario (file or shipped name)")
     scenario = load_scenario(source, variant, overrides)
     model = build_model(scenario)
-    target = out or Path(f"{scenario.name}{OF_ROBOTS[format_]}")
+    target = out or Path(f"{scenario.name}{ROBOT_SUFFIXES[format_]}")
     if format_ is ExportFormat.urdf:
         write_text(target, model.to_urdf())
     else:
@@ -89,5 +98,7 @@ def _export_record(path: Path, format_: ExportFormat, rate: float | None, out: P
     from dynsim.record.mcap_file import write_mcap
 
     if rate is not None:
-        raise RecordError("--rate is for joint motion; an mcap file has the samples of the record: set record.rate_hz")
+        raise RecordError(
+            "--rate does not apply to mcap files, which contain the samples of the record; set record.rate_hz"
+        )
     return write_mcap(record, out or path.with_suffix(".mcap"))

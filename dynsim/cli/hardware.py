@@ -1,4 +1,4 @@
-"""Commands ``dynsim hw …``: replay, checks and service of real and virtual servos."""
+"""Commands ``dynsim hw …``: replay, checks and maintenance of real and virtual servos, and driving with servos."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ from dynsim.cli.teleop import (
     UntilClosedOption,
     VariantOption,
     new_folder,
+    print_address,
+    print_drive,
     require_websockets,
-    tell_address,
-    tell_drive,
 )
 from dynsim.errors import DynsimError
 from dynsim.hardware.bus.protocol import Bus, Clock
@@ -46,9 +46,9 @@ from dynsim.system.terminal import Terminal, escaped, plain
 
 hw = typer.Typer(
     no_args_is_help=True,
-    help="Replay a record on Dynamixel servos (or virtual ones). A software stop is no safety device: fit a power cut.",
+    help="Replay a record on Dynamixel servos, real or virtual. Not a safety device: fit a power cut.",
 )
-# Long lines are left to the terminal, so that paths can be copied. Without markup: "[rad]" is a unit, not a style.
+# The terminal wraps long lines, so that paths can be copied. No markup: "[rad]" is a unit, not a style.
 console = Terminal(soft_wrap=True, highlight=False, markup=False, emoji=False)
 
 
@@ -58,18 +58,21 @@ class Policy(StrEnum):
     off = "off"
 
 
-RecordFile = Annotated[Path, typer.Argument(metavar="RECORD", help="record.h5 of a run.")]
-MapFile = Annotated[Path, typer.Option("--map", help="Servo map: a file, or the name of a shipped one (arm, snake).")]
+RecordFile = Annotated[Path, typer.Argument(metavar="RECORD", help="Record of a run (record.h5).")]
+MapFile = Annotated[Path, typer.Option("--map", help="Servo map: a file, or a shipped map (arm, snake).")]
 Port = Annotated[str, typer.Option("--port", help="Serial device, e.g. /dev/ttyUSB0.")]
-Rate = Annotated[float | None, typer.Option("--rate", help="Goals per second [Hz]; default: the map's.")]
-Speed = Annotated[float, typer.Option("--speed", help="1 is the record's own time, 0.5 half as fast.")]
-ReplayPort = Annotated[str, typer.Option("--port", help="Serial device, or 'virtual' for servos in memory.")]
-PolicyOption = Annotated[Policy | None, typer.Option("--policy", help="On a fault; default: the map's.")]
-Live = Annotated[bool, typer.Option("--live", help="Really move; a real port is a dry run without.")]
-Yes = Annotated[
-    bool, typer.Option("--yes", help="Do not ask before moving; a start beyond safety.start_distance is still asked.")
+Rate = Annotated[float | None, typer.Option("--rate", help="Command rate [Hz]; default: the rate in the map.")]
+Speed = Annotated[float, typer.Option("--speed", help="Playback speed; 0.5 is half speed.")]
+ReplayPort = Annotated[str, typer.Option("--port", help="Serial device, or `virtual` for simulated servos.")]
+PolicyOption = Annotated[
+    Policy | None, typer.Option("--policy", help="Reaction to a fault; default: the policy in the map.")
 ]
-Configure = Annotated[bool, typer.Option("--configure", help="Write differing EEPROM settings.")]
+Live = Annotated[bool, typer.Option("--live", help="Move the robot. Without it a real port gets a dry run.")]
+Yes = Annotated[
+    bool,
+    typer.Option("--yes", help="Skip the confirmation (except when the start is farther than safety.start_distance)."),
+]
+Configure = Annotated[bool, typer.Option("--configure", help="Write EEPROM settings that differ from the map.")]
 Faults = Annotated[Path | None, typer.Option("--faults", help="Fault script for virtual servos.")]
 
 
@@ -78,7 +81,7 @@ class MissingClientLibrary(DynsimError):
 
 
 def require_client_library() -> None:
-    """Raises MissingClientLibrary where the packages for servos are not installed."""
+    """Raise MissingClientLibrary if the packages for servos are not installed."""
     try:
         import dynamixel_sdk  # noqa: F401
         import serial  # noqa: F401
@@ -89,10 +92,10 @@ def require_client_library() -> None:
 @hw.command(epilog="Example: dynsim hw scan --port /dev/ttyUSB0 --map arm")
 def scan(
     port: Port,
-    map_file: Annotated[Path | None, typer.Option("--map", help="Compare with this servo map.")] = None,
-    baud: Annotated[int | None, typer.Option("--baud", help="Only this bit rate [bit/s].")] = None,
+    map_file: Annotated[Path | None, typer.Option("--map", help="Compare the servos with this servo map.")] = None,
+    baud: Annotated[int | None, typer.Option("--baud", help="Scan only this bit rate [bit/s].")] = None,
 ) -> None:
-    """List the servos that answer, at every usual bit rate. Reads only."""
+    """List responding servos at all common bit rates (read-only)."""
     require_client_library()
     from dynsim.hardware.bus import scan as survey
     from dynsim.hardware.bus.control_table import RETURN_DELAY_SECONDS_PER_UNIT, VOLT_PER_UNIT
@@ -104,8 +107,8 @@ def scan(
     answers = survey.scan(port, bauds)
     if not answers:
         raise VerificationFailed(
-            f"{port}: no servo answered at {', '.join(f'{b}' for b in bauds)} bit/s. Is the power on, the cable right? "
-            "MX servos with Protocol 1 firmware do not answer: update them to 2.0"
+            f"{port}: no servo answered at {', '.join(f'{b}' for b in bauds)} bit/s; check power and cable. "
+            "MX servos with Protocol 1 firmware do not answer: update them to Protocol 2.0"
         )
     owners = {servo.id: servo for servo in servo_map.servos} if servo_map else {}
     table = Table("ID", "model", "fw", "bit/s", "mode", "delay µs", "V", "°C", "torque", "error", "joint")
@@ -132,7 +135,7 @@ def _compare_with_map(answers: list[Any], servo_map: Any) -> None:
     wrong = [f"{servo} did not answer" for servo in servo_map.servos if servo.id not in seen]
     wrong += [f"ID {id_} is not in the map" for id_ in seen if id_ not in servo_map.ids]
     wrong += [
-        f"{servo} is {seen[servo.id].model_name}, the map says {servo.model.name}"
+        f"{servo} is {seen[servo.id].model_name}, but {servo.model.name} in the map"
         for servo in servo_map.servos
         if servo.id in seen and seen[servo.id].model != servo.model.number
     ]
@@ -145,7 +148,7 @@ def _compare_with_map(answers: list[Any], servo_map: Any) -> None:
 def check(
     record: RecordFile, map_file: MapFile, rate: Rate = None, speed: Speed = 1.0, trust: TrustOption = False
 ) -> None:
-    """Check a whole record against a robot's limits; needs no port."""
+    """Check a record against the limits of a servo map (offline)."""
     _, servo_map, motion = _checked(record, map_file, rate, speed, trust)
     _print_check(motion, servo_map)
 
@@ -170,7 +173,7 @@ def _print_check(motion: Any, servo_map: Any) -> None:
     plan = motion.plan
     console.print(
         f"check passed: {motion.duration:.2f} s at {plan.rate:g} Hz, "
-        f"{plan.cycle_time * 1e3:.2f} of {1e3 / plan.rate:.2f} ms a cycle on the bus"
+        f"{plan.cycle_time * 1e3:.2f} of {1e3 / plan.rate:.2f} ms per cycle on the bus"
     )
     if tightest := motion.tightest(servo_map):
         margin, part = tightest
@@ -185,17 +188,19 @@ def replay(
     rate: Rate = None,
     speed: Speed = 1.0,
     policy: PolicyOption = None,
-    out: Annotated[Path | None, typer.Option("--out", help="Folder; default: results/ROBOT_replay.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="Output folder; default: results/ROBOT_replay.")] = None,
     live: Live = False,
     yes: Yes = False,
     configure: Configure = False,
     faults: Faults = None,
-    plant: Annotated[str | None, typer.Option("--plant", help="Scenario whose robot the virtual servos move.")] = None,
+    plant: Annotated[
+        str | None, typer.Option("--plant", help="Scenario that provides the load for the virtual servos.")
+    ] = None,
     variant: Annotated[str | None, typer.Option("--variant", help="Variant of that scenario.")] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Do not show a progress bar.")] = False,
     trust: TrustOption = False,
 ) -> None:
-    """Check, verify, arm, move to the start, replay, and keep the measured run.
+    """Check the record, verify and arm the servos, move to the start, replay, and save the measurements.
 
     Ctrl-C once: controlled stop. Twice: torque off.
     """
@@ -207,7 +212,7 @@ def replay(
     from dynsim.hardware.virtual.faults import load_fault_script
 
     if (faults or plant) and port != VIRTUAL:
-        raise ServoMapError("--faults and --plant are for virtual servos: --port virtual")
+        raise ServoMapError("--faults and --plant require virtual servos; use --port virtual")
     simulated, servo_map, motion = _checked(record, map_file, rate, speed, trust)
     script = load_fault_script(faults, servo_map.ids) if faults else None
     robot = _plant(plant, variant, servo_map, motion) if plant else None
@@ -232,9 +237,9 @@ def replay(
         )
         print_timing(result)
         if moves:
-            tell_replay(result, "replayed", folder, record)
+            print_replay(result, "replayed", folder, record)
         else:
-            tell_dry_run(result)
+            print_dry_run(result)
 
 
 def replayed(
@@ -248,7 +253,7 @@ def replayed(
     policy: Policy | None,
     **options: Any,
 ) -> Any:
-    """Run a replay that signals stop, with a progress bar unless ``quiet``; why that failed joins ``lost``."""
+    """Run a replay that signals can stop, with a progress bar unless ``quiet``; add display errors to ``lost``."""
     from dynsim.hardware.replay.output import StopRequest, displayed, stop_on_signals
     from dynsim.hardware.replay.session import run_replay
 
@@ -258,16 +263,16 @@ def replayed(
         return run_replay(motion, servo_map, connection, folder, observer=observer, **options)
 
 
-def tell_dry_run(result: Any) -> None:
-    """What a replay found that moved nothing."""
+def print_dry_run(result: Any) -> None:
+    """Print the result of a replay without motion."""
     from dynsim.cli.hardware import print_limits
 
     print_limits(console, result.limits)
-    console.print("dry run: servos verified and the bus timed, nothing was moved; --live moves")
+    console.print("dry run: servos verified and bus timed, nothing was moved; use --live to move")
 
 
-def tell_replay(result: Any, done: str, folder: Path, record: Path) -> None:
-    """How a motion was left that went well, and how to go on."""
+def print_replay(result: Any, done: str, folder: Path, record: Path) -> None:
+    """Print the state after a successful motion, and the next command."""
     left = "ON, holding" if result.end_state == "holding" else "off"
     console.print(f"{done}; torque {left}; {folder / 'measured.h5'}")
     console.print(f"compare: dynsim hw compare {record} {folder / 'measured.h5'}")
@@ -281,25 +286,25 @@ def _plant(scenario: str, variant: str | None, servo_map: Any, motion: Any) -> A
 
 
 def print_timing(result: Any) -> None:
-    """How well the loop kept its deadlines, in a line."""
+    """Print the timing of the control loop in one line."""
     timing = result.timing
     if timing is None:
         return
     console.print(
-        f"{timing.cycles} cycles, period {timing.period_mean * 1e3:.3f} ms (longest {timing.period_max * 1e3:.3f}), "
-        f"lateness 99 % {timing.lateness_p99 * 1e3:.3f} ms, bus {timing.exchange_mean * 1e3:.2f} ms a cycle, "
-        f"{timing.skipped_cycles} skipped, {timing.missed_statuses} statuses missed"
+        f"{timing.cycles} cycles, period {timing.period_mean * 1e3:.3f} ms (max {timing.period_max * 1e3:.3f}), "
+        f"lateness 99 % {timing.lateness_p99 * 1e3:.3f} ms, bus {timing.exchange_mean * 1e3:.2f} ms per cycle, "
+        f"{timing.skipped_cycles} cycles skipped, {timing.missed_statuses} status packets missed"
     )
 
 
 @hw.command(epilog="Example: dynsim hw recover results/arm_replay")
 def recover(
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Of a replay whose process died.")],
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of a replay that crashed.")],
     out: Annotated[
-        Path | None, typer.Option("--out", help="For record and summary, FOLDER stays as it is; default: FOLDER.")
+        Path | None, typer.Option("--out", help="Output folder for record and summary; default: FOLDER.")
     ] = None,
 ) -> None:
-    """Make a measured record, marked incomplete, of the cycles that a replay had written when it died."""
+    """Build a record (marked incomplete) from the log of a replay that crashed."""
     from dynsim.hardware.replay import measured
     from dynsim.hardware.replay.output import MEASURED
 
@@ -315,21 +320,27 @@ def recover(
 def compare(
     record: RecordFile,
     measured: Annotated[Path, typer.Argument(metavar="MEASURED", help="measured.h5 of a replay.")],
-    gate: Annotated[Path | None, typer.Option("--gate", help="YAML with bounds; exit code 5 beyond them.")] = None,
-    out: Annotated[Path | None, typer.Option("--out", help="Folder; default: that of MEASURED.")] = None,
+    gate: Annotated[
+        Path | None, typer.Option("--gate", help="YAML file with error bounds; exit code 5 if one is exceeded.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="Output folder; default: the folder of MEASURED.")] = None,
     joints: Annotated[
-        list[str] | None, typer.Option("--joint", help="In colour in the figure; may be repeated; default: the worst.")
+        list[str] | None,
+        typer.Option(
+            "--joint",
+            help="Joint to highlight in the figure; repeatable; default: the one with the largest error.",
+        ),
     ] = None,
     trust: TrustOption = False,
 ) -> None:
-    """Delay, rms and largest error between a simulated and a measured run, joints and wheels, with a figure."""
+    """Compare a simulated and a measured run: delay, rms and maximum error per joint and wheel."""
     from dynsim.hardware.replay.compare import check_gate, compare_records, draw_comparison, load_gate
     from dynsim.record import Record
 
     bounds = load_gate(gate) if gate else None
     comparison = compare_records(Record.load(record, trust=trust), Record.load(measured, trust=trust))
     folder = out or measured.parent
-    # First, because it refuses joints that are not there.
+    # First, because it raises an error for unknown joints.
     figure = draw_comparison(comparison, folder / "comparison.png", joints or ())
     table = Table("joint", "rms [rad]", "max [rad]", "at [s]", "rms, common delay removed [rad]", "own delay [ms]")
     common = not math.isnan(comparison.delay)
@@ -347,7 +358,7 @@ def compare(
             angles = [f"{wheel.turned:.3f}", f"{wheel.angle_max:.4f}", f"{wheel.angle_end:+.4f}"]
             wheels.add_row(wheel.wheel, *rates, *angles)
         console.print(wheels)
-    why = "" if common else " (none explains half of the mean square error of all joints)"
+    why = "" if common else " (no delay explains half of the mean square error of all joints)"
     console.print(f"{comparison.delay_text}{why}, worst joint {comparison.worst.joint}")
     write_json(folder / "comparison.json", comparison.summary())
     console.print(f"figure: {figure}")
@@ -359,11 +370,13 @@ def compare(
 def virtual(
     map_file: MapFile,
     faults: Annotated[Path | None, typer.Option("--faults", help="Fault script.")] = None,
-    link: Annotated[Path | None, typer.Option("--link", help="Name the device by this symbolic link.")] = None,
-    plant: Annotated[str | None, typer.Option("--plant", help="Scenario whose robot the servos move.")] = None,
+    link: Annotated[Path | None, typer.Option("--link", help="Create this symbolic link to the device.")] = None,
+    plant: Annotated[
+        str | None, typer.Option("--plant", help="Scenario that provides the load for the servos.")
+    ] = None,
     variant: Annotated[str | None, typer.Option("--variant", help="Variant of that scenario.")] = None,
 ) -> None:
-    """Virtual servos behind a pseudo-terminal, for any Dynamixel tool. Ctrl-C ends it."""
+    """Run virtual servos on a pseudo-terminal for any Dynamixel tool; stop with Ctrl-C."""
     require_client_library()
     from dynsim.hardware.replay.output import StopRequest, stop_on_signals
     from dynsim.hardware.servo_map import load_servo_map
@@ -376,7 +389,7 @@ def virtual(
     robot = simulated_arm(plant, variant, servo_map, {}) if plant else None
     terminal = PseudoTerminal(line_for_map(servo_map, script=script, plant=robot), link)
     stop = StopRequest()
-    # A plain line: other programs wait for it.
+    # A plain line, because other programs wait for it.
     print(
         f"{len(servo_map.servos)} virtual servos at {servo_map.bus.baud} bit/s on {plain(link or terminal.device)}",
         flush=True,
@@ -391,10 +404,15 @@ def virtual(
 @hw.command("stop", epilog="Example: dynsim hw stop --port /dev/ttyUSB0")
 def stop_servos(
     port: Port,
-    map_file: Annotated[Path | None, typer.Option("--map", help="Ask the servos of this map.")] = None,
+    map_file: Annotated[
+        Path | None, typer.Option("--map", help="Use bit rate and servo IDs of this servo map.")
+    ] = None,
     baud: Annotated[int | None, typer.Option("--baud", help="Only this bit rate [bit/s].")] = None,
 ) -> None:
-    """Torque off for every servo at every usual bit rate, beside a replay too; no substitute for a power cut."""
+    """Switch torque off on all servos at all common bit rates, even during a replay.
+
+    Not a substitute for a power cut.
+    """
     require_client_library()
     from dynsim.hardware.bus import scan as survey
     from dynsim.hardware.errors import VerificationFailed
@@ -404,17 +422,17 @@ def stop_servos(
     bauds = (baud,) if baud else (servo_map.bus.baud,) if servo_map else survey.STOP_BAUD_RATES
     asked = survey.stop_all(port, bauds, servo_map.ids if servo_map else ())
     on = [id_ for id_, still_on in asked.torque.items() if still_on]
-    # With a map everybody is known; without one those at a bit rate at which the port failed are not.
+    # Without a map, servos at a bit rate at which the port failed are unknown.
     if on or not asked.torque or (asked.trouble and not servo_map):
-        who = f"ID {', '.join(map(str, on))}" if on else "everybody" if asked.torque else "any servo"
+        who = f"ID {', '.join(map(str, on))}" if on else "all servos" if asked.torque else "any servo"
         why = f" ({'; '.join(asked.trouble)})" if asked.trouble else ""
-        raise VerificationFailed(f"torque off was sent, but NOT confirmed by {who}: cut the power{why}")
+        raise VerificationFailed(f"torque off was sent but NOT confirmed by {who}: cut the power{why}")
     console.print(f"torque off, confirmed by {len(asked.torque)} servos")
 
 
 @hw.command(epilog="Example: dynsim hw schema > servo_map.schema.json")
 def schema() -> None:
-    """Print the JSON schema of servo maps, for editors."""
+    """Print the JSON schema of servo maps for your editor."""
     from dynsim.hardware.servo_map import json_schema
 
     print(json_text(json_schema()), end="")
@@ -424,19 +442,21 @@ def schema() -> None:
 def calibrate(
     map_file: MapFile,
     port: Port,
-    joint: Annotated[list[str] | None, typer.Option("--joint", help="Only this joint; may be repeated.")] = None,
-    out: Annotated[Path | None, typer.Option("--out", help="Write here instead of into the map.")] = None,
-    nudge: Annotated[bool, typer.Option("--nudge", help="Turn each joint 3° and back, to see its sense.")] = False,
-    live: Annotated[bool, typer.Option("--live", help="Really move (--nudge).")] = False,
-    yes: Annotated[bool, typer.Option("--yes", help="Ask nothing, only report (--nudge).")] = False,
-    write: Annotated[bool, typer.Option("--write", help="Write wrong senses into the map (--nudge).")] = False,
+    joint: Annotated[list[str] | None, typer.Option("--joint", help="Calibrate only this joint; repeatable.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="Output file; default: the map itself.")] = None,
+    nudge: Annotated[
+        bool, typer.Option("--nudge", help="Turn each joint by 3° and back to check its direction.")
+    ] = False,
+    live: Annotated[bool, typer.Option("--live", help="Move the robot (with --nudge).")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Ask no questions, only report (with --nudge).")] = False,
+    write: Annotated[bool, typer.Option("--write", help="Correct the signs in the map (with --nudge).")] = False,
 ) -> None:
-    """Write the zero ticks: put the robot into its zero posture by hand (torque off), then run this.
+    """Store the zero position: pose the robot by hand with torque off, then run this.
 
-    With --nudge: find swapped senses instead, joint by joint.
+    With --nudge: find joints with the wrong direction instead, one by one.
     """
     require_client_library()
-    from dynsim.cli.hardware import find_senses, may_write
+    from dynsim.cli.hardware import find_directions, may_write
     from dynsim.hardware.errors import ServoMapError, VerificationFailed
     from dynsim.hardware.ports import bus_on
     from dynsim.hardware.servo_map import SHIPPED, load_servo_map, read_zero_ticks, write_into_map
@@ -445,21 +465,21 @@ def calibrate(
     target = out or servo_map.path
     shipped = target.resolve().parent == SHIPPED
     if shipped and (write or not nudge):
-        raise ServoMapError(f"{target} comes with dynsim; write your own map with --out")
+        raise ServoMapError(f"{target} is a shipped map; write your own map with --out")
     unknown = [name for name in joint or () if name not in servo_map.joints]
     if unknown:
         raise ServoMapError(f"{map_file} has no joint {', '.join(unknown)}; it has {', '.join(servo_map.joints)}")
     if nudge:
         chosen = [servo for servo in servo_map.servos if servo.joint in (joint or servo_map.joints)]
-        signs, blocked = find_senses(console, servo_map, chosen, port, live=live, asked=not yes)
+        signs, blocked = find_directions(console, servo_map, chosen, port, live=live, asked=not yes)
         if signs and (write or (not shipped and may_write(console, list(signs), target))):
             write_into_map(servo_map, "sign", signs, target)
             console.print(f"written to {target}")
         if blocked:
-            raise VerificationFailed(f"{', '.join(blocked)}: did not turn as told; is something in the way?")
+            raise VerificationFailed(f"{', '.join(blocked)} did not turn as commanded; check for an obstacle")
         return
     if live or yes or write:
-        raise ServoMapError("--live, --yes and --write are for --nudge: zero ticks are read with the torque off")
+        raise ServoMapError("--live, --yes and --write require --nudge; zero ticks are read with the torque off")
     chosen = [servo for servo in servo_map.servos if (servo.joint in joint if joint else servo.in_position_mode)]
     with bus_on(port, servo_map) as (bus, _):
         ticks = read_zero_ticks(bus, chosen)
@@ -471,12 +491,10 @@ def calibrate(
     console.print(f"zero ticks of {len(ticks)} joints written to {target}")
 
 
-# Command ``dynsim hw drive``: a pilot drives a simulation in real time and servos follow it.
-
-
+# Command ``dynsim hw drive``: the user drives a simulation in real time, and servos follow it.
 EXAMPLE = "Example: dynsim hw drive elbow_comparison --variant two_elbows --map arm --port virtual"
 SERVOS = "servos"
-"""Folder of the measured run, in that of the drive."""
+"""Subfolder of the measured run."""
 
 
 def hw_drive(
@@ -488,7 +506,8 @@ def hw_drive(
     rate: Rate = None,
     policy: PolicyOption = None,
     out: Annotated[
-        Path | None, typer.Option("--out", metavar="FOLDER", help="Default: results/SCENARIO/drive_N, a new one.")
+        Path | None,
+        typer.Option("--out", metavar="FOLDER", help="Output folder; default: a new folder results/SCENARIO/drive_N."),
     ] = None,
     speed: SpeedOption = 0.1,
     turn: TurnOption = 0.5,
@@ -503,10 +522,10 @@ def hw_drive(
     faults: Faults = None,
     quiet: QuietOption = False,
 ) -> None:
-    """Drive a scenario from a browser as `dynsim teleop` does, with servos that follow the simulated joints.
+    """Like `dynsim teleop`, with servos following the simulated joints.
 
-    Verify, arm and move to the start as a replay does; every posture is checked against the map before it is followed.
-    Ctrl-C once: controlled stop. Twice: torque off. The button of the page ends the drive regularly.
+    Servos are verified and armed, and move to the start, as in a replay; every posture is checked against the map
+    before it is sent. Ctrl-C once: controlled stop. Twice: torque off. The button on the page ends the drive normally.
     """
     require_websockets()
     require_client_library()
@@ -524,7 +543,7 @@ def hw_drive(
     from dynsim.teleop.web.follower import DriveRequest, SimulationProcess
 
     if faults and port != VIRTUAL:
-        raise ServoMapError("--faults is for virtual servos: --port virtual")
+        raise ServoMapError("--faults requires virtual servos; use --port virtual")
     loaded = load_scenario(scenario, variant, parsed_overrides(overrides))
     servo_map = load_servo_map(map_file)
     script = load_fault_script(faults, servo_map.ids) if faults else None
@@ -535,7 +554,7 @@ def hw_drive(
     moves = live or port == VIRTUAL
     result: Any = None
     with SimulationProcess(request) as process:
-        with console.status("loading the kernels; the first time they are compiled, which takes half a minute"):
+        with console.status("loading the kernels; the first time, compiling them takes half a minute"):
             ready = process.ready()
         motion = check_drive(
             ready.first,
@@ -549,7 +568,7 @@ def hw_drive(
         if live and port != VIRTUAL:
             confirm_replay(console, servo_map, motion, port, asked=not yes, at_most=True)
         if moves:
-            tell_address(ready.address, "Ctrl-C stops the robot, a second one releases it", open_=open_)
+            print_address(ready.address, "Ctrl-C stops the robot, a second one releases it", open_=open_)
         posture = dict(zip(servo_map.joints, motion.start.tolist(), strict=True))
         error: DynsimError | None = None
         try:
@@ -572,10 +591,10 @@ def hw_drive(
                 )
         except DynsimError as stopped:
             error, result = stopped, getattr(stopped, "result", None)
-        # What was driven is saved, whatever else the user asks for.
+        # Defer signals until the drive is saved.
         interruption.keep()
         try:
-            done = process.finish("ended" if error is None else f"the servos have stopped: {error}")
+            done = process.finish("ended" if error is None else f"the servos stopped: {error}")
         except DynsimError as lost_drive:
             if error is None:
                 raise
@@ -585,24 +604,24 @@ def hw_drive(
     if result is not None and not quiet:
         print_timing(result)
     if not moves and error is None:
-        tell_dry_run(result)
+        print_dry_run(result)
         return
     if done.saved:
-        _tell_files(loaded.variant or loaded.name, folder, result, quiet=quiet)
+        _write_page(loaded.variant or loaded.name, folder, result, quiet=quiet)
         if not quiet:
-            tell_drive(done.report, done.driven, folder)
+            print_drive(done.report, done.driven, folder)
     if error is None and not quiet:
-        tell_replay(result, "driven", folder / SERVOS, folder / "record.h5")
+        print_replay(result, "driven", folder / SERVOS, folder / "record.h5")
     if error is not None:
         if done.failure is not None:
-            errors.print(f"[red]error:[/] the simulation: {escaped(str(done.failure))}")
+            errors.print(f"[red]error:[/] simulation: {escaped(str(done.failure))}")
         raise error
     if done.failure is not None:
         raise done.failure
 
 
-def _tell_files(name: str, folder: Path, result: Any, *, quiet: bool) -> None:
-    """The page with the measured robot beside the simulated one."""
+def _write_page(name: str, folder: Path, result: Any, *, quiet: bool) -> None:
+    """Write the page that shows the measured robot next to the simulated one."""
     from dynsim.record import Record
 
     records = {name: Record.load(folder / "record.h5")}
@@ -611,53 +630,63 @@ def _tell_files(name: str, folder: Path, result: Any, *, quiet: bool) -> None:
     write_view(records, folder, quiet)
 
 
-# Questions and tables of the commands that move a robot: before a replay, and about nudges of single servos.
-
-
+# Prompts and tables of the commands that move a robot: before a replay, and for nudges of single servos.
 ANSWERS = ("y", "n", "again")
-CLEAR = "Is everybody clear of the robot, and the power cut within reach?"
+CLEAR = "Is everyone clear of the robot, and is the power cut within reach?"
 
 
 def confirm_replay(
     console: Console, servo_map: ServoMap, motion: MotionTask, port: str, *, asked: bool, at_most: bool = False
 ) -> None:
-    """Show the distance to the start and ask for consent.
+    """Show the distance to the start and ask for confirmation.
 
-    A start beyond ``safety.start_distance`` needs an answer even where not ``asked``.
-
-    ``at_most``: the motion may end sooner.
+    Parameters
+    ----------
+    console : Console
+        Output.
+    servo_map : ServoMap
+        Map of the servos.
+    motion : MotionTask
+        Motion to confirm.
+    port : str
+        Serial device.
+    asked : bool
+        Whether to ask. A start beyond ``safety.start_distance`` is always asked.
+    at_most : bool, optional
+        Whether the motion may end earlier than its duration.
 
     Raises
     ------
     ReplayInterrupted
-        The user does not agree, or does not answer.
+        If the user declines or does not answer.
     PortError, VerificationFailed
-        The posture cannot be read.
+        If the posture cannot be read.
     """
     with bus_on(port, servo_map) as (bus, _):
         approach = way_to_start(bus, servo_map, motion.start)
     console.print(
-        f"{servo_map.robot}: {len(servo_map.servos)} servos will move for {motion.duration:.1f} s"
-        f"{' at most' if at_most else ''}, "
-        f"after {approach.duration:.1f} s to the start."
+        f"{servo_map.robot}: {len(servo_map.servos)} servos will move for {'at most ' if at_most else ''}"
+        f"{motion.duration:.1f} s, after an approach of {approach.duration:.1f} s."
     )
     for distance in approach.distances[:1]:
-        console.print(f"furthest from its start: {distance}")
+        console.print(f"largest distance to the start: {distance}")
     agreed = not asked or _agreed(console, CLEAR, "move?")
     if agreed and approach.far:
-        still = "" if asked else " (asked with --yes too)"
+        still = "" if asked else " (asked even with --yes)"
         bound = servo_map.safety.start_distance
-        console.print(f"further than safety.start_distance, {bound:g} rad, from their start{still}:")
+        console.print(f"more than safety.start_distance = {bound:g} rad from the start{still}:")
         for distance in approach.far:
             console.print(f"  {distance}")
-        agreed = _agreed(console, "All joints go there in step: is the whole way free?", "move there?")
+        agreed = _agreed(
+            console, "All joints move to the start together. Is the whole path free?", "move to the start?"
+        )
     if not agreed:
         raise ReplayInterrupted("not confirmed; nothing was moved")
 
 
 def print_limits(console: Console, rows: Sequence[LimitRow]) -> None:
-    """Limits that the servos have stored, beside the map's."""
-    table = Table("joint", "ID", *QUANTITIES, title="limits, stored in the servo | of the map")
+    """Print the limits stored in the servos next to those of the map."""
+    table = Table("joint", "ID", *QUANTITIES, title="limits: servo | map")
     for row in rows:
         table.add_row(row.joint, str(row.id), *(" | ".join(cell) for cell in row.cells))
     console.print(table)
@@ -665,32 +694,45 @@ def print_limits(console: Console, rows: Sequence[LimitRow]) -> None:
         console.print(line)
 
 
-def find_senses(
+def find_directions(
     console: Console, servo_map: ServoMap, chosen: Sequence[MappedServo], port: str, *, live: bool, asked: bool
 ) -> tuple[dict[str, int], list[str]]:
-    """Nudge joint after joint, and ask whether it moved as the map says.
+    """Nudge one joint after the other, and ask whether it moved in the direction of the map.
 
-    A real port is a dry run without ``live``; where not ``asked``, motion is reported only.
+    Parameters
+    ----------
+    console : Console
+        Output.
+    servo_map : ServoMap
+        Map of the servos.
+    chosen : sequence of MappedServo
+        Servos to nudge.
+    port : str
+        Serial device, or ``VIRTUAL``.
+    live : bool
+        Whether to move; without it a real port gets a dry run.
+    asked : bool
+        Whether to ask; otherwise the motion is only reported.
 
     Returns
     -------
-    signs : dict
-        What the sign of every joint should be that turned against the map.
-    blocked : list
-        Joints that did not go where they were sent.
+    signs : dict of str to int
+        Correct sign of every joint that turned against the map.
+    blocked : list of str
+        Joints that did not reach their goals.
 
     Raises
     ------
     ReplayInterrupted
-        The user does not agree, does not answer, or stopped a nudge.
+        If the user declines, does not answer, or stopped a nudge.
     VerificationFailed, ReplayAborted
-        A servo is not fit to move, or an abort rule ended a nudge; torque is off.
+        If a servo is not ready to move, or an abort rule ended a nudge; torque is off.
     """
     real = port != VIRTUAL
     angle = f"{math.degrees(ANGLE):g}°"
     if real and live and asked:
         console.print(
-            f"{servo_map.robot}: {len(chosen)} joint(s) will turn {angle} and back, one by one; the others limp."
+            f"{servo_map.robot}: {len(chosen)} joint(s) will turn {angle} and back, one by one; torque off elsewhere."
         )
         if not _agreed(console, CLEAR, "move?"):
             raise ReplayInterrupted("not confirmed; nothing was moved")
@@ -700,25 +742,25 @@ def find_senses(
         for servo in chosen:
             moved = _nudge(bus, clock, servo_map, servo, live=live or not real)
             if moved is None:
-                console.print(f"{servo}: fit to move")
+                console.print(f"{servo}: ready to move")
                 continue
-            answer = _shown(console, moved, asked=asked)
+            answer = _ask_direction(console, moved, asked=asked)
             while answer == "again":
                 moved = _nudge(bus, clock, servo_map, servo, live=True) or moved
-                answer = _shown(console, moved, asked=asked)
+                answer = _ask_direction(console, moved, asked=asked)
             if not moved.followed:
                 blocked.append(servo.joint)
             agrees[servo.joint] = answer == "y"
     if real and not live:
-        console.print("dry run: nothing was moved; --live moves")
+        console.print("dry run: nothing was moved; use --live to move")
     signs = swapped(servo_map, agrees)
     for joint, sign in signs.items():
-        console.print(f"{joint}: turns against the map; its sign should be {sign}")
+        console.print(f"{joint}: turns opposite to the map; its sign should be {sign}")
     return signs, blocked
 
 
 def may_write(console: Console, joints: Sequence[str], target: object) -> bool:
-    """Ask whether the map is to be changed."""
+    """Ask whether to change the map."""
     return _agreed(console, f"The sign of {', '.join(joints)} is wrong in {target}.", "write it?")
 
 
@@ -728,18 +770,18 @@ def _nudge(bus: Bus, clock: Clock, servo_map: ServoMap, servo: MappedServo, *, l
         return nudge(servo_map, servo, bus, clock, live=live, stop=stop)
 
 
-def _shown(console: Console, moved: Nudge, *, asked: bool) -> str:
-    """Tell what a joint did; "y", "n" or "again"."""
+def _ask_direction(console: Console, moved: Nudge, *, asked: bool) -> str:
+    """Print the motion of a joint and ask for its direction; returns "y", "n" or "again"."""
     console.print(
-        f"{moved.joint} (ID {moved.id}): {math.degrees(moved.moved):+.1f}° by the map, {moved.ticks:+d} ticks, and back"
+        f"{moved.joint} (ID {moved.id}): {math.degrees(moved.moved):+.1f}° (map), {moved.ticks:+d} ticks, and back"
     )
     if not asked or not moved.followed:
         return "y"
-    sense = "positive" if moved.asked > 0 else "negative"
+    direction = "positive" if moved.asked > 0 else "negative"
     answer = ""
     try:
         while answer not in ANSWERS:
-            question = f"Did {moved.joint} turn in the {sense} sense first? [{'/'.join(ANSWERS)}]"
+            question = f"Did {moved.joint} turn in the {direction} direction first? [{'/'.join(ANSWERS)}]"
             answer = typer.prompt(question).strip().lower()
         return answer
     except typer.Abort:

@@ -1,4 +1,4 @@
-"""Command ``dynsim plan``: finds the points of an arm to brace, their places, the postures and the brace forces."""
+"""Command ``dynsim plan``: finds brace points, their positions, postures and contact forces."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from dynsim.cli.app import (
     VariantOption,
     parsed_overrides,
 )
-from dynsim.cli.tables import plan_progress, say, say_written
+from dynsim.cli.tables import plan_progress, print_line, print_written
 from dynsim.errors import ScenarioError, UnreachableReference
 from dynsim.system.terminal import escaped
 
@@ -32,64 +32,68 @@ def plan(
         str,
         typer.Option(
             metavar="LIST",
-            help="Points that may be braced: links (their joints), link_3:link_9, frames, contact points, with "
-            "commas; default: all links but the first two, and all contact points.",
+            help="Points that may become braces, comma-separated: links (at their joint), ranges (link_3:link_9), "
+            "frames or contact points; default: all links except the first two, and all contact points.",
         ),
     ] = "",
     along: Annotated[
         list[float] | None,
-        typer.Option(metavar="SHARE", help="Also points at this share of the way along the links; may be repeated."),
+        typer.Option(
+            metavar="SHARE", help="Also use the point at this fraction of each link's length, 0 to 1; repeatable."
+        ),
     ] = None,
     radius: Annotated[
-        float | None, typer.Option(metavar="M", min=0.0, help="Radius of the candidates [m]; default: their links'.")
+        float | None, typer.Option(metavar="M", min=0.0, help="Brace radius [m]; default: the radius of the link.")
     ] = None,
-    count: Annotated[str, typer.Option(metavar="MIN:MAX", help="Numbers of braces.")] = "0:3",
+    count: Annotated[str, typer.Option(metavar="MIN:MAX", help="Smallest and largest number of braces.")] = "0:3",
     surface: Annotated[
-        list[str] | None, typer.Option(metavar="NAME", help="Surfaces to lean on, may be repeated; default: all.")
+        list[str] | None, typer.Option(metavar="NAME", help="Surface that may be used; repeatable; default: all.")
     ] = None,
     weight: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="peak=VALUE", help="Cost of the greatest torque of revolute joints beside the heat [W/(N m)]."
-        ),
+        typer.Option(metavar="peak=VALUE", help="Extra cost of the largest torque of revolute joints [W/(N m)]."),
     ] = None,
     clearance: Annotated[
-        float, typer.Option(metavar="M", min=0.0, help="Clearance of joints that are not braced [m].")
+        float, typer.Option(metavar="M", min=0.0, help="Minimum distance of unbraced joints from surfaces [m].")
     ] = 0.01,
-    min_force: Annotated[float, typer.Option(metavar="N", min=0.0, help="Least normal force of a brace [N].")] = 0.5,
+    min_force: Annotated[
+        float, typer.Option(metavar="N", min=0.0, help="Minimum normal force on each brace [N].")
+    ] = 0.5,
     verify: Annotated[
-        bool, typer.Option("--verify/--no-verify", help="Run the plans with errors of the scene.")
+        bool, typer.Option("--verify/--no-verify", help="Re-simulate plans with errors in friction and surface height.")
     ] = True,
     friction_error: Annotated[
-        float, typer.Option(metavar="SHARE", min=0.0, max=0.99, help="Error of friction that plans shall bear.")
+        float,
+        typer.Option(metavar="SHARE", min=0.0, max=0.99, help="Relative friction error that plans must tolerate."),
     ] = 0.2,
     surface_error: Annotated[
-        float, typer.Option(metavar="M", min=0.0, help="Error of the surfaces' height that plans shall bear [m].")
+        float, typer.Option(metavar="M", min=0.0, help="Surface height error that plans must tolerate [m].")
     ] = 0.005,
     gains: Annotated[
         str | None,
-        typer.Option(metavar="LIST", help="Gains k_p [V/rad] to choose from, with commas; default: 500 to 5."),
+        typer.Option(metavar="LIST", help="Candidate gains k_p [V/rad], comma-separated; default: 500 to 5."),
     ] = None,
-    exhaustive: Annotated[
-        bool, typer.Option("--exhaustive", help="Try all sets of candidates, not only those that grow from the best.")
-    ] = False,
-    starts: Annotated[int, typer.Option(metavar="N", min=1, help="Independent rounds of the search.")] = 8,
-    seed: Annotated[int, typer.Option(metavar="S", help="Of its random postures.")] = 0,
+    exhaustive: Annotated[bool, typer.Option("--exhaustive", help="Try every set of candidates (slow).")] = False,
+    starts: Annotated[int, typer.Option(metavar="N", min=1, help="Number of independent search rounds.")] = 8,
+    seed: Annotated[int, typer.Option(metavar="S", help="Seed for the random starting postures.")] = 0,
     explain: Annotated[
-        bool, typer.Option("--explain", help="Find the errors of the scene that refused plans do bear.")
+        bool, typer.Option("--explain", help="For rejected plans, find the largest error they tolerate.")
     ] = False,
     out: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="For the files; default: results/SCENARIO/plan.")
+        Path | None, typer.Option(metavar="FOLDER", help="Output folder; default: results/SCENARIO/plan.")
     ] = None,
-    jobs: Annotated[int, typer.Option(metavar="N", min=0, help="Processes that verify; default: all cores.")] = 0,
+    jobs: Annotated[
+        int, typer.Option(metavar="N", min=0, help="Number of worker processes; default 0: one per core.")
+    ] = 0,
     no_figures: FiguresOption = False,
     format_: FormatOption = FigureFormat.png,
     quiet: QuietOption = False,
 ) -> None:
-    """Plan braces: which points, on which surfaces, in what posture along the hand's path, with what forces and gains.
+    """Find where an arm should brace: points, surfaces, posture along the hand path, contact forces and gains.
 
-    For each number of braces the set of least copper heat, run in whole dynamics with friction and surfaces that are
-    not as planned. plan.yaml runs the plans, a variant each: dynsim run results/SCENARIO/plan/plan.yaml.
+    For each number of braces, finds the set with the least motor heat and re-simulates it with errors in friction and
+    surface height. Writes plan.yaml with one variant per plan; run it with `dynsim run
+    results/SCENARIO/plan/plan.yaml`.
     """
     from dynsim.scenario import load_scenario
 
@@ -99,7 +103,9 @@ def plan(
     peak = _weights(weight or [])
     names = [name.strip() for name in candidates.split(",") if name.strip()]
     if candidates and not names:
-        raise ScenarioError(f"--candidates {escaped(candidates)}: names nothing; leave it out for the default")
+        raise ScenarioError(
+            f"--candidates {escaped(candidates)}: must list at least one candidate; omit it for the default"
+        )
     from dynsim.planner.answer import plan_braces
     from dynsim.planner.files import check_plan_folder, save_plan
     from dynsim.planner.verify import Tolerances
@@ -136,25 +142,25 @@ def plan(
         from dynsim.cli.tables import print_plan
 
         print_plan(result)
-        say_written(folder)
+        print_written(folder)
         if result.best is not None:
-            say(f"To run the best: dynsim run {escaped(folder / 'plan.yaml')}")
+            print_line(f"Run the best plan: dynsim run {escaped(folder / 'plan.yaml')}")
     if result.best is None:
         raise UnreachableReference(f"no plan: {escaped(result.sizes[0].reason)}")
 
 
 def _numbers(text: str) -> tuple[int, int]:
-    """``0:3`` or ``2``."""
+    """Parse ``0:3`` or ``2``."""
     first, colon, last = text.partition(":")
     try:
         least = int(first)
         return least, int(last) if colon else least
     except ValueError:
-        raise ScenarioError(f"--count {escaped(text)}: must look like 0:3, or be one number") from None
+        raise ScenarioError(f"--count {escaped(text)}: must be MIN:MAX, such as 0:3, or one number") from None
 
 
 def _weights(texts: list[str]) -> float:
-    """The cost of the peak [W/(N m)]."""
+    """Return the cost of the peak torque [W/(N m)]."""
     peak = 0.0
     for text in texts:
         key, _, value = text.partition("=")
@@ -163,17 +169,19 @@ def _weights(texts: list[str]) -> float:
         except ValueError:
             number = -1.0
         if key != "peak" or not 0.0 <= number < float("inf"):
-            raise ScenarioError(f"--weight {escaped(text)}: must look like peak=0.5, zero or more [W/(N m)]")
+            raise ScenarioError(
+                f"--weight {escaped(text)}: must look like peak=0.5, with a value of at least 0 [W/(N m)]"
+            )
         peak = number
     return peak
 
 
 def _gains(text: str) -> tuple[float, ...]:
-    """Gains from the largest on."""
+    """Return gains in descending order."""
     try:
         values = tuple(sorted((float(part) for part in text.split(",")), reverse=True))
     except ValueError:
         values = ()
     if not values or not all(0.0 < gain < float("inf") for gain in values):
-        raise ScenarioError(f"--gains {escaped(text)}: must be positive numbers with commas, such as 500,100,20")
+        raise ScenarioError(f"--gains {escaped(text)}: must be comma-separated positive numbers, such as 500,100,20")
     return values

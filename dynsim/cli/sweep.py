@@ -20,7 +20,7 @@ from dynsim.cli.app import (
     folder_option,
     parsed_overrides,
 )
-from dynsim.cli.tables import drawing, errors, say, sweep_progress
+from dynsim.cli.tables import drawing, errors, print_line, sweep_progress
 from dynsim.errors import ScenarioError, SimulationStopped
 from dynsim.system.terminal import escaped
 
@@ -43,52 +43,63 @@ def sweep(
     grid: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="KEY=start:stop:count", help="Values of a key, both ends included, or KEY=a,b; may be repeated."
+            metavar="KEY=start:stop:count",
+            help="Values of one key: start:stop:count (ends included) or a,b,c; repeatable (all combinations).",
         ),
     ] = None,
     sample: Annotated[
         list[str] | None,
         typer.Option(
             metavar="KEY=normal(m,s)",
-            help="Draw a key, also by uniform(a,b); `*` in it is every entry; may be repeated.",
+            help="Random values of one key: normal(mean,sd) or uniform(a,b); `*` matches every list entry; repeatable.",
         ),
     ] = None,
-    count: Annotated[int, typer.Option(metavar="N", min=1, help="Draws of each sample.")] = 1,
-    seed: Annotated[int, typer.Option(metavar="S", min=0, help="Of the draws.")] = 0,
+    count: Annotated[int, typer.Option(metavar="N", min=1, help="Number of random draws.")] = 1,
+    seed: Annotated[int, typer.Option(metavar="S", min=0, help="Seed for the random draws.")] = 0,
     variants: Annotated[
-        str | None, typer.Option(metavar="all|NAMES", help="Variants to run, by names with commas; default: the first.")
+        str | None,
+        typer.Option(
+            metavar="all|NAMES", help="`all`, or comma-separated variant names; default: the first in the file."
+        ),
     ] = None,
     overrides: SetOption = None,
-    jobs: Annotated[int | None, typer.Option(metavar="N", min=1, help="Processes; default: one for each core.")] = None,
+    jobs: Annotated[
+        int | None, typer.Option(metavar="N", min=1, help="Number of worker processes; default: one per core.")
+    ] = None,
     scheduler: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="Dask scheduler whose workers run instead, tcp://HOST:PORT.")
+        str | None, typer.Option(metavar="ADDRESS", help="Run on the workers of this Dask scheduler (tcp://HOST:PORT).")
     ] = None,
     out: Annotated[Path | None, folder_option("results/SCENARIO/sweep")] = None,
-    keep_records: Annotated[KeepRecords, typer.Option(help="Runs whose records are saved.")] = KeepRecords.none,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with the sweep in the folder.")] = False,
+    keep_records: Annotated[KeepRecords, typer.Option(help="Which runs keep their full record.")] = KeepRecords.none,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Resume the sweep in --out; completed runs are skipped.")
+    ] = False,
     plot: Annotated[
         list[str] | None,
         typer.Option(
             metavar="NUMBER",
-            help="A number of the summary to draw instead of energy and error, as the table calls it, such as "
-            "base.tip_margin_min; may be repeated. --resume draws others of a sweep that is done.",
+            help="Table column to plot instead of energy and error, e.g. base.tip_margin_min; repeatable. "
+            "With --resume, redraws a finished sweep.",
         ),
     ] = None,
     no_figures: FiguresOption = False,
     format_: FormatOption = FigureFormat.png,
     quiet: QuietOption = False,
 ) -> None:
-    """Simulate a scenario over a grid, and with samples, of its values; write a table of all runs and figures.
+    """Simulate a scenario over a grid of values, random samples, or both; write a table of all runs and figures.
 
-    A run that fails is a row with its reason. Exit codes: 0 some run ended well, 2 bad input, 3 none did, 130 Ctrl-C.
+    A failed run becomes a row with its reason. Exit codes: 0 at least one run succeeded, 2 bad input, 3 no run
+    succeeded, 130 Ctrl-C.
     """
     from dynsim.studies.processes import cores
     from dynsim.studies.worker import keep_memory
 
     if jobs is not None and scheduler is not None:
-        raise ScenarioError("--jobs are processes of this machine, --scheduler has its own workers: give one of them")
+        raise ScenarioError(
+            "--jobs (processes on this machine) and --scheduler (workers of a cluster) conflict; use one of them"
+        )
     if plot and no_figures:
-        raise ScenarioError("--plot says what is drawn, --no-figures that nothing is: give one of them")
+        raise ScenarioError("--plot and --no-figures conflict; use one of them")
     from dynsim.scenario import read_scenario
     from dynsim.studies.sweep import OK, TABLES, has_parquet, run_sweep
     from dynsim.studies.sweep_plan import Axis, Law, Plan
@@ -96,7 +107,7 @@ def sweep(
     file = read_scenario(scenario)
     axes, laws = tuple(map(Axis.parse, grid or ())), tuple(map(Law.parse, sample or ()))
     plan = Plan(file, _variants(file.variants, variants), parsed_overrides(overrides), axes, laws, count, seed)
-    # Which values make no scenario is known here, before processes and threads have work.
+    # Invalid values are reported here, before processes and threads start.
     name = plan.scenario(next(plan.points())).name
     folder = out or Path("results", name, "sweep")
     others = scheduler is not None or min(jobs or cores(), plan.runs) > 1
@@ -106,7 +117,7 @@ def sweep(
 
     def warn_once(row: SweepRow) -> None:
         if row.status == OK:
-            _warn_of_unknown(row, unchecked)
+            _warn_about_unknown(row, unchecked)
             unchecked.clear()
 
     with sweep_progress(plan.runs, quiet) as report:
@@ -124,15 +135,15 @@ def sweep(
     for row in failed[:_SHOWN]:
         errors.print(f"run {row.run} {row.status}: {escaped(row.reason)}")
     if len(failed) > _SHOWN:
-        errors.print(f"… and {len(failed) - _SHOWN} more; the table has all reasons")
+        errors.print(f"… and {len(failed) - _SHOWN} more; the table lists all reasons")
     if not no_figures:
         _draw(name, rows, plan, folder, quiet, format_, plot or ())
     if not quiet:
         if not has_parquet():
-            say(escaped("No Parquet: it needs pyarrow (pip install 'dynsim[tables]')."))
-        say(f"{len(rows) - len(failed)} of {len(rows)} runs ended well. Written to {escaped(folder)}")
+            print_line(escaped("Parquet file skipped: it requires pyarrow (pip install 'dynsim[tables]')."))
+        print_line(f"{len(rows) - len(failed)} of {len(rows)} runs succeeded. Written to {escaped(folder)}")
     if len(failed) == len(rows):
-        raise SimulationStopped(f"none of the {len(rows)} runs ended well; {folder / TABLES[0]} has their reasons")
+        raise SimulationStopped(f"none of the {len(rows)} runs succeeded; {folder / TABLES[0]} lists the reasons")
 
 
 def _variants(known: Sequence[str], wanted: str | None) -> tuple[str | None, ...]:
@@ -145,8 +156,8 @@ def _variants(known: Sequence[str], wanted: str | None) -> tuple[str | None, ...
     return tuple(known) if wanted == "all" else tuple(name.strip() for name in wanted.split(","))
 
 
-def _warn_of_unknown(row: SweepRow, plotted: Sequence[str]) -> None:
-    """Say of numbers to draw, before all is run, that the first run does not have them; another variant may."""
+def _warn_about_unknown(row: SweepRow, plotted: Sequence[str]) -> None:
+    """Warn before the sweep if the first run lacks a number to plot; another variant may have it."""
     from dynsim.config.problems import suggest
 
     for number in plotted:
@@ -154,7 +165,7 @@ def _warn_of_unknown(row: SweepRow, plotted: Sequence[str]) -> None:
             named = f" ({escaped(row.variant)})" if row.variant else ""
             errors.print(
                 f"[yellow]warning:[/] --plot {escaped(number)}: run {row.run}{named} has no such number"
-                f"{suggest(number, row.numbers)}; Ctrl-C, then --resume with another --plot, loses no run"
+                f"{suggest(number, row.numbers)}; to change it, press Ctrl-C and use --resume with another --plot"
             )
 
 
@@ -175,10 +186,10 @@ def _draw(
     for number in plotted:
         if known and number not in known:
             raise ScenarioError(
-                f"--plot {number}: no run has that number{suggest(number, known)}; {folder / TABLES[0]} has all; "
-                "--resume draws others without running anything again"
+                f"--plot {number}: no run has that number{suggest(number, known)}; {folder / TABLES[0]} lists all; "
+                "use --resume with another --plot to redraw without simulating"
             )
-    # What a run that stopped has until then, or before it was to end, is beside the others like a fine result.
+    # The partial numbers of a stopped run must not be plotted like complete results.
     table = Sweep(
         name,
         [(row if row.status == OK else replace(row, numbers={})).cells() for row in rows],

@@ -1,4 +1,4 @@
-"""Tables of summaries, comparisons, checked starts, and choices of scenario types for the terminal."""
+"""Terminal output: tables of summaries, comparisons, starts, choices and plans; messages and progress bars."""
 
 from __future__ import annotations
 
@@ -33,16 +33,14 @@ if TYPE_CHECKING:
 
 Summary = Mapping[str, Any]
 
-# Room for the longest row heading.
+# Width of the longest row heading.
 _HEADING_WIDTH = 30
-
-
-# Energies of no more than this share of the turnover, and coordinates up to this [m], are rounding.
+# Energies below this fraction of the turnover, and coordinates below this [m], are rounding errors.
 ROUNDING = 1e-12
 
 
 def _format(value: float, form: str) -> str:
-    """Text of a number; "0" for zero, and no sign where it is rounded to zero."""
+    """Format a number; "0" for zero, and no sign if it is rounded to zero."""
     text = format(value, form)
     if value == 0.0:
         return "0"
@@ -54,13 +52,13 @@ def _number(value: Any, scale: float = 1.0, digits: int = 4) -> str:
 
 
 def _deepest(summary: Summary) -> str | None:
-    """How deep the body that sank deepest lay below a surface [mm]; None where no body did."""
+    """Return the largest depth of a body below a surface [mm], or None if no body was below one."""
     sunk = max(summary.get("sinking", ()), key=lambda entry: entry["depth_m"], default=None)
     return None if sunk is None else f"[bold red]{_number(sunk['depth_m'], 1e3, 3)}[/]"
 
 
 def _base(key: str) -> Callable[[Summary], Any]:
-    """A number of the mobile base; None where there is none."""
+    """Return a function that reads a number of the mobile base from a summary (None without a base)."""
     return lambda summary: summary.get("base", {}).get(key)
 
 
@@ -74,7 +72,7 @@ def _least_load(summary: Summary) -> float | None:
 
 
 def _energy(key: str) -> Callable[[Summary], float | None]:
-    """An energy of a summary [J], 0 where it is rounding beside the energy turned over."""
+    """Return a function that reads an energy from a summary [J]; 0 if it is only rounding error of the turnover."""
 
     def take(summary: Summary) -> float | None:
         energy: float | None = summary.get(key)
@@ -83,19 +81,19 @@ def _energy(key: str) -> Callable[[Summary], float | None]:
     return take
 
 
-# Heading, and how to take it from a summary. A row is left out when no run has it.
+# Heading, function that reads the value from a summary, and its format. A row without values is omitted.
 _ROWS: tuple[tuple[str, Callable[[Summary], Any], Callable[[Any], str]], ...] = (
     ("electrical energy [J]", _energy("electrical_energy_J"), _number),
     ("  from one supply [J]", _energy("electrical_energy_supply_J"), _number),
-    ("  from a supply each [J]", _energy("electrical_energy_drawn_J"), _number),
+    ("  from separate supplies [J]", _energy("electrical_energy_drawn_J"), _number),
     ("battery energy [Wh]", lambda s: s.get("battery_energy_Wh"), lambda v: _number(v, digits=3)),
-    ("worst joint, rms torque [N m]", lambda s: s.get("worst_joint"), lambda v: _worst(v)),
+    ("worst joint, rms torque [N m]", lambda s: s.get("worst_joint"), lambda v: _worst_joint(v)),
     ("mechanical work [J]", _energy("mechanical_work_J"), _number),
     ("Joule heat [J]", _energy("joule_heat_J"), _number),
     ("friction heat [J]", _energy("friction_heat_J"), _number),
     ("impact loss, all contacts [J]", _energy("impact_loss_J"), _number),
     ("stop loss [J]", lambda s: s.get("stop_loss_J") or None, _number),
-    ("taken by time steps [J]", _energy("scheme_loss_J"), _number),
+    ("loss of time stepping [J]", _energy("scheme_loss_J"), _number),
     ("hand error, rms [mm]", lambda s: s.get("hand_error_rms_m"), lambda v: _number(v, 1e3)),
     ("  max [mm]", lambda s: s.get("hand_error_max_m"), lambda v: _number(v, 1e3)),
     ("  vertical, rms [mm]", lambda s: s.get("hand_error_z_rms_m"), lambda v: _number(v, 1e3)),
@@ -104,7 +102,7 @@ _ROWS: tuple[tuple[str, Callable[[Summary], Any], Callable[[Any], str]], ...] = 
     ("position error, max [m]", lambda s: s.get("position_error_max_m"), lambda v: _number(v, digits=3)),
     ("attitude error, max [rad]", lambda s: s.get("attitude_error_max_rad"), lambda v: _number(v, digits=3)),
     (
-        "joint limit passed by [rad]",
+        "joint limit exceeded by [rad]",
         lambda s: s.get("joint_limit_violation_max_rad"),
         lambda v: _number(v, digits=3),
     ),
@@ -115,17 +113,17 @@ _ROWS: tuple[tuple[str, Callable[[Summary], Any], Callable[[Any], str]], ...] = 
     ("tip margin, settled", _base("tip_margin_min_settled"), _margin),
     ("  whole run", _base("tip_margin_min"), _margin),
     ("  tips over at [s]", _base("overturns_settled_at_s"), lambda v: _number(v, digits=3)),
-    ("least load, wheels, caster [N]", _least_load, lambda v: _number(v, digits=3)),
+    ("min load, wheels, caster [N]", _least_load, lambda v: _number(v, digits=3)),
     ("ledger residual, relative", lambda s: s.get("energy_residual_relative"), lambda v: _format(v, ".1e")),
     ("constraint drift [m]", lambda s: s.get("constraint_drift_max_m"), lambda v: _format(v, ".1e")),
-    ("integrated by", lambda s: s.get("method"), str),
+    ("integration method", lambda s: s.get("method"), str),
     ("integration [s]", lambda s: s.get("integration_wall_s"), lambda v: f"{v:.3f}"),
-    ("times real time", lambda s: s.get("real_time_factor"), lambda v: f"{v:.0f}"),
+    ("speed, times real time", lambda s: s.get("real_time_factor"), lambda v: f"{v:.0f}"),
 )
 
 
 def print_summary(console: Console, summary: Summary) -> None:
-    """One run: its numbers, contacts and warnings."""
+    """Print the numbers, contacts and warnings of one run."""
     title = f"{summary['scenario']} {summary['variant']}".strip()
     table = Table(title=escaped_line(title), box=box.SIMPLE_HEAD, show_header=False, title_justify="left")
     table.add_column()
@@ -144,9 +142,9 @@ def print_summary(console: Console, summary: Summary) -> None:
 
 
 def print_comparison(console: Console, summaries: Mapping[str, Summary]) -> None:
-    """All variants side by side, one column each; several tables where the terminal is too narrow for one."""
+    """Print all variants side by side, one column per variant; in several tables if the terminal is too narrow."""
     names = list(summaries)
-    # "wheel2R 3.17 of 1.68" is the widest cell, and most tables have none.
+    # "wheel2R 3.17 of 1.68" is the widest cell; most tables do not have this row.
     cell = max([20 if any(s.get("worst_joint") for s in summaries.values()) else 10, *map(len, names)]) + 2
     across = max(1, (console.width - _HEADING_WIDTH) // cell)
     for start in range(0, len(names), across):
@@ -169,7 +167,7 @@ def _print_columns(console: Console, summaries: Mapping[str, Summary], names: Se
     energies = [summary.get("electrical_energy_J") or 0.0 for summary in summaries.values()]
     if min(energies) > 0.0:
         ratios = (summary["electrical_energy_J"] / min(energies) for summary in shown)
-        table.add_row("energy, times the least", *(f"{ratio:.3g}" for ratio in ratios))
+        table.add_row("energy, times the minimum", *(f"{ratio:.3g}" for ratio in ratios))
     contacts = list(dict.fromkeys(c["name"] for s in summaries.values() for c in s.get("contacts", ())))
     for contact in contacts:
         by_variant = [next((c for c in s.get("contacts", ()) if c["name"] == contact), None) for s in shown]
@@ -182,7 +180,7 @@ def _print_columns(console: Console, summaries: Mapping[str, Summary], names: Se
 
 
 def print_choices(console: Terminal) -> None:
-    """Shipped scenarios and the members of every family, with the first line of what they say of themselves."""
+    """Print shipped scenarios and the members of every family, with the first lines of their descriptions."""
     from dynsim.library.families import FAMILIES, member, members
     from dynsim.scenario import load_scenario, shipped_scenarios, variant_names
 
@@ -191,7 +189,7 @@ def print_choices(console: Terminal) -> None:
         description = load_scenario(path).config.description
         sentence = re.split(r"(?<!et al)\.\s", description, maxsplit=1)[0].strip().removesuffix(".")
         scenarios.append((path.stem, ", ".join(variant_names(path)), sentence))
-    _print_choice(console, "scenarios", scenarios, ("name", "variants", "what"))
+    _print_choice(console, "scenarios", scenarios, ("name", "variants", "description"))
     for family in FAMILIES:
         firsts = [(name, (member(family, name).__doc__ or "").strip().partition("\n")[0]) for name in members(family)]
         _print_choice(console, f"{family}s", firsts)
@@ -200,10 +198,10 @@ def print_choices(console: Terminal) -> None:
 def _print_choice(
     console: Terminal, title: str, rows: Sequence[tuple[str, ...]], headings: tuple[str, ...] = ()
 ) -> None:
-    """A table on a terminal; lines with tabs for programs."""
+    """Print a table on a terminal, or tab-separated lines for programs."""
     if console.unbounded:
         lines = ["\t".join(plain(cell).replace("\n", "\\n") for cell in row) for row in [(title,), *rows, ()]]
-        # Not by the console, which would write the tabs out.
+        # Without the console, which would expand the tabs.
         print("\n".join(lines), file=console.file)
         return
     table = Table(title=title, box=box.SIMPLE_HEAD, show_header=bool(headings), title_justify="left")
@@ -215,9 +213,9 @@ def _print_choice(
 
 
 def print_starts(console: Console, starts: Mapping[str, Start]) -> None:
-    """Per variant the positions of hand and contact points [m], as lists of YAML that read back to the same doubles.
+    """Print the start positions of hand and contact points [m] per variant, as YAML lists in full precision.
 
-    Then how far contacts are from their surfaces, joints that on_surface has moved, and the margin of a base at rest.
+    Also prints contact gaps, joints moved by initial.on_surface, and the tip margin of a mobile base at rest.
     """
     for variant, start in starts.items():
         values = {"hand": f"{_coordinates(start.hand)}"}
@@ -231,19 +229,19 @@ def print_starts(console: Console, starts: Mapping[str, Start]) -> None:
                 braced = f", {start.tip_margin_braced:.4g} with braces of least heat"
             values["tip margin"] = f"{start.tip_margin:.4g} at rest{braced} (1: safest, 0: tips)"
         if start.off_path is not None:
-            away = "where the hand is" if start.off_path < 1e-9 else f"{start.off_path:.4g} m from the hand"
-            values["hand's path"] = f"begins {away}"
+            away = "at the hand" if start.off_path < 1e-9 else f"{start.off_path:.4g} m from the hand"
+            values["hand path"] = f"starts {away}"
         width = max(map(len, values))
         lines = [f"  {variant}{', ' if variant else ''}at the start [m]:"]
         lines += [f"    {name:<{width}}  {value}" for name, value in values.items()]
         if start.aloft:
-            lines += [f"    not on their surfaces; they would be with  {start.aloft}"]
+            lines += [f"    not all on their surfaces; they would be with  {start.aloft}"]
         console.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
         _print_warnings(console, {variant: {"warnings": start.warnings}})
 
 
 def _coordinates(point: NDArray[np.float64]) -> list[float]:
-    """Coordinates [m]; 0.0 for what is rounding of zero, the others read back to the same doubles."""
+    """Return coordinates [m] that read back to the same doubles; rounding errors of zero become 0.0."""
     return [0.0 if abs(x) <= ROUNDING else x for x in point.tolist()]
 
 
@@ -258,12 +256,12 @@ def _percent(key: str) -> Callable[[Summary], str]:
     return lambda contact: f"{100.0 * contact[key]:.1f}" if 0.0 < contact[key] < 1.0 else f"{100.0 * contact[key]:.0f}"
 
 
-def _is_real(contact: Summary) -> bool:
-    """Whether it followed the unilateral law."""
+def _is_unilateral(contact: Summary) -> bool:
+    """Return whether the contact followed the unilateral law."""
     return "sticking_fraction" in contact
 
 
-# Heading, how to show it, and whether it is said of contacts of the bilateral (False) or unilateral law (True) only.
+# Heading, format, and the law for which the row is printed: bilateral (False), unilateral (True) or both (None).
 _CONTACT_ROWS: tuple[tuple[str, Callable[[Summary], str], bool | None], ...] = (
     ("force, mean [N]", lambda c: _format(c["normal_force_mean_N"], ".2f"), None),
     ("  min [N]", lambda c: _format(c["normal_force_min_N"], ".2f"), None),
@@ -273,54 +271,54 @@ _CONTACT_ROWS: tuple[tuple[str, Callable[[Summary], str], bool | None], ...] = (
     ("  sticking [% of time]", _percent("sticking_fraction"), True),
     ("  lift-offs, landings", lambda c: f"{c['lift_offs']}, {c['landings']}", True),
     ("  bounces, slip starts", lambda c: f"{c['bounces']}, {c['slip_starts']}", True),
-    ("  loss at its impacts [J]", lambda c: _number(c.get("impact_loss_J"), digits=3), True),
+    ("  loss at impacts [J]", lambda c: _number(c.get("impact_loss_J"), digits=3), True),
 )
 
 
 def _contact_rows(name: str, contacts: Sequence[Summary | None]) -> Iterator[tuple[str, list[str]]]:
-    """Rows of a contact, a cell for each run; None where a run does not have it.
+    """Yield the rows of a contact with a cell for each run (None: the run does not have this contact).
 
-    No rows of a candidate that never touched; a declared point says how near it came.
+    A candidate that never touched has no rows; for a declared point that never touched, its smallest gap is printed.
     """
     having = [contact for contact in contacts if contact]
     if not any(contact["closed_fraction"] > 0.0 or "gap_min_m" in contact for contact in having):
         return
     if not all(contact["closed_fraction"] > 0.0 for contact in having):
         cells = [_number(c.get("gap_min_m"), 1e3, 3) if c and not c["closed_fraction"] else "–" for c in contacts]
-        yield escaped_line(_of(name, "never touches, least gap [mm]")), cells
+        yield escaped_line(_prefixed(name, "never touches, min gap [mm]")), cells
     if not any(contact["closed_fraction"] > 0.0 for contact in having):
         return
     for heading, show, real in _CONTACT_ROWS:
-        if real is None or any(_is_real(contact) == real for contact in having):
-            cells = [show(c) if c and real in (None, _is_real(c)) else "–" for c in contacts]
-            yield escaped_line(_of(name, heading)), cells
+        if real is None or any(_is_unilateral(contact) == real for contact in having):
+            cells = [show(c) if c and real in (None, _is_unilateral(c)) else "–" for c in contacts]
+            yield escaped_line(_prefixed(name, heading)), cells
 
 
-# Heading, and how to show it, of a joint stop.
+# Rows of a joint stop: heading and format.
 _STOP_ROWS: tuple[tuple[str, Callable[[Summary], str]], ...] = (
     ("hits", lambda s: str(s["hits"])),
     ("  force, max [{force_unit}]", lambda s: _number(s["force_max"], digits=3)),
     ("  closed [% of time]", _percent("closed_fraction")),
-    ("  loss at its impacts [J]", lambda s: _number(s.get("impact_loss_J"), digits=3)),
+    ("  loss at impacts [J]", lambda s: _number(s.get("impact_loss_J"), digits=3)),
 )
 
 
 def _stop_rows(summaries: Sequence[Summary], shown: Sequence[Summary]) -> Iterator[tuple[str, list[str]]]:
-    """Rows of the joint stops that any run has touched, a cell for each run that is shown."""
+    """Yield the rows of the joint stops that any run has touched, with a cell for each run shown."""
     stops = {_stop(stop): stop for summary in summaries for stop in summary.get("joint_stops", ())}
     for key, stop in stops.items():
         cells = [{_stop(stop): stop for stop in summary.get("joint_stops", ())}.get(key) for summary in shown]
         joint, limit = key
         position = f"{math.degrees(limit):.4g}°" if stop["unit"] == "rad" else f"{limit:.4g} {stop['unit']}"
         for heading, show in _STOP_ROWS:
-            text = _of(f"{joint}, stop at {position}", heading.format(**stop))
+            text = _prefixed(f"{joint}, stop at {position}", heading.format(**stop))
             yield escaped_line(text), ["–" if stop is None else show(stop) for stop in cells]
 
 
 def _motor_rows(summaries: Sequence[Summary], shown: Sequence[Summary]) -> Iterator[tuple[str, list[str]]]:
-    """Rows of motors with ratings, root mean square of nominal, a cell for each run that is shown.
+    """Yield the rows of rated motors (rms of nominal) with a cell for each run shown.
 
-    Of many motors the most loaded ones.
+    With many motors only the most loaded ones are shown.
     """
     for quantity, unit, label in _RATED:
         rms, nominal = f"{quantity}_rms_{unit}", f"nominal_{quantity}_{unit}"
@@ -335,7 +333,7 @@ def _motor_rows(summaries: Sequence[Summary], shown: Sequence[Summary]) -> Itera
             yield escaped_line(f"{joint}: {label}"), cells
 
 
-# Of motors: quantity and unit as in the keys of the summary, and how they are called in a table.
+# Ratings of motors: quantity and unit as in the keys of the summary, and label in the table.
 _RATED = (
     ("current", "A", "rms of nominal [A]"),
     ("torque", "N_m", "rms of nominal [N m]"),
@@ -348,8 +346,8 @@ def _loaded(rms: float, nominal: float) -> str:
     return f"[bold red]{rms:.3g}[/]" if rms > nominal else f"{rms:.3g}"
 
 
-def _worst(motor: Summary) -> str:
-    """Name of a motor, rms torque, and nominal torque, or stall torque where that is not known."""
+def _worst_joint(motor: Summary) -> str:
+    """Return the name of a motor with its rms torque and nominal torque (stall torque if unknown)."""
     rating = motor.get("nominal_torque_N_m", motor.get("stall_torque_N_m", math.inf))
     return f"{escaped_line(motor['joint'])} {_loaded(motor['torque_rms_N_m'], rating)} of {rating:g}"
 
@@ -358,7 +356,7 @@ def _stop(stop: Summary) -> tuple[str, float]:
     return stop["joint"], stop["limit"]
 
 
-def _of(contact: str, heading: str) -> str:
+def _prefixed(contact: str, heading: str) -> str:
     return heading if heading.startswith(" ") else f"{contact}: {heading}"
 
 
@@ -369,34 +367,32 @@ def _print_warnings(console: Console, summaries: Mapping[str, Summary]) -> None:
             console.print(f"[yellow]warning:[/] {escaped_line(prefix + warning)}", highlight=False)
 
 
-# Consoles, messages about written files, progress bars, and the display of drawing and compilation.
-
-
-# emoji: rich would turn the ":b:" of a path or key into a picture.
+# Consoles, messages and progress bars.
+# No emoji: rich would replace ":b:" in a path or key.
 console = Terminal(emoji=False)
 errors = Terminal(stderr=True, soft_wrap=True, highlight=False, emoji=False)
 
 
-def say(text: str) -> None:
-    """A sentence on standard output, in as many lines as it has; names in it are :func:`escaped`."""
+def print_line(text: str) -> None:
+    """Print text on standard output without wrapping; names in it must be :func:`escaped`."""
     console.print(text, highlight=False, soft_wrap=True)
 
 
-def say_written(path: Path) -> None:
+def print_written(path: Path) -> None:
     """Print where the files of a command are."""
-    say(f"Written to {escaped(path)}")
+    print_line(f"Written to {escaped(path)}")
 
 
-# Of a progress bar.
+# Maximum title width of a progress bar.
 _TITLE_WIDTH = 22
-# Of kernels, where none have been compiled yet [s].
+# Expected compilation time of the kernels before their first compilation [s].
 _COMPILED_S = 90.0
-# Of a run's folder, and of one of several.
+# Files in the folder of a run, and in the folder of a comparison.
 RECORD, COMPARISON = "record.h5", "comparison.json"
 
 
 def labelled(paths: Sequence[Path], *, trust: bool = False) -> dict[str, Record]:
-    """Records, or those of folders, by names for them: their variants, numbered where another has the same.
+    """Load records, or those in folders, by label: their variant, with a number if it repeats.
 
     Raises
     ------
@@ -416,29 +412,29 @@ def labelled(paths: Sequence[Path], *, trust: bool = False) -> dict[str, Record]
 
 
 def record_files(paths: Sequence[Path]) -> list[Path]:
-    """Records as they were named; of a folder its record, or those of the variants in it.
+    """Return the paths of records; a folder is replaced by its record, or by the records of its variants.
 
     Raises
     ------
     RecordError
-        A folder has no records.
+        If a folder contains no records.
     """
     files = []
     for path in paths:
         if not path.is_dir():
             files.append(path)
             continue
-        inside = [path / RECORD] if (path / RECORD).is_file() else _of_variants(path)
+        inside = [path / RECORD] if (path / RECORD).is_file() else _variant_records(path)
         if not inside:
             raise RecordError(
-                f"{path}: no {RECORD} there, nor in a folder in it; name a record, or the folder of a run"
+                f"{path}: no {RECORD} in this folder or its subfolders; pass a record, or the folder of a run"
             )
         files += inside
     return files
 
 
-def _of_variants(folder: Path) -> list[Path]:
-    """Records of the folders in a folder: in the order of a comparison's variants, others after them."""
+def _variant_records(folder: Path) -> list[Path]:
+    """Return the records in the subfolders of a folder: variants in the order of the comparison, then others."""
     files = sorted(folder.glob(f"*/{RECORD}"))
     try:
         order = list(json.loads((folder / COMPARISON).read_text(encoding="utf-8"))["variants"])
@@ -449,13 +445,13 @@ def _of_variants(folder: Path) -> list[Path]:
 
 @contextmanager
 def drawing(folder: Path, quiet: bool) -> Iterator[None]:
-    """Says that figures are being drawn."""
+    """Show a status while figures are being drawn."""
     with nullcontext() if quiet else console.status(f"drawing {escaped(folder)}"):
         yield
 
 
 def _bars(*columns: str | ProgressColumn) -> Progress:
-    """Bars with these columns, time since their start and time to go; gone at their end where there is no terminal."""
+    """Create progress bars with these columns and elapsed and remaining time, removed at the end without a terminal."""
     from rich import progress
     from rich.table import Column
 
@@ -469,21 +465,21 @@ def _bars(*columns: str | ProgressColumn) -> Progress:
     )
 
 
-def told_in(status: Status, task: str, now: Compilation | None) -> None:
-    """Say in a status what is compiled meanwhile."""
+def show_compilation(status: Status, task: str, now: Compilation | None) -> None:
+    """Show in a status what is being compiled."""
     status.update(task if now is None else f"{task}: {escaped(now.text)}, {now.elapsed:.0f} s")
 
 
 def _silence() -> None:
-    """Kernels are compiled without a word."""
+    """Suppress messages about compilation."""
     from dynsim.engine.compilation import shown_by_caller
 
     shown_by_caller()
 
 
 @contextmanager
-def _compilation_told(show: Callable[[Compilation | None], None] = lambda now: None) -> Iterator[None]:
-    """Within, the first compilation of kernels is told, and shown while it lasts."""
+def _compilation_shown(show: Callable[[Compilation | None], None] = lambda now: None) -> Iterator[None]:
+    """Print the first compilation of kernels in the block, and show its progress."""
     from dynsim.engine.compilation import watched
 
     shown: list[Compilation] = []
@@ -500,7 +496,7 @@ def _compilation_told(show: Callable[[Compilation | None], None] = lambda now: N
 
 @contextmanager
 def progress(scenarios: Sequence[Scenario], quiet: bool) -> Iterator[VariantProgress]:
-    """A progress bar per scenario, with time and time to go, and one while references take long; yields its report."""
+    """Show a progress bar per scenario, and one while its references take long; yields the report function."""
     if quiet:
         _silence()
         yield lambda variant, time, stage="": None
@@ -509,7 +505,7 @@ def progress(scenarios: Sequence[Scenario], quiet: bool) -> Iterator[VariantProg
 
     from dynsim.engine import REFERENCES, SIMULATION
 
-    # In 80 columns all fits up to 9999 s: the bar gives way, the times do not.
+    # Fits into 80 columns up to 9999 s: the bar shrinks, the times do not.
     done = "{task.completed:.2f} / {task.total:g} s {task.fields[what]}"
     kernels: list[TaskID] = []
 
@@ -521,7 +517,7 @@ def progress(scenarios: Sequence[Scenario], quiet: bool) -> Iterator[VariantProg
             kernels.append(bars.add_task("kernels", total=now.expected or _COMPILED_S, what="compiled"))
         bars.update(kernels[0], completed=now.elapsed, visible=True)
 
-    with _bars("{task.description}", BarColumn(), done) as bars, _compilation_told(compiling):
+    with _bars("{task.description}", BarColumn(), done) as bars, _compilation_shown(compiling):
 
         def add(scenario: Scenario, kind: str, visible: bool) -> TaskID:
             title = scenario.variant or scenario.name
@@ -541,7 +537,7 @@ def progress(scenarios: Sequence[Scenario], quiet: bool) -> Iterator[VariantProg
 
 @contextmanager
 def sweep_progress(runs: int, quiet: bool) -> Iterator[Callable[[int, int], None]]:
-    """A bar over all runs of a sweep, with time, time to go and how many failed; yields its report."""
+    """Show a progress bar over all runs of a sweep, with the number of failed runs; yields the report function."""
     if quiet:
         _silence()
         yield lambda done, failed: None
@@ -556,12 +552,12 @@ def sweep_progress(runs: int, quiet: bool) -> Iterator[Callable[[int, int], None
             bar.update(task, failed="" if now is None else f"compiling, {now.elapsed:.0f} s")
 
     def report(done: int, failed: int) -> None:
-        # Not before: what refuses the sweep then stands alone.
+        # Started here, so that an error before the first run is printed without a bar.
         bar.start()
         bar.update(task, completed=done, failed=f"{failed} failed" if failed else "")
 
     try:
-        with _compilation_told(compiling):
+        with _compilation_shown(compiling):
             yield report
     finally:
         if bar.live.is_started:
@@ -570,21 +566,21 @@ def sweep_progress(runs: int, quiet: bool) -> Iterator[Callable[[int, int], None
 
 @contextmanager
 def plan_progress(quiet: bool) -> Iterator[Callable[[str, float], None]]:
-    """A bar over the stages of a plan of braces; yields its report of a stage and the share that is done."""
+    """Show a progress bar over the stages of a plan; yields the report function (stage, fraction done)."""
     if quiet:
         _silence()
         yield lambda stage, share: None
         return
     from rich.progress import BarColumn
 
-    with _bars("{task.description}", BarColumn()) as bar, _compilation_told():
+    with _bars("{task.description}", BarColumn()) as bar, _compilation_shown():
         task = bar.add_task("searching", total=1.0)
         yield lambda stage, share: bar.update(task, description=stage, completed=share)
 
 
 @contextmanager
 def film_progress(quiet: bool) -> Iterator[Callable[[int, int], None]]:
-    """A bar over the frames of a film, with time and time to go; yields its report."""
+    """Show a progress bar over the frames of a film; yields the report function."""
     if quiet:
         yield lambda done, total: None
         return
@@ -595,15 +591,12 @@ def film_progress(quiet: bool) -> Iterator[Callable[[int, int], None]]:
         yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
-# Table of a brace plan for the terminal.
-
-
-# A brace that is in contact for less than this part of the time counts as lifted off.
+# Table of a brace plan. A brace that is in contact for a smaller fraction of the time counts as lifted off.
 LIFTED = 0.999
 
 
 def print_plan(plan: BracePlan) -> None:
-    """Print a row for each number of braces, then reasons for refused plans, and plans that were not found."""
+    """Print a row for each number of braces, then the reasons for rejected and missing plans."""
     table = Table(title=f"{escaped(plan.task.scenario.title)}: braces", title_justify="left")
     heads = (
         "braces", "on", "heat [W]", "simulated [W]", "all energy [J]", "k_p [V/rad]", "forces [N]", "rounds",
@@ -615,16 +608,18 @@ def print_plan(plan: BracePlan) -> None:
         table.add_row(*_cells(size))
     console.print(table)
     if any(size.planned is not None and size.agreed == 0 for size in plan.sizes):
-        say("rounds: how many of the search found that heat by themselves; none, where exchanging braces found it")
+        print_line("rounds: search rounds that found this heat independently; 0 if only exchanging braces found it")
     best = plan.best
     if best is not None:
-        say(f"best: {escaped(best.label)}{', though it is refused' if best.survives is False else ''}")
+        print_line(f"best: {escaped(best.label)}{' (rejected)' if best.survives is False else ''}")
     for size in plan.sizes:
         for text in _notes(size):
-            say(f"{size.count} brace{'' if size.count == 1 else 's'}: {escaped(text)}")
+            print_line(f"{size.count} brace{'' if size.count == 1 else 's'}: {escaped(text)}")
     missed, reached = len(plan.tally.missed), len(plan.tally.reached)
     if missed:
-        say(f"no posture found for {missed} of {missed + reached} sets tried: not found, which does not say impossible")
+        print_line(
+            f"no posture found for {missed} of {missed + reached} sets tried; this does not prove that none exists"
+        )
 
 
 def _cells(size: Size) -> tuple[str, ...]:
@@ -646,26 +641,26 @@ def _cells(size: Size) -> tuple[str, ...]:
     )
 
 
-def _borne(shift_m: float | None, friction: float | None) -> list[str]:
-    """Errors that a refused plan bears, as far as they were tried."""
+def _tolerated(shift_m: float | None, friction: float | None) -> list[str]:
+    """Return the errors that a rejected plan tolerates, within the tested range."""
     texts = []
     if shift_m is not None:
-        texts.append(f"surfaces that are {1e3 * shift_m:.2g} mm off" if shift_m else "none of the surfaces tried")
+        texts.append(f"surfaces {1e3 * shift_m:.2g} mm off" if shift_m else "no tested error of the surfaces")
     if friction is not None:
-        texts.append(f"friction that is {100 * friction:.2g} % off" if friction else "none of friction tried")
-    return [f"of errors, each alone, up and down, bears {' and '.join(texts)}"] if texts else []
+        texts.append(f"friction {100 * friction:.2g} % off" if friction else "no tested error of friction")
+    return [f"tolerates, one error at a time in both directions, {' and '.join(texts)}"] if texts else []
 
 
 def _notes(size: Size) -> list[str]:
-    notes = [f"refused, {size.reason}"] if size.planned is not None and size.reason else []
+    notes = [f"rejected, {size.reason}"] if size.planned is not None and size.reason else []
     if size.planned is None:
         notes.append(size.reason)
     if size.verdict is not None and not size.verdict.sound:
-        notes.append(f"refused as planned with k_p = {size.k_p:g} V/rad: no errors of the scene were tried")
+        notes.append(f"rejected as planned with k_p = {size.k_p:g} V/rad: errors were not tested")
     for brace, share in ({} if size.nominal is None else size.nominal.closed).items():
         if share < LIFTED:
-            notes.append(f"{brace} lifts off, for {100.0 * (1.0 - share):.2g} % of the time of the run as planned")
+            notes.append(f"{brace} lifts off for {100.0 * (1.0 - share):.2g} % of the time in the run without errors")
     if size.tolerance is not None:
-        notes += _borne(*size.tolerance)
-    notes += [f"{label} would be cheaper, but: {why}" for label, why in size.cheaper]
+        notes += _tolerated(*size.tolerance)
+    notes += [f"{label} would need less heat, but: {why}" for label, why in size.cheaper]
     return notes

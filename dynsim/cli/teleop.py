@@ -10,7 +10,7 @@ import typer
 
 from dynsim.cli.app import QuietOption, ScenarioArgument, SetOption, VariantOption, folder_option, parsed_overrides
 from dynsim.cli.drawing import open_address, write_view
-from dynsim.cli.tables import console, errors, say, say_written
+from dynsim.cli.tables import console, errors, print_line, print_written
 from dynsim.errors import DynsimError
 from dynsim.system import interruption
 from dynsim.system.terminal import escaped
@@ -18,17 +18,23 @@ from dynsim.system.terminal import escaped
 if TYPE_CHECKING:
     from dynsim.teleop.web.live import DriveReport
 
-SpeedOption = Annotated[float, typer.Option(metavar="M/S", min=1e-3, max=10.0, help="Fastest hand or head.")]
-TurnOption = Annotated[float, typer.Option(metavar="RAD/S", min=1e-3, max=20.0, help="Fastest turn.")]
-BaseSpeedOption = Annotated[float, typer.Option(metavar="M/S", min=1e-3, max=10.0, help="Fastest mobile base.")]
-LongestOption = Annotated[float, typer.Option(metavar="S", min=1.0, max=36000.0, help="Longest drive.")]
+SpeedOption = Annotated[
+    float, typer.Option(metavar="M/S", min=1e-3, max=10.0, help="Maximum speed of the hand or head [m/s].")
+]
+TurnOption = Annotated[
+    float, typer.Option(metavar="RAD/S", min=1e-3, max=20.0, help="Maximum turning rate of the hand or head [rad/s].")
+]
+BaseSpeedOption = Annotated[
+    float, typer.Option(metavar="M/S", min=1e-3, max=10.0, help="Maximum speed of the mobile base [m/s].")
+]
+LongestOption = Annotated[float, typer.Option(metavar="S", min=1.0, max=36000.0, help="Maximum duration [s].")]
 HttpPortOption = Annotated[
-    int, typer.Option(metavar="N", min=0, max=65535, help="Of the page on this machine; 0: a free one.")
+    int, typer.Option(metavar="N", min=0, max=65535, help="Local port of the web page; 0 picks a free one.")
 ]
 UntilClosedOption = Annotated[
-    bool, typer.Option("--until-closed", help="End when the last browser is closed, not only by button or Ctrl-C.")
+    bool, typer.Option("--until-closed", help="Also end when the last browser window closes.")
 ]
-OpenOption = Annotated[bool, typer.Option("--open/--no-open", help="Open the page in a browser.")]
+OpenOption = Annotated[bool, typer.Option("--open/--no-open", help="Open the web page in a browser.")]
 
 # Ticks later than this are reported at the end [s].
 LATE = 0.05
@@ -38,7 +44,7 @@ def teleop(
     scenario: ScenarioArgument,
     variant: VariantOption = None,
     overrides: SetOption = None,
-    out: Annotated[Path | None, folder_option("results/SCENARIO/drive_N, a new one")] = None,
+    out: Annotated[Path | None, folder_option("a new folder results/SCENARIO/drive_N")] = None,
     speed: SpeedOption = 0.1,
     turn: TurnOption = 0.5,
     base_speed: BaseSpeedOption = 0.3,
@@ -48,10 +54,10 @@ def teleop(
     open_: OpenOption = True,
     quiet: QuietOption = False,
 ) -> None:
-    """Drive a scenario from a browser: keyboard, gamepad or sticks on the screen.
+    """Drive a scenario live from a browser with keyboard, gamepad or touch.
 
-    Velocities count only while the dead-man's key is held: space, a shoulder button, or a finger on a stick. The drive
-    is saved with a scenario that repeats it: `dynsim run FOLDER/scenario.yaml` gives the same record, bit for bit.
+    The robot moves only while the dead-man switch is held: space bar, shoulder button, or a finger on a stick. The
+    drive is saved; `dynsim run FOLDER/scenario.yaml` repeats it bit for bit.
     """
     require_websockets()
     from dynsim.engine.recording import RUN_FILES, save_drive
@@ -63,12 +69,12 @@ def teleop(
     loaded = load_scenario(scenario, variant, parsed_overrides(overrides))
     folder = out or new_folder(Path("results", loaded.name))
     check_writable(folder, RUN_FILES)
-    with console.status("loading the kernels; the first time they are compiled, which takes half a minute"):
+    with console.status("loading the kernels; the first time, compiling them takes half a minute"):
         session = begin(loaded, limits=SpeedLimits(speed, turn, base_speed), longest=longest)
     drive = LiveDrive(session, loaded.variant or loaded.name)
     try:
         address = drive.open(http_port)
-        tell_address(address, "Ctrl-C ends the drive and saves it", open_=open_)
+        print_address(address, "Ctrl-C ends the drive and saves it", open_=open_)
         drive.run(until_closed=until_closed)
     except KeyboardInterrupt:
         # Before the first tick.
@@ -78,47 +84,49 @@ def teleop(
         drive.close()
     report = drive.report
     if session.ticks == 0:
-        console.print(f"The drive is over ({escaped(report.ended)}) before it began; nothing is saved", soft_wrap=True)
+        console.print(f"The drive ended before it began ({escaped(report.ended)}); nothing was saved", soft_wrap=True)
         return
     record = session.record() if report.stop is None or report.stop.record is None else report.stop.record
     save_drive(record, folder)
     interruption.heed()
     if not quiet:
-        tell_drive(report, session.ticks * session.period, folder)
+        print_drive(report, session.ticks * session.period, folder)
     write_view({loaded.variant or loaded.name: record}, folder, quiet)
     if report.stop is not None:
-        errors.print(f"what was simulated until then is in {escaped(folder)}, marked incomplete")
+        errors.print(f"results up to the stop are in {escaped(folder)}, marked incomplete")
         raise report.stop
 
 
 def require_websockets() -> None:
-    """Raises DynsimError where the package is not installed."""
+    """Raise DynsimError if the package websockets is not installed."""
     try:
         import websockets  # noqa: F401
     except ModuleNotFoundError:
-        raise DynsimError("a live drive needs websockets: pip install 'dynsim[live]'") from None
+        raise DynsimError("live driving requires websockets: pip install 'dynsim[live]'") from None
 
 
-def tell_address(address: str, ending: str, *, open_: bool) -> None:
-    """Say where to drive; also with --quiet: nobody could drive without it."""
-    say(f"To be driven in a browser on this machine: {address}")
+def print_address(address: str, ending: str, *, open_: bool) -> None:
+    """Print the address of the page, even with --quiet, because driving requires it."""
+    print_line(f"Drive in a browser on this machine: {address}")
     console.print(ending, highlight=False)
     if open_:
         open_address(address)
 
 
 def new_folder(parent: Path) -> Path:
-    """The first of ``drive_1``, ``drive_2``, … that is not there: a drive cannot be made again by driving."""
+    """Return the first of ``drive_1``, ``drive_2``, … that does not exist; a drive must not overwrite another."""
     return next(folder for k in itertools.count(1) if not (folder := parent / f"drive_{k}").exists())
 
 
-def tell_drive(report: DriveReport, driven: float, folder: Path) -> None:
-    """How a drive of so many seconds went, where it is, and how it is repeated."""
+def print_drive(report: DriveReport, driven: float, folder: Path) -> None:
+    """Print the timing of a drive of ``driven`` seconds, its folder, and how to repeat it."""
     late = sorted(report.late)
     middle, most = 1e3 * late[len(late) // 2], 1e3 * late[-1 - len(late) // 100]
-    text = f"Driven for {driven:.1f} s ({escaped(report.ended)}); ticks late by {middle:.1f} ms, 99 % by {most:.1f} ms"
+    text = (
+        f"Driven for {driven:.1f} s ({escaped(report.ended)}); tick delay: median {middle:.1f} ms, 99 % {most:.1f} ms"
+    )
     behind = f"; {report.lost:.1f} s behind real time" if report.lost > LATE else ""
-    say(text + behind)
-    say_written(folder)
+    print_line(text + behind)
+    print_written(folder)
     script = escaped(folder / "scenario.yaml")
-    say(f"The same drive again: dynsim run {script}")
+    print_line(f"Repeat this drive: dynsim run {script}")
