@@ -70,7 +70,7 @@ _HOME = {
 }
 
 
-# Modules of their own.
+# Names that are modules.
 _MODULES = {"film": "dynsim.draw.film", "view": "dynsim.draw.page"}
 
 
