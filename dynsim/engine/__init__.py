@@ -117,7 +117,7 @@ def simulate(scenario: Scenario, progress: Progress | None = None, *, pictured: 
     >>> scenario = dynsim.load_scenario("single_pendulum", overrides={"duration_s": 1})
     >>> record = dynsim.simulate(scenario)
     >>> record["q"].shape, record.units["q"], record.complete
-    ((101, 1), 'rad', True)
+    ((201, 1), 'rad', True)
     """
     with named(scenario), remembering():
         interruption.heed()

@@ -135,7 +135,7 @@ class Simulation:
     1.0
     >>> record = simulation.record()
     >>> record["q"].shape, simulation.finished
-    ((101, 10), False)
+    ((201, 10), False)
     """
 
     def __init__(
@@ -326,7 +326,7 @@ class Simulation:
 
     @property
     def operator(self) -> Operator | SnakePilot | None:
-        """Handler that rewrites references: hand and base with ``controller.operator``, the snake with ``task_space``."""
+        """Handler that rewrites references: hand and base (``controller.operator``) or a snake (``task_space``)."""
         return self._operator
 
     @property
@@ -670,7 +670,7 @@ class Simulation:
         self._restart()
 
     def _plan_voltages(self, motors: NDArray[np.int64], share: float) -> None:
-        """Apply a share of the planned voltages to motors: 1 along their planned references, 0 along other references."""
+        """Apply a share of the planned voltages to motors: 1 along planned references, 0 along other references."""
         if len(planned := self._voltages):
             self._prepared.system.reference.voltage[:, motors] = share * planned[:, motors]
 
