@@ -7,37 +7,52 @@ from typing import Any, ClassVar
 
 
 class DynsimError(Exception):
-    """Base of all errors a user can meet; printed without a traceback."""
+    """Base class of all dynsim errors; the command line prints them without a traceback.
+
+    Attributes
+    ----------
+    exit_code : int
+        Exit code of the command line: 2 for invalid input, 3 if a run stopped early, 130 after Ctrl-C.
+
+    Examples
+    --------
+    >>> import dynsim
+    >>> try:
+    ...     dynsim.load_scenario("single_pendulum", overrides={"duration_s": -1})
+    ... except dynsim.DynsimError as error:
+    ...     print(type(error).__name__, error.exit_code)
+    ScenarioError 2
+    """
 
     exit_code: ClassVar[int] = 2
 
 
 def brief(value: object) -> str:
-    """Any value in an error message: in one line, and not long."""
+    """Return a value for an error message: on one line, at most 80 characters."""
     text = " ".join(repr(value).split())
     return text if len(text) <= 80 else f"{text[:77]}..."
 
 
 def first_few(names: Sequence[str], most: int = 4) -> str:
-    """Names for a sentence: the first, and how many more there are."""
+    """Return the first ``most`` names as text, and the number of the remaining names."""
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 class ScenarioError(DynsimError):
-    """A scenario cannot be read or is not valid: the message names file, line, key, value and the fix."""
+    """A scenario cannot be read or is invalid; the message names file, line, key, value and fix."""
 
 
 class PluginError(DynsimError):
-    """A member of a family that is not there, or is in a package outside dynsim and does not work."""
+    """A plug-in (surface, motor, path, plant or controller) does not exist, or its package fails to load."""
 
 
 class ModelError(DynsimError):
-    """A description of bodies, joints, motors or contacts that no physics can be made of.
+    """Bodies, joints, motors or contacts do not define a valid physical model.
 
     Attributes
     ----------
     keys : tuple
-        Where in a scenario the fault is, for its line; empty where no one key is to blame.
+        Path of the faulty key in the scenario, to find its line; empty if no single key is at fault.
     """
 
     def __init__(self, message: str, *, keys: tuple[int | str, ...] = ()) -> None:
@@ -46,19 +61,19 @@ class ModelError(DynsimError):
 
 
 class UnreachableReference(DynsimError):
-    """A reference path that the named joints cannot follow (time and distance are in the message).
+    """The joints cannot follow a reference path; the message contains time and distance.
 
     Attributes
     ----------
     keys : tuple
-        Those of the path in a scenario, as of a :class:`ModelError`.
+        Key of the path in the scenario, as in :class:`ModelError`.
     """
 
     keys: ClassVar[tuple[int | str, ...]] = ("controller", "hand", "path")
 
 
 class CheckRefused(DynsimError):
-    """A motion that a robot must not make, or cannot; joint or body, time and margin are in the message."""
+    """A robot cannot or must not execute a motion; the message contains joint or body, time and margin."""
 
 
 class RecordError(DynsimError):
@@ -66,25 +81,25 @@ class RecordError(DynsimError):
 
 
 class MissingEntry(RecordError, KeyError):
-    """A record has no signal, or its summary no entry, of that name; the message lists those that there are."""
+    """A record has no signal, or its summary no entry, with that name; the message lists the known names."""
 
     # A KeyError shows its message in quotes.
     __str__ = Exception.__str__
 
 
 class SimulationStopped(DynsimError):
-    """The simulation could not go on (divergence, no solution, no progress).
+    """The simulation could not continue (divergence, no solution, no progress).
 
     Attributes
     ----------
     kind : str
-        Why, in a word, such as ``step_too_small``; empty where it is not the engine of the dynamics that stopped.
+        Reason as one word, such as ``step_too_small``; empty if the dynamics engine did not cause the stop.
     time : float
         Simulated time of the stop [s].
     state : dict[str, Any]
-        The last good state, by name.
+        Last good state: quantities and their values.
     record : Record | None
-        What was simulated until then.
+        Results up to the stop, if any.
     """
 
     exit_code: ClassVar[int] = 3
@@ -99,12 +114,12 @@ class SimulationStopped(DynsimError):
         self.record: Any = None
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # Exceptions travel between processes by their arguments alone; the state and record must come along.
+        # By default exceptions are pickled by their arguments alone; state and record are added here.
         return _rebuild, (type(self), str(self), self.time, self.state, self.kind, self.record)
 
 
 class SimulationInterrupted(SimulationStopped):
-    """The user pressed Ctrl-C; what was simulated so far is kept and marked incomplete."""
+    """The user pressed Ctrl-C; the results so far are kept and marked incomplete."""
 
     exit_code: ClassVar[int] = 130
 

@@ -1,1 +1,1 @@
-"""Translation of descriptions to tables and references: model, contacts, loads, postures, equilibrium, scene."""
+"""Compilation of descriptions to kernel tables and references: model, contacts, loads, postures, equilibrium, scene."""

@@ -1,4 +1,4 @@
-"""Braces of an arm, and their forces of least motor heat for given motions."""
+"""Braces of an arm, and their forces of least motor heat for prescribed motions."""
 
 from __future__ import annotations
 
@@ -21,22 +21,42 @@ MIN_N = 0.5
 
 @dataclass(frozen=True)
 class Brace:
-    """A point of a body that leans on a surface; its arrays are copies that cannot be written to.
+    """Brace contact of a body point on a surface (immutable).
 
-    Attributes
+    Parameters
     ----------
-    body : name of a body or frame
-    point : (3,) in its frame [m]
-    normal : (3,) of the surface, away from it, in the world
-    friction : μ
-    min_N : least normal force [N]
-    normal_force : [N], commanded; None: whatever gives the least heat
-    sliding : (3,) velocity along the surface, of which the direction counts: f_t = μ f_n against it; None: it is held
+    body : str
+        Name of a body or frame.
+    point : array_like, shape (3,)
+        Point in the frame of the body [m].
+    normal : array_like, shape (3,)
+        Normal of the surface in the world frame, pointing away from the surface; any length.
+    friction : float, optional
+        Friction coefficient μ ≥ 0.
+    min_N : float, optional
+        Minimum normal force [N].
+    normal_force : float, optional
+        Commanded normal force [N]; default: the force of least heat.
+    sliding : array_like, shape (3,), optional
+        Velocity along the surface in the world frame, of which only the direction counts: f_t = μ f_n against it;
+        default: the point does not slide, |f_t| ≤ μ f_n.
 
     Raises
     ------
     ModelError
-        No three finite numbers, no direction, a negative friction or least force, or a commanded one that pulls.
+        If a vector is not three finite numbers or has no direction, a value is negative, or the commanded force pulls.
+
+    Notes
+    -----
+    Arrays are stored as read-only copies. Used by :meth:`dynsim.Model.brace_statics`.
+
+    Examples
+    --------
+    >>> import dynsim
+    >>> brace = dynsim.Brace("link_7", point=[0, 0, 0], normal=[0, 0, 1], friction=0.1)
+    >>> model = dynsim.build_model(dynsim.load_scenario("elbow_comparison"))
+    >>> model.brace_statics(model.robot.initial, [0] * 10, [0] * 10, {"elbow_7": brace}).feasible
+    True
     """
 
     body: str
@@ -52,7 +72,7 @@ class Brace:
             if (value := getattr(self, name)) is not None:
                 object.__setattr__(self, name, _vector(name, value))
         if not self.normal.any():
-            raise ModelError(f"brace on {self.body}: normal {self.normal.tolist()} has no direction")
+            raise ModelError(f"brace on {self.body}: normal must not be the zero vector")
         if not 0.0 <= self.friction < np.inf:
             raise ModelError(f"brace on {self.body}: friction {self.friction} must be zero or positive")
         if not 0.0 <= self.min_N < np.inf:
@@ -63,43 +83,50 @@ class Brace:
             )
         if self.sliding is not None and not _is_along(self.sliding, self.normal):
             raise ModelError(
-                f"brace on {self.body}: sliding {self.sliding.tolist()} has no direction along the surface"
+                f"brace on {self.body}: sliding must have a component along the surface, got {self.sliding.tolist()}"
             )
 
 
 def _is_along(sliding: Array, normal: Array) -> bool:
-    """Whether a velocity has a part along the surface that is more than rounding."""
+    """Return whether a velocity has a component along the surface that is larger than rounding."""
     across = np.linalg.norm(np.cross(normal, sliding))
     return bool(across > 1e-12 * np.linalg.norm(normal) * np.linalg.norm(sliding))
 
 
 def _vector(name: str, value: ArrayLike) -> Array:
-    """Three finite numbers, not to be written to."""
+    """Return three finite numbers as a read-only array."""
     try:
         vector = np.array(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise ModelError(f"brace: {name} must be three numbers, not {brief(value)}") from error
+        raise ModelError(f"brace: {name} must be three numbers, got {brief(value)}") from error
     if vector.shape != (3,) or not np.isfinite(vector).all():
-        raise ModelError(f"brace: {name} must be three finite numbers, not {brief(value)}")
+        raise ModelError(f"brace: {name} must be three finite numbers, got {brief(value)}")
     vector.flags.writeable = False
     return vector
 
 
 @dataclass(frozen=True)
 class BraceStatics:
-    """What :meth:`dynsim.Model.brace_statics` finds.
+    """Result of :meth:`dynsim.Model.brace_statics`.
 
     Attributes
     ----------
-    feasible : whether any forces and torques fulfil all constraints; if not, all of the others but ``certificate`` are
-        NaN or None
-    torques : (n,) of the motors, tau = K_m i [N m or N]
-    heat : Σ R i² [W]
-    forces : by brace, (3,) on the arm in the world [N]
-    normal_forces : by brace [N]
-    intervals : by brace, least and largest normal force with which the motion is still possible [N]
-    certificate : (n,) joint rates ω that show that nothing does: for all torques within their limits and all forces of
-        the braces, ω·(tau + Jᵀ f) < ω·(M v̇ + h + g + losses), which would have to be equal; None where feasible
+    feasible : bool
+        True if forces and torques exist that satisfy all constraints; otherwise all results except ``certificate`` are
+        NaN.
+    torques : (n,) ndarray
+        Motor torques tau = K_m i [N m or N].
+    heat : float
+        Motor heat Σ R i² [W].
+    forces : dict of str to (3,) ndarray
+        Force of each brace on the arm in the world frame [N].
+    normal_forces : dict of str to float
+        Normal force of each brace [N].
+    intervals : dict of str to (float, float)
+        Minimum and maximum normal force of each brace for which the motion is possible [N].
+    certificate : (n,) ndarray or None
+        If infeasible, joint rates ω that prove it: for all torques within their limits and all admissible brace forces,
+        ω·(tau + Jᵀ f) < ω·(M v̇ + h + g + losses), although both sides would have to be equal.
     """
 
     feasible: bool
@@ -112,33 +139,56 @@ class BraceStatics:
 
 
 class BracePlanner:
-    """Braces of a robot as the tables of the kernels, and room for them.
+    """Kernel tables of the braces of a robot, with workspace.
 
     Parameters
     ----------
-    robot, model : the description and its arrays
-    links : (c,) int, the body of each brace
+    robot : Robot
+        Description of the robot.
+    model : ModelArrays
+        Its kernel tables.
+    links : (c,) sequence of int
+        Body of each brace.
     """
 
     def __init__(self, robot: Robot, model: ka.ModelArrays, links: Sequence[int]) -> None:
         if robot.couplings:
-            raise ModelError("brace_statics: not for robots with coupled joints, which share a motor")
+            raise ModelError("brace_statics: coupled joints are not supported, because they share a motor")
         self._model, self._ws = model, ka.workspace(len(robot.links), 0, 0)
         drives = {motor.joint: motor for motor in robot.motors}
         motors = np.array([_motor_row(drives.get(joint)) for joint in robot.joint_names])
         self.arrays = kb.brace_arrays(integers(links), reals(motors))
 
     def motion(self, points: Array, q: Array, v: Array) -> tuple[Array, Array]:
-        """Positions and velocities of points of the braces' bodies, (c, 3) [m], along a motion, both (T, c, 3)."""
+        """Return positions and velocities of points on the braces' bodies along a motion, both (T, c, 3).
+
+        ``points`` has shape (c, 3) [m].
+        """
         positions, velocities = np.zeros((2, len(q), len(points), 3))
         self.arrays.table[:, kb.POINT : kb.POINT + 3] = points
         brace_motion(self._model, self._ws, self.arrays, reals(q), reals(v), positions, velocities)
         return positions, velocities
 
     def least_heat(self, q: Array, v: Array, vdot: Array, tables: Array) -> tuple[Array, Array, int]:
-        """Torques (T, n) [N m] and normal forces (T, c) [N] of least heat along a motion, and at how many instants.
+        """Compute torques and normal forces of least heat along a motion.
 
-        ``tables`` : (T, c, BRACE_SIZE) of :func:`brace_rows`
+        Parameters
+        ----------
+        q : (T, nq) ndarray
+            Positions [rad or m].
+        v, vdot : (T, n) ndarray
+            Rates and accelerations.
+        tables : (T, c, BRACE_SIZE) ndarray
+            Rows of :func:`brace_rows`.
+
+        Returns
+        -------
+        torques : (T, n) ndarray
+            Torques [N m or N].
+        normal : (T, c) ndarray
+            Normal forces [N].
+        solved : int
+            Number of samples solved before the first infeasible one.
         """
         torques, normal = np.zeros(v.shape), np.zeros(tables.shape[:2])
         solved = brace_statics(
@@ -148,7 +198,7 @@ class BracePlanner:
 
 
 class PreparedBraces:
-    """Some braces of a robot with all that does not change from one state to the next."""
+    """Braces of a robot with everything that does not change between states."""
 
     def __init__(self, robot: Robot, model: ka.ModelArrays, braces: Mapping[str, Brace]) -> None:
         self.names, self.braces = tuple(braces), tuple(braces.values())
@@ -166,12 +216,12 @@ class PreparedBraces:
         self._q, self._v, self._vdot = np.zeros((1, robot.nq)), np.zeros((1, n)), np.zeros((1, n))
         self._torques, self._normal = np.zeros((1, n)), np.zeros((1, len(braces)))
 
-    def are(self, braces: Mapping[str, Brace]) -> bool:
-        """Whether these are the same objects under the same names, so that nothing of them can have changed."""
+    def match(self, braces: Mapping[str, Brace]) -> bool:
+        """Return whether these are the same objects under the same names, so that they cannot have changed."""
         return self.names == tuple(braces) and all(a is b for a, b in zip(self.braces, braces.values(), strict=True))
 
     def solve(self, q: Array, v: Array, vdot: Array) -> BraceStatics:
-        """For one state."""
+        """Solve the brace forces for one state."""
         arrays = self._arrays
         self._q[0], self._v[0], self._vdot[0] = q, v, vdot
         solved = brace_statics(
@@ -194,15 +244,22 @@ class PreparedBraces:
 
 
 def brace_rows(point: Array, normals: Array, friction: Array, least: float, commanded: float, sliding: Array) -> Array:
-    """Rows of the table of the kernels for one brace along a motion, (T, BRACE_SIZE).
+    """Return the kernel table rows of one brace along a motion, (T, BRACE_SIZE).
 
     Parameters
     ----------
-    point : (3,), or one for each instant (T, 3), on its link [m]
-    normals : (T, 3) of any length
-    friction : (T,)
-    least, commanded : [N], NaN for no commanded force
-    sliding : (T, 3), zero where it is held
+    point : (3,) or (T, 3) ndarray
+        Point on its link [m].
+    normals : (T, 3) ndarray
+        Surface normals of any length.
+    friction : (T,) ndarray
+        Friction coefficients.
+    least : float
+        Minimum normal force [N].
+    commanded : float
+        Commanded normal force [N]; NaN for none.
+    sliding : (T, 3) ndarray
+        Slip velocities; zero if the point does not slide.
     """
     rows = np.zeros((len(normals), kb.BRACE_SIZE))
     normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
@@ -219,7 +276,7 @@ def brace_rows(point: Array, normals: Array, friction: Array, least: float, comm
 
 
 def _motor_row(motor: Motor | Servo | TorqueSource | None) -> Array:
-    """A row of the table of motors of the kernels; the limits follow from the rate."""
+    """Return a row of the kernel table of motors; its limits follow from the rate."""
     row = np.zeros(kb.MOTOR_SIZE)
     row[kb.CONSTANT] = 1.0
     if isinstance(motor, TorqueSource):

@@ -14,19 +14,26 @@ from dynsim.model.surfaces import Surface
 
 # Depth beyond its radius at which a body does not yet count as sinking [m]: the tolerance of contacts at the start.
 SLACK = 1e-6
-# Parts into which an axis is divided to find its depth in a box or a height field.
+# Number of parts of an axis for computing its depth in a box or a height field.
 POINTS = 16
 
 
 @dataclass(frozen=True)
 class Sinking:
-    """A body whose axis lay below a surface by more than its radius.
+    """A body whose axis was below a surface by more than its radius.
 
     Attributes
     ----------
-    depth : largest depth of the axis below the surface, over the samples [m]
-    radius : of the body [m]
-    sample : index of the first sample at which it lay deeper than its radius
+    body : str
+        Name of the body.
+    surface : str
+        Name of the surface.
+    depth : float
+        Largest depth of the axis below the surface over all samples [m].
+    radius : float
+        Radius of the body [m].
+    sample : int
+        Index of the first sample with a depth larger than the radius.
     """
 
     body: str
@@ -39,10 +46,20 @@ class Sinking:
 def poses(
     robot: Robot, q: Array, bodies: Collection[str] | None = None, directions: Array | None = None
 ) -> Iterator[tuple[Link, Array, Array]]:
-    """R_WB, (3, 3, T), and p_WB, (3, T) [m], of each body in turn at joint positions q, (T, nq).
+    """Yield each body with R_WB, (3, 3, T), and p_WB, (3, T) [m], at joint positions q, (T, nq).
 
-    Vectorised over the samples, which lie together in memory: thousands of them cost a millisecond. ``bodies``: only
-    these and those that carry them. ``directions``, (k, 3) in W: d·R_WB, (k, 3, T), and d·p_WB, (k, T), instead.
+    Vectorized over the samples, which are contiguous in memory: thousands of samples cost a millisecond.
+
+    Parameters
+    ----------
+    robot : Robot
+        Description of the robot.
+    q : (T, nq) ndarray
+        Joint positions [rad or m].
+    bodies : collection of str, optional
+        Only these bodies and the bodies that carry them; default: all.
+    directions : (k, 3) ndarray, optional
+        Directions d in W: yield d·R_WB, (k, 3, T), and d·p_WB, (k, T), instead.
     """
     view = np.eye(3) if directions is None else directions
     q = np.ascontiguousarray(q.T)
@@ -73,7 +90,7 @@ def poses(
         if link.kind == "prismatic":
             p = p + q[k] * (link.axis @ R)
         elif link.kind != "revolute":
-            # Later rows of a joint stay where its first one has put the body.
+            # Only the first row of a joint moves the body.
             if row.motion is not None:
                 turn, shift = row.motion(link, q[k : k + len(row.neutral)])
                 p = p + np.einsum("ijt,jt->it", R, shift)
@@ -89,9 +106,9 @@ def poses(
 
 
 def axis_ends(robot: Robot) -> dict[str, list[Array]]:
-    """Of each link the other ends of its axes, (3,) in its frame [m]; they begin at its joint.
+    """Return the end points of the axes of each link, (3,) in its frame [m]; the axes start at its joint.
 
-    :attr:`Link.tip`; without one the joints that it carries, and the hand.
+    The end is :attr:`Link.tip` if it is set, otherwise the joints that the link carries, and the hand.
     """
     tips: dict[str, list[Array]] = {link.name: [] if link.tip is None else [link.tip] for link in robot.links}
     open_ended = {link.name for link in robot.links if link.tip is None}
@@ -106,15 +123,15 @@ def axis_ends(robot: Robot) -> dict[str, list[Array]]:
 def gaps(
     robot: Robot, q: Array, points: Mapping[str, Sequence[tuple[Surface, Array]]]
 ) -> Iterator[tuple[Link, list[Array]]]:
-    """Signed distances, (T,) [m], of points from surfaces, of each body in turn at joint positions q, (T, nq).
+    """Yield each body with the signed distances, (T,) [m], of its points from surfaces, at joint positions q, (T, nq).
 
-    ``points`` : by body, with the surface of each; (3,) in the body's frame [m]. Of planes alone only what counts
-    along their normals is computed, a third.
+    ``points`` contains surface and point, (3,) in the body's frame [m], for each body. If all surfaces are planes, only
+    components along their normals are computed, which takes a third of the time.
     """
     surfaces = {id(surface): surface for pairs in points.values() for surface, _ in pairs}
     planes = {key: surface for key, surface in surfaces.items() if is_plane(surface)}
     flat = len(planes) == len(surfaces)
-    # Of each plane its place among the normals, and its distance from the origin.
+    # Index among the normals, and distance from the origin, for each plane.
     rows = {key: (k, surface.c / np.linalg.norm(surface.b)) for k, (key, surface) in enumerate(planes.items())}
     normals = np.array([surface.b / np.linalg.norm(surface.b) for surface in planes.values()])
     for link, R, p in poses(robot, q, points, normals if flat else None):
@@ -132,19 +149,19 @@ def gaps(
 
 
 def is_plane(surface: Surface) -> TypeGuard[Quadric]:
-    """True for a quadric without curvature."""
+    """Return True for a quadric without curvature."""
     return isinstance(surface, Quadric) and not surface.Q.any()
 
 
 def sinking(robot: Robot, surfaces: Mapping[str, Surface], q: Array) -> list[Sinking]:
-    """Bodies whose axes lie below a surface by more than their radius, at samples q, (T, nq).
+    """Return the bodies whose axes are below a surface by more than their radius, at samples q, (T, nq).
 
-    The axes of a body are those of :func:`axis_ends`. A body of unknown radius has radius zero.
+    The axes are defined by :func:`axis_ends`. A body of unknown radius has radius zero.
     """
     sunk: list[Sinking] = []
     if not surfaces or not len(q):
         return sunk
-    # Of a run that diverged the last samples may be beyond what squares of floats can hold.
+    # The last samples of a diverged run may overflow when squared.
     with np.errstate(over="ignore", invalid="ignore"):
         for link, name, gap in _axis_gaps(robot, surfaces, q):
             if gap.min() >= -link.radius - SLACK:
@@ -157,12 +174,14 @@ def sinking(robot: Robot, surfaces: Mapping[str, Surface], q: Array) -> list[Sin
 
 
 def by_surface(sunk: Sequence[Sinking]) -> dict[str, list[Sinking]]:
-    """Bodies below each surface that has any below it, by its name."""
+    """Return the sinking bodies for each surface that has any."""
     return {surface: [s for s in sunk if s.surface == surface] for surface in dict.fromkeys(s.surface for s in sunk)}
 
 
 def _axis_gaps(robot: Robot, surfaces: Mapping[str, Surface], q: Array) -> Iterator[tuple[Link, str, Array]]:
-    """Least distance of each body's axes from each surface, (T,) [m]; at their ends where all surfaces are planes."""
+    """Yield the minimum distance of each body's axes from each surface, (T,) [m]; at their ends if all surfaces are
+    planes.
+    """
     tips, carriers = axis_ends(robot), robot.carriers
     bodies = [link.name for link in robot.links if link.name not in carriers]
     if all(map(is_plane, surfaces.values())):
@@ -184,10 +203,11 @@ def _axis_gaps(robot: Robot, surfaces: Mapping[str, Surface], q: Array) -> Itera
 
 
 def _segment_gap(surface: Surface, start: Array, along: Array) -> Array:
-    """Least signed distance of the lines from ``start`` to ``start + along``, (T, 3), without that of their beginning.
+    """Return the minimum signed distance of the lines from ``start`` to ``start + along``, (T, 3), without the start
+    points.
 
-    Exact for plane, sphere and cylinder, whose distance grows with C: along a line C is a parabola. Of other surfaces
-    the least of some points on the lines.
+    Exact for plane, sphere and cylinder, whose distance increases with C: along a line C is a parabola. For other
+    surfaces, the minimum over some points on the lines.
     """
     gap = surface.gaps(start + along)
     if not isinstance(surface, Quadric):

@@ -23,54 +23,64 @@ from dynsim.system.memo import recall
 if TYPE_CHECKING:
     from dynsim.snake.description import TaskSpaceController
 
-# Samples in a segment of the reference splines, and segments that are sampled together.
+# Samples per segment of the reference splines, and segments that are sampled together.
 _PER_SEGMENT = 4
 _PIECE = 4096
-# Knots that the longest steps of an implicit method straddle (of 20 ms; 55 ms in the published arm).
+# Knots spanned by the longest steps of an implicit method (20 ms; 55 ms for the published arm).
 _STRADDLED = 3.0
 
-# Times within this of the end of references count as at it, relative to that time.
+# Times within this of the end of the references count as at the end, relative to that time.
 END_SLACK = 1e-12
 
-# Keys of a controller that plan for a whole run, which an operator does not know.
+# Controller keys that plan for a whole run and are not available with an operator.
 PLANNED = ("hand", "base", "joints", "torques", "feed_forward", "brace")
 
-# Positions of a joint: samples, (T,) [rad or m], or a function of times, (T,) [s], that gives them.
+# Positions of a joint: samples, (T,) [rad or m], or a function of times, (T,) [s].
 JointMotion = ArrayLike | Callable[[NDArray[np.float64]], ArrayLike]
 
 
 @runtime_checkable
 class HandPath(Protocol):
-    """A path in space."""
+    """A path of the hand in space."""
 
     def position(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Positions at times t [s], shape (T,) → (T, 3) [m]."""
+        """Return positions at times t [s], shape (T,) → (T, 3) [m]."""
 
 
 @runtime_checkable
 class BasePath(Protocol):
-    """A motion of a mobile base without side slip; the way to its place follows."""
+    """A motion of a mobile base without side slip; its position follows from it."""
 
     def motion(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Distance ahead [m] and turn to the left [rad] since the start at times t [s], shape (T,) → (T, 2)."""
+        """Return distance ahead [m] and turn to the left [rad] since the start at times t [s], shape (T,) → (T, 2)."""
 
 
 def held_values(robot: Robot) -> NDArray[np.float64]:
-    """What motors without a moving reference hold, (na,): the initial position of the joint; no torque of a source."""
+    """Return the references of motors that do not move, (na,): initial joint positions; zero for torque sources."""
     initial = dict(zip(robot.joint_names, robot.initial[list(robot.position_index)], strict=True))
     return np.array([0.0 if isinstance(m, TorqueSource) else initial[m.joint] for m in robot.motors])
 
 
 @dataclass(frozen=True)
 class JointControl:
-    """Gains of the voltage PD per motor [V/rad, V s/rad], joint references, and the path the hand is to follow.
+    """Gains of the voltage PD controller per motor, joint references, and the path of the hand.
 
-    Only DC motors take the gains; ``k_p`` of a servo says whether it follows its position. References of a torque
-    source are its torques [N m]. ``sample_time`` is the period [s] at which commands are taken, to be held in between;
-    None: they follow the state continuously. Where there is ``teleop``, an operator rewrites references on the way.
-    ``orientation`` : rotation of the hand in the world that goes with ``path``, (3, 3); None: any.
-    None: they follow the state continuously. Where there is ``teleop``, an operator rewrites references on the way, and
-    where there is ``task_space``, the controller of a snake does.
+    Attributes
+    ----------
+    k_p, k_d : (na,) ndarray
+        Gains [V/rad, V s/rad]; only DC motors use them, but ``k_p`` of a servo shows whether it follows its position.
+    reference : ReferenceArrays
+        Joint references; for a torque source its torques [N m].
+    path : HandPath or None
+        Path that the hand is to follow.
+    sample_time : float or None
+        Period at which commands are computed and then held [s]; None: they follow the state continuously.
+    teleop : TeleopOptions or None
+        If set, an operator rewrites the references during the run.
+    orientation : (3, 3) ndarray or None
+        Rotation of the hand in the world along ``path``; None: any.
+    task_space : TaskSpaceController or None
+        If set, the controller of a snake rewrites the references during the run.
     """
 
     k_p: NDArray[np.float64]
@@ -84,9 +94,9 @@ class JointControl:
 
     @classmethod
     def absent(cls, robot: Robot, targets: Mapping[str, float] | None = None) -> JointControl:
-        """No controller: DC motors have zero volts and brake, servos hold where they start, torque sources rest.
+        """Return a control without controller: DC motors at zero volts, servos at their start, torque sources at zero.
 
-        ``targets`` : what motors hold instead, by joint [rad or m]
+        ``targets`` replaces the references of some joints [rad or m].
         """
         motors, values = len(robot.motors), held_values(robot)
         for a, motor in enumerate(robot.motors):
@@ -105,24 +115,33 @@ class JointControl:
         sample_time: float | None = None,
         voltages: ArrayLike | None = None,
     ) -> JointControl:
-        """The voltage PD u = k_p (q_d − q) + k_d (v_d − v) on joint positions that are given as samples or functions.
+        """Return the voltage PD controller u = k_p (q_d − q) + k_d (v_d − v) for joint positions given as samples or
+        functions.
 
-        q_d is a quintic spline through the samples, v_d its derivative. Joints without positions hold their first.
+        q_d is a quintic spline through the samples, v_d its derivative. Joints without positions keep their initial
+        position.
 
         Parameters
         ----------
-        robot : whose motors are controlled
-        k_p, k_d : one for all motors, or (na,) in their order [V/rad, V s/rad; V/m, V s/m at prismatic joints]
-        times : (T,) [s], equally spaced, T ≥ 6, from 0 to the end of the run
-        positions : by joint, (T,) positions [rad or m], or a function that gives them for ``times``
-        path : what the hand is to follow, for tracking errors in summary and figures
-        sample_time : period of a zero-order hold of the voltages [s]; None: continuous
-        voltages : (T, na), planned ones that are added to those of DC motors [V]; None: none
+        robot : Robot
+            Robot with the motors.
+        k_p, k_d : array_like, shape () or (na,)
+            One gain for all motors, or one per motor [V/rad, V s/rad; V/m, V s/m at prismatic joints].
+        times : array_like, shape (T,), optional
+            Equally spaced times from 0 to the end of the run [s], T ≥ 6.
+        positions : mapping of str to array_like or callable, optional
+            Positions, (T,) [rad or m], for each joint, or a function that returns them for ``times``.
+        path : HandPath, optional
+            Path of the hand, for tracking errors in summary and figures.
+        sample_time : float, optional
+            Period of a zero-order hold of the voltages [s]; default: continuous.
+        voltages : array_like, shape (T, na), optional
+            Planned voltages added to the voltages of DC motors [V].
 
         Raises
         ------
         ModelError
-            A joint that has no motor, or samples, times or gains whose shape or values do not fit.
+            If a joint has no motor, or shape or values of samples, times or gains are invalid.
         """
         positions = positions or {}
         driven = [motor.joint for motor in robot.motors]
@@ -130,19 +149,19 @@ class JointControl:
         gains = _gains("k_p", k_p, len(driven)), _gains("k_d", k_d, len(driven))
         for name in positions:
             if name not in driven:
-                raise ModelError(f"{name!r} is no joint with a motor; those are: {', '.join(driven) or 'none'}")
+                raise ModelError(f"joint {name!r} has no motor; joints with a motor: {', '.join(driven) or 'none'}")
         if not positions and voltages is None:
             return cls(*gains, _reference(values), path, sample_time)
         grid = np.asarray(times, dtype=np.float64)
         if grid.ndim != 1 or len(grid) < 6 or not np.allclose(np.diff(grid), grid[1] - grid[0], rtol=1e-6, atol=0.0):
-            raise ModelError("references need six or more equally spaced times [s]")
+            raise ModelError("times must be six or more equally spaced times [s]")
         if not grid[1] > grid[0]:
-            raise ModelError("the times of references must increase")
+            raise ModelError("times must increase")
         columns = []
         for name, motion in positions.items():
             column = np.asarray(motion(grid) if callable(motion) else motion, dtype=np.float64)
             if column.shape != grid.shape or not np.isfinite(column).all():
-                raise ModelError(f"the reference of {name} needs {len(grid)} finite positions, one for each time")
+                raise ModelError(f"the reference of {name} must be {len(grid)} finite positions, one for each time")
             columns.append(column)
         spline = np.full(len(driven), ka.HELD_POSITION)
         for k, name in enumerate(positions):
@@ -156,22 +175,23 @@ class JointControl:
         if voltages is not None:
             planned = np.asarray(voltages, dtype=np.float64)
             if planned.shape != (len(grid), len(driven)) or not np.isfinite(planned).all():
-                raise ModelError(f"voltages must be finite, one of each of {len(driven)} motors for each time")
+                raise ModelError(f"voltages must be finite with shape ({len(grid)}, {len(driven)}): times, motors")
             reference = reference._replace(voltage=quintic_coefficients(spacing, planned))
         return cls(*gains, reference, path, sample_time)
 
     @property
     def end(self) -> float:
-        """Time up to which the moving references are known [s]; infinite when all hold."""
+        """Time up to which the moving references are defined [s]; infinite if none moves."""
         begin, spacing = self.reference.grid
         moving = bool((self.reference.spline >= 0).any())
         return float(begin + spacing * len(self.reference.coefficients)) if moving else np.inf
 
     def bends(self, rtol: float, atol: float) -> NDArray[np.float64]:
-        """Knots at which references bend within a long step [s], increasing: error control samples them too thinly.
+        """Return the knots at which references bend within a long step [s], increasing: error control samples them too
+        coarsely.
 
-        The fifth derivative jumps there: three knots further on the polynomials of the segments before and behind
-        differ by more than ``atol`` + ``rtol`` × the spline's span. Commands that are taken at ticks bend nowhere.
+        The fifth derivative jumps there: three knots later, the polynomials of the adjacent segments differ by more
+        than ``atol`` + ``rtol`` × the span of the spline. Sampled commands do not bend.
         """
         spacing, times = float(self.reference.grid[1]), []
         for splines in (self.reference.coefficients, self.reference.voltage):
@@ -186,14 +206,15 @@ class JointControl:
         return np.asarray(self.reference.grid[0] + spacing * (knots + 1.0))
 
     def positions(self, robot: Robot) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-        """Times, (T,) [s], and the coordinates, (T, nq), of the references, in pieces of some thousand samples.
+        """Yield times, (T,) [s], and coordinates, (T, nq), of the references, in pieces of some thousand samples.
 
-        Taken at the knots and at three times between two of them. Joints without a moving reference stay where they
-        start; a base is where its wheels roll it.
+        Sampled at the knots and at three times between adjacent knots. Joints without a moving reference stay at their
+        start; a base moves as its wheels roll.
 
         Parameters
         ----------
-        robot : whose motors follow the references
+        robot : Robot
+            Robot whose motors follow the references.
         """
         reference, q, start = self.reference, robot.initial, None
         begin, spacing = reference.grid
@@ -215,7 +236,9 @@ class JointControl:
             yield times.ravel(), positions
 
     def _wheels(self, robot: Robot, segments: slice) -> NDArray[np.float64]:
-        """References of the wheels of a mobile base as splines, (segments, 2, 6); of one that holds, its angle."""
+        """Return the wheel references of a mobile base as splines, (segments, 2, 6); constant for a wheel that does not
+        move.
+        """
         assert robot.base is not None
         k, _ = base_row(robot)
         driven = [motor.joint for motor in robot.motors]
@@ -229,9 +252,9 @@ class JointControl:
         return angles
 
     def base_target(self, robot: Robot, t: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        """Where the references of its wheels take a mobile base: x, y [m], heading [rad] at times t [s], (T, 3).
+        """Return the target of a mobile base from its wheel references: x, y [m], heading [rad] at times t [s], (T, 3).
 
-        None without a base, or where a wheel follows nothing.
+        Returns None without a base, or if a wheel has no reference.
         """
         follows = {motor.joint for motor, k_p in zip(robot.motors, self.k_p, strict=True) if k_p > 0.0}
         if robot.base is None or not follows.issuperset(robot.base.wheels):
@@ -244,28 +267,28 @@ class JointControl:
         return base_pose(robot, q)
 
     def target(self, t: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        """Target of the hand at times t, (T, 3) [m]; None without a path.
+        """Return the target of the hand at times t, (T, 3) [m]; None without a path.
 
-        It holds where the references end, as they do.
+        After the end of the references the target is constant.
         """
         if self.path is None:
             return None
         end = self.end
-        # References of a whole run may end a rounding before it, where the target is that of its last sample.
+        # References of a whole run may end earlier by rounding; the target there is the one at their last sample.
         ended = t > end + END_SLACK * max(1.0, abs(end))
         return targets_on(self.path, np.where(ended, end, t) if ended.any() else t)
 
 
 def targets_on(path: HandPath, t: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Positions on a path at times t [s], (T,) → (T, 3) [m], unless they are known."""
+    """Return positions on a path at times t [s], (T,) → (T, 3) [m], computed only once."""
     return recall("targets", lambda: path.position(t), path, t)
 
 
 def _gains(name: str, value: ArrayLike, motors: int) -> NDArray[np.float64]:
-    """A gain for each motor, (na,)."""
+    """Return one gain per motor, (na,)."""
     gains = np.asarray(value, dtype=np.float64)
     if gains.shape not in ((), (motors,)) or not (np.isfinite(gains).all() and (gains >= 0.0).all()):
-        raise ModelError(f"{name} must be one gain, or one for each of {motors} motors, finite and not negative")
+        raise ModelError(f"{name} must be one non-negative finite gain, or one per motor ({motors})")
     return np.full(motors, gains) if gains.ndim == 0 else gains
 
 
@@ -275,7 +298,7 @@ def _reference(
     grid: tuple[float, float] = (0.0, 1.0),
     coefficients: NDArray[np.float64] | None = None,
 ) -> ReferenceArrays:
-    """References as the kernels take them: ``values``, (na,), where ``spline`` is HELD_POSITION, else that column."""
+    """Return references for the kernels: ``values``, (na,), if ``spline`` is HELD_POSITION, otherwise this column."""
     return ReferenceArrays(
         spline=integers(np.full(len(values), ka.HELD_POSITION) if spline is None else spline),
         held=reals(values),

@@ -1,16 +1,16 @@
 """Derivatives of inverse dynamics in closed form, after Singh, Russo and Wensing (2022).
 
-Six-vectors at the world origin: motions (ω, v), forces (n, f). × is the cross product of motions, ×* that of a motion
-and a force, and (F ×̄*) V = V ×* F. S is the axis of a joint, V and A (less gravity) velocity and acceleration of its
-body, V_p and A_p those of the body that it is mounted on; I and f are spatial inertia and wrench of a body; I_c, f_c
-and B_c are sums of I, f and B over a subtree:
+Six-vectors at the world origin: motions (ω, v), forces (n, f). × is the cross product of motions, ×* of a motion and a
+force, and (F ×̄*) V = V ×* F. S is the axis of a joint, V and A (minus gravity) are velocity and acceleration of its
+body, V_p and A_p of the body it is mounted on; I and f are spatial inertia and wrench of a body; I_c, f_c and B_c are
+sums of I, f and B over a subtree:
 
     S' = V_p × S,   S'' = A_p × S + V_p × S',   Ṡ = V × S
     2 B = (V ×*) I − I (V ×) + (I V) ×̄*
 
     ∂τ_i/∂q_j = S_i · (2 B_c S'_j + I_c S''_j)                    j an ancestor of i, or i
     ∂τ_j/∂q_i = S_j · (2 B_c S'_i + I_c S''_i + S_i ×* f_c)       j an ancestor of i
-    ∂τ_i/∂v_j, ∂τ_j/∂v_i = S · (2 B_c S + I_c (S' + Ṡ))           likewise; B_c, I_c and f_c are those of link i
+    ∂τ_i/∂v_j, ∂τ_j/∂v_i = S · (2 B_c S + I_c (S' + Ṡ))           likewise, with B_c, I_c and f_c of link i
 """
 
 from __future__ import annotations
@@ -31,9 +31,12 @@ class InverseDynamicsDerivatives:
 
     Attributes
     ----------
-    q : (n, n) ∂tau/∂q [N m/rad]; column j is that of a motion along rate j: of ball joints a turn about the body's axes
-    v : (n, n) ∂tau/∂v [N m s/rad]
-    vdot : (n, n) ∂tau/∂v̇ = M [kg m²]
+    q : (n, n) ndarray
+        ∂tau/∂q [N m/rad]. Column j is for a motion along rate j; for ball joints, a rotation about the body's axes.
+    v : (n, n) ndarray
+        ∂tau/∂v [N m s/rad].
+    vdot : (n, n) ndarray
+        ∂tau/∂v̇ = M [kg m²].
     """
 
     q: Array
@@ -42,7 +45,7 @@ class InverseDynamicsDerivatives:
 
 
 def inverse_dynamics_derivatives(arrays: ModelArrays, links: Array) -> InverseDynamicsDerivatives:
-    """Derivatives at the state that a sweep with rates, accelerations and gravity has left in ``links``."""
+    """Return the derivatives at the state in ``links`` after a sweep with rates, accelerations and gravity."""
     n = len(arrays.tree)
     parent = arrays.tree[:, ka.PARENT]
     base = arrays.tree[:, ka.BASE]
@@ -78,17 +81,19 @@ def inverse_dynamics_derivatives(arrays: ModelArrays, links: Array) -> InverseDy
 
 
 def _joint_bodies(parent: NDArray[np.int64], base: NDArray[np.int64]) -> NDArray[np.int64]:
-    """For each row the link of the body that its joint carries: that of the joint's last row."""
+    """Return for each row the link of the body that its joint carries: the link of the joint's last row."""
     body = np.arange(len(parent), dtype=np.int64)
     for i in range(len(parent) - 1, 0, -1):
-        # A later row of a joint is mounted where the row before it, its parent, is.
+        # A later row of a joint has the same mounting as its parent, the row before it.
         if parent[i] >= 0 and base[i] == base[parent[i]] and base[i] != parent[i]:
             body[parent[i]] = body[i]
     return body
 
 
 def _composites(arrays: ModelArrays, links: Array, V: Array, A: Array) -> tuple[Array, Array, Array]:
-    """Of each body alone: inertia (n, 6, 6), 2 B (n, 6, 6), wrench I A + V ×* I V (n, 6), at the world origin."""
+    """Return inertia (n, 6, 6), 2 B (n, 6, 6) and wrench I A + V ×* I V (n, 6) of each single body, at the world
+    origin.
+    """
     tables = arrays.body
     n = len(tables)
     R, p = links[:, ka.R : ka.R + 9].reshape(n, 3, 3), links[:, ka.P : ka.P + 3]
@@ -109,7 +114,7 @@ def _composites(arrays: ModelArrays, links: Array, V: Array, A: Array) -> tuple[
 
 
 def _skew(a: Array) -> Array:
-    """[a]× of vectors (…, 3), (…, 3, 3)."""
+    """Return [a]× of vectors (…, 3), (…, 3, 3)."""
     zero = np.zeros(a.shape[:-1])
     x, y, z = a[..., 0], a[..., 1], a[..., 2]
     rows = [zero, -z, y, z, zero, -x, -y, x, zero]
@@ -117,7 +122,7 @@ def _skew(a: Array) -> Array:
 
 
 def _motion_matrix(V: Array) -> Array:
-    """(V ×) on motions, (…, 6, 6); that on forces is −(V ×)ᵀ."""
+    """Return (V ×) on motions, (…, 6, 6); on forces it is −(V ×)ᵀ."""
     out = np.zeros((*V.shape, 6))
     out[..., :3, :3] = out[..., 3:, 3:] = _skew(V[..., :3])
     out[..., 3:, :3] = _skew(V[..., 3:])
@@ -125,7 +130,7 @@ def _motion_matrix(V: Array) -> Array:
 
 
 def _force_matrix(F: Array) -> Array:
-    """(F ×̄*) with (F ×̄*) V = V ×* F, (…, 6, 6)."""
+    """Return (F ×̄*) with (F ×̄*) V = V ×* F, (…, 6, 6)."""
     out = np.zeros((*F.shape, 6))
     out[..., :3, :3] = -_skew(F[..., :3])
     out[..., :3, 3:] = out[..., 3:, :3] = -_skew(F[..., 3:])
@@ -133,12 +138,12 @@ def _force_matrix(F: Array) -> Array:
 
 
 def _cross_motion(V: Array, S: Array) -> Array:
-    """V × S of motions, (…, 6)."""
+    """Return V × S of motions, (…, 6)."""
     w, v = V[..., :3], V[..., 3:]
     return np.concatenate([np.cross(w, S[..., :3]), np.cross(w, S[..., 3:]) + np.cross(v, S[..., :3])], axis=-1)
 
 
 def _cross_force(V: Array, F: Array) -> Array:
-    """V ×* F of a motion and a wrench, (…, 6)."""
+    """Return V ×* F of a motion and a wrench, (…, 6)."""
     w, v = V[..., :3], V[..., 3:]
     return np.concatenate([np.cross(w, F[..., :3]) + np.cross(v, F[..., 3:]), np.cross(w, F[..., 3:])], axis=-1)

@@ -12,14 +12,14 @@ from dynsim.errors import ModelError, UnreachableReference
 from dynsim.model.description import Array, Contact, Robot
 
 ITERATIONS = 200
-# Longest step of a coordinate in one iteration [rad or m], against jumps to another branch of solutions.
+# Largest change of a coordinate in one iteration [rad or m]; prevents jumps to another solution branch.
 STEP_MAX = 0.3
-# Largest damping, far from the target; near it damping vanishes.
+# Maximum damping, far from the target; it vanishes near the target.
 DAMPING = 1e-2
 
 
 class Kinematics(Protocol):
-    """The part of :class:`dynsim.Model` that postures need."""
+    """The part of :class:`dynsim.Model` required to compute postures."""
 
     robot: Robot
     n: int
@@ -30,15 +30,15 @@ class Kinematics(Protocol):
 
 
 def turn_error(R: Array, wanted: Array) -> Array:
-    """Rotation vector that turns R to ``wanted``, (3,) [rad]."""
-    from scipy.spatial.transform import Rotation  # takes a third of a second
+    """Return the rotation vector that rotates R to ``wanted``, (3,) [rad]."""
+    from scipy.spatial.transform import Rotation  # import takes a third of a second
 
     return np.asarray(Rotation.from_matrix(wanted @ R.T).as_rotvec())
 
 
 def hand_turns(model: Kinematics, q: Array, orientation: Array) -> Array:
-    """Angles between the hand's orientation and a wanted one, postures (T, nq) → (T,) [rad]."""
-    from scipy.spatial.transform import Rotation  # takes a third of a second
+    """Return the angles between the hand's orientation and a target orientation, postures (T, nq) → (T,) [rad]."""
+    from scipy.spatial.transform import Rotation  # import takes a third of a second
 
     body, axes = model.robot.attach(*model.robot.hand)[0], model.robot.hand_axes
     R = np.array([model.body_pose(body, row)[0] for row in q]).reshape(-1, 3, 3)
@@ -54,12 +54,12 @@ def hand_posture(
     tolerance: float,
     moving: Sequence[str] | None = None,
 ) -> Array:
-    """See :meth:`dynsim.Model.inverse_kinematics`; ``moving`` : the joints that may move, None: all."""
+    """Find a posture, see :meth:`dynsim.Model.inverse_kinematics`; only the joints ``moving`` change, default: all."""
     robot = model.robot
     if robot.couplings or model.nq != model.n:
-        raise ModelError("inverse_kinematics: for arms whose joints each have a coordinate of their own")
+        raise ModelError("inverse_kinematics: coupled joints and joints with several coordinates are not supported")
     if any(contact.tip is not None for contact in braces):
-        raise ModelError("inverse_kinematics: braces are points or spheres, no axes of links")
+        raise ModelError("inverse_kinematics: braces must be points or spheres, not link axes")
     lower, upper = (np.array([getattr(link, side) for link in robot.links]) for side in ("lower", "upper"))
     revolute = np.array([link.units[0] == "rad" for link in robot.links])
     movable = np.array([moving is None or link.joint in moving for link in robot.links])
@@ -86,15 +86,15 @@ def hand_posture(
     stuck = f"; at their limits: {', '.join(at)}" if at else ""
     left = float(np.abs(error).max())
     raise UnreachableReference(
-        f"no posture near the start has hand, orientation and braces in place: {left:.3g} m or rad are left{stuck}; "
-        "start elsewhere, or ask for less"
+        f"no posture found for hand, orientation and braces near the start: residual {left:.3g} [m or rad]{stuck}; "
+        "change the start or relax a target"
     )
 
 
 def _stepped(
     q: Array, J: Array, error: Array, size: float, lower: Array, upper: Array, movable: NDArray[np.bool_]
 ) -> Array:
-    """A damped Gauss–Newton step; joints that it would take beyond their limits stay there, and the rest take over."""
+    """Return a damped Gauss–Newton step; joints at their limits stay there, and the other joints take over."""
     free = movable.copy()
     for _ in range(len(q)):
         A = J[:, free]
@@ -110,7 +110,7 @@ def _stepped(
 
 
 def _turning(model: Kinematics, body: int, R: Array, origin: Array, q: Array) -> Array:
-    """Angular velocity of a body for each unit of rate, (3, n): from the velocities of two of its points."""
+    """Return the angular velocity of a body per unit rate, (3, n), from the velocities of its points."""
     at_origin = model.point_position_and_jacobian(body, np.zeros(3), q)[1]
     jacobian = np.zeros((3, model.n))
     for k in range(3):

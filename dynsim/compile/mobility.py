@@ -1,8 +1,8 @@
 """Joints that move no inertia, and contact points that no joint moves along the normal of their surface.
 
 The force on an immobile point changes no motion, so no equation determines it. A point that is immobile in every
-posture is left out of the contact problem; in a single posture it carries nothing. A joint whose brake is closed moves
-nothing.
+posture is left out of the contact problem; a point that is immobile in a single posture carries no force there. A joint
+with a closed brake moves nothing.
 """
 
 from __future__ import annotations
@@ -19,29 +19,29 @@ from dynsim.errors import ModelError
 from dynsim.model.description import Array, Contact, Robot
 from dynsim.model.surfaces import Quadric
 
-# Configurations at which points are compared and rows examined: a property that holds at all of them is structural.
+# Number of configurations at which points are compared and rows examined: a property common to all is structural.
 CONFIGURATIONS = 6
-# Points closer than this at all configurations are the same [m]; rows smaller than this at all of them are zero.
+# Points closer than this at all configurations are identical [m]; rows smaller than this at all of them are zero.
 SAME = 1e-9
-# Positions along the axis of a capsule at which its row is examined, in parts of its length.
+# Positions along the axis of a capsule at which its row is examined, as fractions of its length.
 SHARES = (0.0, 0.3, 0.7, 1.0)
-# The inertia of a joint counts as zero below this part of Σ m l² + tr I of the bodies that it moves, and below this
-# part of their Σ m r² about the world's origin, which is rounding of the sweep.
+# The inertia of a joint counts as zero below this fraction of Σ m l² + tr I of the bodies that it moves, and below this
+# fraction of their Σ m r² about the world origin, the rounding error of the sweep.
 NOTHING, CANCELLED = 1e-12, 1e-14
-# The rounding of the sweep is at most this part of Σ m l² + tr I, or the inertia of a joint is not known.
+# Maximum rounding error of the sweep as a fraction of Σ m l² + tr I; beyond it the inertia of a joint is unknown.
 KNOWN = 1e-3
 
 
 def random_configurations(robot: Robot, braked: Collection[int] = (), at: Array | None = None) -> list[Array]:
-    """Return random coordinates, always the same; quaternions are unit.
+    """Return random coordinates with unit quaternions, the same in every call.
 
-    braked : joints that stay where they are in coordinates ``at``. A ball joint with a brake on one or two of its three
-        rates still reaches every attitude.
+    ``braked`` joints keep their coordinates ``at``. A ball joint with a brake on one or two of its three rates still
+    reaches every attitude.
     """
     rng, first = np.random.default_rng(0), 0
     free = set[int]()
     for i, link in enumerate(robot.links):
-        # A row without coordinates moves by those of the first row of its joint.
+        # A row without coordinates moves with the first row of its joint.
         first = i if link.row.neutral else first
         if i not in braked:
             free.add(first)
@@ -69,8 +69,7 @@ def moves(
 ) -> bool:
     """Return whether any joint moves any part of a candidate along the normal.
 
-    anywhere : a motion along the surface counts too
-    braked : joints that do not count
+    With ``anywhere``, motion along the surface also counts; ``braked`` joints do not count.
     """
     free = [i for i in range(model.n) if i not in braked]
     points = [contact.point]
@@ -90,17 +89,15 @@ def immobile(
 ) -> list[bool]:
     """Return for each contact whether no joint moves it along the normal in any posture.
 
-    The faces of a box and the slopes of a height field cannot be judged by a few random postures. A point on such a
-    surface is immobile only if no joint moves it in any direction.
-
-    braked : joints that stay where they are in coordinates ``at``
+    A few random postures do not cover the faces of a box or the slopes of a height field. A point on such a surface is
+    immobile only if no joint moves it in any direction. ``braked`` joints keep their coordinates ``at``.
     """
     configurations = random_configurations(model.robot, braked, at)
     still = []
     for contact in contacts:
         try:
             model.robot.attach(contact.body, contact.point)
-        except ModelError:  # an unknown or a fixed body: the check of the start names it
+        except ModelError:  # unknown or fixed body: reported by the start check
             still.append(False)
             continue
         anywhere = not isinstance(contact.surface, Quadric)
@@ -109,7 +106,7 @@ def immobile(
 
 
 def immobile_at(model: Model, link: int, point: Array, normal: Array, q: Array) -> bool:
-    """Return whether rounding alone is left of the motion of a link's point along a normal, in a posture.
+    """Return whether the motion of a link's point along a normal is only rounding error in a posture.
 
     The same limit as :func:`dynsim.dynamics.contact.mobility.moves_along_normal`.
     """
@@ -122,13 +119,11 @@ def immobile_at(model: Model, link: int, point: Array, normal: Array, q: Array) 
 def mobility_floors(
     model: Model, contacts: Sequence[Contact], braked: Collection[int] = (), at: Array | None = None
 ) -> Array:
-    """Return for each contact the mobility along its normal below which a glued one has no force, (c,) [1/kg].
+    """Return for each contact the mobility along its normal below which a bilateral contact has no force, (c,) [1/kg].
 
-    That is the fraction of a typical mobility below which a row counts as dependent. The typical one is the
-    largest of random postures, with the diagonal of the mass matrix in place of the matrix, which makes it up to n
-    times too large.
-
-    braked : joints that stay where they are in coordinates ``at``; those of the model are as heavy as their brakes
+    This is the fraction of a typical mobility below which a row counts as dependent. The typical mobility is the
+    largest of random postures, with the diagonal of the mass matrix instead of the matrix, which overestimates it by a
+    factor of up to n. ``braked`` joints keep their coordinates ``at``; their armature in the model includes the brake.
     """
     floors = np.zeros(len(contacts))
     if not contacts:
@@ -143,7 +138,7 @@ def mobility_floors(
 
 
 def without_inertia(model: Model, q: Array) -> list[int]:
-    """Numbers of the joints that move no inertia at coordinates q (nq,); for several in a row only the last one."""
+    """Return the indices of joints that move no inertia at coordinates q (nq,); in a series only the last one."""
     links = model.robot.links
     felt = model.articulated_inertia(q)
     mass = np.array([link.inertia.mass for link in links])
@@ -161,14 +156,14 @@ def without_inertia(model: Model, q: Array) -> list[int]:
     about_joint = np.where(slides, behind @ mass, (behind * (mass * lever + own)).sum(axis=1)) + model.armature
     about_origin = behind @ (mass * (centres**2).sum(axis=1))
     rounding = np.where(slides, 0.0, CANCELLED * about_origin)
-    # Of bodies that have run far away nothing is known.
+    # Undefined for bodies that have diverged.
     known = rounding <= KNOWN * about_joint
     none = (felt <= np.maximum(NOTHING * about_joint, rounding)) & (known | (about_joint == 0.0))
     return [k for k in np.flatnonzero(none).tolist() if np.count_nonzero(none & behind[k]) == 1]
 
 
 def moving_nothing(model: Model, q: Array) -> str:
-    """A sentence about joints that move no inertia at coordinates q (nq,), or an empty string."""
+    """Return a message about joints that move no inertia at coordinates q (nq,), or an empty string."""
     if not np.isfinite(q).all():
         return ""
     none = without_inertia(model, q)
@@ -177,12 +172,12 @@ def moving_nothing(model: Model, q: Array) -> str:
     joints = listed([model.robot.links[k].joint for k in none])
     bodies = listed([model.robot.links[k].name for k in none])
     return (
-        f"joint {joints} moves no inertia in this posture: the mass behind it ({bodies}) is zero or lies on its axis "
-        "without moments; give moments of inertia or a rotor inertia, change the posture, or lock the joint"
+        f"joint {joints} moves no inertia in this posture: the mass behind it ({bodies}) is zero or on its axis "
+        "without moments of inertia; add moments of inertia or a rotor inertia, change the posture, or lock the joint"
     )
 
 
 def check_inertia(model: Model) -> None:
-    """Refuse a start in which a joint has nothing to accelerate: ModelError."""
+    """Raise ModelError if a joint moves no inertia at the start."""
     if sentence := moving_nothing(model, model.robot.initial):
         raise ModelError(f"plant: {sentence}", keys=("plant",))

@@ -1,4 +1,4 @@
-"""The rigid-body model for use from Python: one method per quantity, numpy in and out."""
+"""The rigid-body model for use from Python: one method per quantity, with numpy arrays."""
 
 from __future__ import annotations
 
@@ -29,27 +29,47 @@ _FLOAT64 = np.dtype(np.float64)
 class Model:
     """Dynamics of a :class:`~dynsim.model.description.Robot`.
 
-    ``M(q) v̇ + h(q, v) + g(q) = tau``: ``mass_matrix`` is M, ``bias_forces`` h + g. Rotor inertia, gear and joint losses
-    and contacts are not part of these (they belong to motors and scenario); ``armature`` and ``damping`` give them.
-    The wheels of a mobile base are part but for their spin, which is in ``armature`` as that of a rotor is.
-    The masses of motors are: they sit on the links (:meth:`Robot.with_motors_mounted`).
-
     Parameters
     ----------
     robot : Robot
+        Tree of bodies with joints, motors and hand; :func:`dynsim.build_model` and :meth:`from_urdf` create models.
+
+    Attributes
+    ----------
+    robot : Robot
+        The description, with motors mounted.
+    n : int
+        Number of joint rates.
+    nq : int
+        Number of joint coordinates.
 
     Raises
     ------
     ModelError
-        The description is not a physical tree of bodies.
+        If the description is not a physically valid tree of bodies. Every method raises it for vectors of wrong length,
+        values that are not finite numbers, and unknown bodies.
 
-    Every method raises ModelError for vectors of another length, for what is no finite number, and for unknown bodies.
+    Notes
+    -----
+    ``M(q) v̇ + h(q, v) + g(q) = tau`` ([WM] eqs 42–44, 54–55): ``mass_matrix`` is M, ``bias_forces`` h + g. Rotor
+    inertia, gear and joint losses and contacts are not included (they belong to motors and scenario); see ``armature``
+    and ``damping``. The wheels of a mobile base are included except for their spin, which is in ``armature`` like the
+    inertia of a rotor. Motor masses are included: they are attached to the links (:meth:`Robot.with_motors_mounted`).
+
+    Examples
+    --------
+    >>> import dynsim
+    >>> model = dynsim.build_model(dynsim.load_scenario("single_pendulum"))
+    >>> model
+    <Model serial_arm: joint joint_1, no motors, hand on link_1, 1 kg>
+    >>> model.mass_matrix([0.0]).round(4).tolist()
+    [[0.3334]]
     """
 
     def __init__(self, robot: Robot) -> None:
         if not isinstance(robot, Robot):
             raise ModelError(
-                f"needs a Robot, not {brief(robot)}; Model.from_urdf(file) and build_model(scenario) give a model"
+                f"robot must be a Robot, got {brief(robot)}; use Model.from_urdf(file) or build_model(scenario)"
             )
         robot = robot.with_motors_mounted() if any(motor.mass for motor in robot.motors) else robot
         self.robot = robot
@@ -57,9 +77,9 @@ class Model:
         self.n, self.nq = len(robot.links), robot.nq
         self._workspace = ka.workspace(self.n, 0, 0)
         self._q = np.zeros(self.nq)
-        self._braces: PreparedBraces | None = None  # those of the last call of brace_statics
-        self._position_names = robot.position_names  # computed from every link's kind
-        # forward_dynamics and mass_matrix are those of the bodies alone: no rotor inertia.
+        self._braces: PreparedBraces | None = None  # braces of the last call of brace_statics
+        self._position_names = robot.position_names  # cached, because it is computed from every link's kind
+        # Without rotor inertia, for forward_dynamics and mass_matrix of the bodies alone.
         self._bodies = self.arrays._replace(body=self.arrays.body.copy())
         self._bodies.body[:, ka.ARMATURE] = 0.0
 
@@ -94,43 +114,93 @@ class Model:
 
     @classmethod
     def from_urdf(cls, path: str | os.PathLike[str], lock: Mapping[str, float] | None = None) -> Model:
-        """Read bodies and joints from a URDF file (fixed joints are merged into their parents).
+        """Read bodies and joints from a URDF file; fixed joints are merged into their parents.
 
         Parameters
         ----------
-        path : file
-        lock : positions [rad or m] of joints that are to be fixed, by name
+        path : str or path-like
+            URDF file.
+        lock : mapping of str to float, optional
+            Positions of joints to lock [rad or m].
+
+        Returns
+        -------
+        Model
+            Model without motors.
 
         Raises
         ------
         ModelError
-            The message names file, line, link or joint and what to do; see :func:`dynsim.model.urdf.reader.read_urdf`.
+            If the file is invalid; the message contains file, line, link or joint, and fix, see
+            :func:`dynsim.model.urdf.reader.read_urdf`.
+
+        Examples
+        --------
+        >>> import dynsim
+        >>> from dynsim.system.shipped import SHIPPED
+        >>> model = dynsim.Model.from_urdf(SHIPPED / "robots" / "six_axis_arm.urdf")
+        >>> model.n
+        6
         """
         from dynsim.model.urdf.reader import read_urdf
 
         if not isinstance(path, (str, os.PathLike)):
-            raise ModelError(f"a URDF file is named by its path, not by {brief(path)}")
+            raise ModelError(f"expected the path of a URDF file, got {brief(path)}")
         return cls(read_urdf(Path(path), lock))
 
     def to_urdf(self) -> str:
-        """The tree of bodies as URDF text, with masses, limits, viscous losses and shapes."""
+        """Return the tree of bodies as URDF text, with masses, limits, viscous losses and shapes.
+
+        Returns
+        -------
+        str
+            URDF document.
+
+        Raises
+        ------
+        ModelError
+            If URDF does not support a joint.
+
+        Examples
+        --------
+        >>> import dynsim
+        >>> model = dynsim.build_model(dynsim.load_scenario("single_pendulum"))
+        >>> "<robot" in model.to_urdf()
+        True
+        """
         from dynsim.compile.scene import with_shapes
         from dynsim.model.urdf.writer import write_urdf
 
         return write_urdf(with_shapes(self.robot))
 
     def to_mjcf(self, contacts: Sequence[Contact] = (), surfaces: Mapping[str, Surface] | None = None) -> str:
-        """The tree of bodies as MJCF, the format of MuJoCo, with what its motors add to it.
+        """Return the tree of bodies as MJCF text, the format of MuJoCo, including rotor inertia and losses of the
+        motors.
 
         Parameters
         ----------
-        contacts : points that become sites
-        surfaces : of which planes, spheres, cylinders and boxes become shapes that are drawn and do not touch
+        contacts : sequence of Contact, optional
+            Contact points to export as sites.
+        surfaces : mapping of str to Surface, optional
+            Planes, spheres, cylinders and boxes to export as visual shapes without collision; other surfaces are
+            omitted.
+
+        Returns
+        -------
+        str
+            MJCF document.
 
         Raises
         ------
         ModelError
-            A joint of a kind that MJCF does not have, such as wheels that roll without slip.
+            If MJCF does not support a joint, such as wheels that roll without slip.
+
+        Examples
+        --------
+        >>> import dynsim
+        >>> model = dynsim.build_model(dynsim.load_scenario("single_pendulum"))
+        >>> "<mujoco" in model.to_mjcf()
+        True
         """
         from dynsim.compile.scene import drawn_surface, with_shapes
         from dynsim.model.mjcf import write_mjcf
@@ -145,14 +215,14 @@ class Model:
 
     @property
     def geometry(self) -> ka.ModelArrays:
-        """The tables without masses, inertias and losses: what poses of bodies follow from, beside q."""
+        """Tables without masses, inertias and losses: together with q they determine the poses of bodies."""
         body = self.arrays.body.copy()
         body[:, ka.MASS : ka.PARAMETER] = 0.0
         return self.arrays._replace(body=body, gravity=np.zeros(3))
 
     @property
     def armature(self) -> Array:
-        """What only turns with each joint: reflected rotor inertia J_m, spin of a wheel [kg m²], (n,)."""
+        """Inertia that only rotates with each joint: reflected rotor inertia J_m, spin of a wheel [kg m²], (n,)."""
         return self.arrays.body[:, ka.ARMATURE].copy()
 
     @property
@@ -162,7 +232,7 @@ class Model:
 
     @property
     def coupling_rows(self) -> Array:
-        """Rows C of the couplings, C v = 0, (k, n)."""
+        """Rows C of the joint couplings, C v = 0, (k, n)."""
         rows = np.zeros((len(self.robot.couplings), self.n))
         for row, coupling in zip(rows, self.robot.couplings, strict=True):
             row[self.joint_names.index(coupling.joint)] = 1.0
@@ -170,37 +240,179 @@ class Model:
         return rows
 
     def mass_matrix(self, q: ArrayLike) -> Array:
-        """M(q), (n, n) [kg m²] ([WM] eq 55)."""
+        """Compute the mass matrix M(q).
+
+        Parameters
+        ----------
+        q : array_like, shape (nq,)
+            Joint positions [rad or m].
+
+        Returns
+        -------
+        (n, n) ndarray
+            Mass matrix [kg m²; kg m, kg at prismatic joints], without rotors.
+
+        Raises
+        ------
+        ModelError
+            If the shape is wrong, or a value is not finite.
+
+        Notes
+        -----
+        [WM] eq 55.
+
+        Examples
+        --------
+        >>> import dynsim
+        >>> model = dynsim.build_model(dynsim.load_scenario("elbow_comparison"))
+        >>> model.mass_matrix(model.robot.initial).shape
+        (10, 10)
+        """
         self._set(q)
         M = np.zeros((self.n, self.n))
         sweep.mass_matrix(self.arrays, self._workspace, M)
         return M
 
     def bias_forces(self, q: ArrayLike, v: ArrayLike) -> Array:
-        """h(q, v) + g(q), (n,) [N m] ([WM] eq 54)."""
+        """Compute the velocity and gravity forces h(q, v) + g(q).
+
+        Parameters
+        ----------
+        q : array_like, shape (nq,)
+            Joint positions [rad or m].
+        v : array_like, shape (n,)
+            Joint rates [rad/s or m/s].
+
+        Returns
+        -------
+        (n,) ndarray
+            Joint torques or forces [N m or N].
+
+        Raises
+        ------
+        ModelError
+            If a shape is wrong, or a value is not finite.
+
+        Notes
+        -----
+        [WM] eq 54.
+
+        Examples
+        --------
+        >>> import dynsim
+        >>> model = dynsim.build_model(dynsim.load_scenario("single_pendulum"))
+        >>> model.bias_forces([1.5707963], [0.0]).round(3).tolist()
+        [-4.905]
+        """
         self._set(q, v)
         sweep.newton_euler(self.arrays, self._workspace, 1.0, 0.0, 1.0)
         return self._workspace.joints[:, ka.BIAS].copy()
 
     def inverse_dynamics(self, q: ArrayLike, v: ArrayLike, vdot: ArrayLike) -> Array:
-        """tau = M v̇ + h + g, (n,) [N m] ([WM] eqs 42–44)."""
+        """Compute the joint torques for an acceleration, tau = M v̇ + h + g.
+
+        Parameters
+        ----------
+        q : array_like, shape (nq,)
+            Joint positions [rad or m].
+        v : array_like, shape (n,)
+            Joint rates [rad/s or m/s].
+        vdot : array_like, shape (n,)
+            Joint accelerations [rad/s² or m/s²].
+
+        Returns
+        -------
+        (n,) ndarray
+            Joint torques or forces [N m or N].
+
+        Raises
+        ------
+        ModelError
+            If a shape is wrong, or a value is not finite.
+
+        Notes
+        -----
+        [WM] eqs 42–44.
+
+        Examples
+        --------
+        >>> import dynsim
+        >>> model = dynsim.build_model(dynsim.load_scenario("single_pendulum"))
+        >>> model.inverse_dynamics([0.0], [0.0], [1.0]).round(4).tolist()
+        [0.3334]
+        """
         self._set(q, v)
         self._workspace.joints[:, ka.QDD] = self._vector(vdot, "vdot", self.joint_names)
         sweep.newton_euler(self.arrays, self._workspace, 1.0, 1.0, 1.0)
         return self._workspace.joints[:, ka.BIAS].copy()
 
     def forward_dynamics(self, q: ArrayLike, v: ArrayLike, tau: ArrayLike) -> Array:
-        """v̇ = M⁻¹ (tau − h − g), (n,) [rad/s²], by the articulated sweeps."""
+        """Compute the joint accelerations for torques, v̇ = M⁻¹ (tau − h − g).
+
+        Parameters
+        ----------
+        q : array_like, shape (nq,)
+            Joint positions [rad or m].
+        v : array_like, shape (n,)
+            Joint rates [rad/s or m/s].
+        tau : array_like, shape (n,)
+            Joint torques or forces [N m or N].
+
+        Returns
+        -------
+        (n,) ndarray
+            Joint accelerations [rad/s² or m/s²].
+
+        Raises
+        ------
+        ModelError
+            If a shape is wrong, or a value is not finite.
+
+        Notes
+        -----
+        Articulated-body algorithm; rotor inertia is not included.
+
+        Examples
+        --------
+        >>> import dynsim
+        >>> model = dynsim.build_model(dynsim.load_scenario("single_pendulum"))
+        >>> model.forward_dynamics([0.5], [0.0], [0.0]).round(3).tolist()
+        [7.054]
+        """
         self._set(q, v)
         self._workspace.joints[:, ka.APPLIED] = self._vector(tau, "tau", self.joint_names)
         articulated.forward_dynamics(self._bodies, self._workspace)
         return self._workspace.joints[:, ka.QDD].copy()
 
     def articulated_inertia(self, q: ArrayLike) -> Array:
-        """Inertia that each joint moves while all joints behind it are free, rotors included, (n,) [kg m²; kg].
+        """Compute the inertia that each joint moves if all joints behind it are free, including rotors.
 
-        Pivots of the mass matrix, by the articulated sweep. For a joint that moves no inertia the pivot is zero to
-        rounding, and undefined for the joints before it.
+        Parameters
+        ----------
+        q : array_like, shape (nq,)
+            Joint positions [rad or m].
+
+        Returns
+        -------
+        (n,) ndarray
+            Articulated inertias [kg m²; kg at prismatic joints].
+
+        Raises
+        ------
+        ModelError
+            If the shape is wrong, or a value is not finite.
+
+        Notes
+        -----
+        These are the pivots of the mass matrix, from the articulated sweep. For a joint that moves no inertia the pivot
+        is zero up to rounding, and the pivots of the joints before it are undefined.
+
+        Examples
+        --------
+        >>> import dynsim
+        >>> model = dynsim.build_model(dynsim.load_scenario("single_pendulum"))
+        >>> model.articulated_inertia([0.0]).round(4).tolist()
+        [0.3334]
         """
         self._set(q)
         self._workspace.joints[:, ka.APPLIED] = 0.0
@@ -209,39 +421,89 @@ class Model:
             return 1.0 / self._workspace.links[:, ka.INVERSE_D]
 
     def derivatives(self, q: ArrayLike, v: ArrayLike, vdot: ArrayLike) -> InverseDynamicsDerivatives:
-        """Derivatives of inverse dynamics, ∂tau/∂q, ∂tau/∂v and ∂tau/∂v̇ = M, in closed form, (n, n) each.
+        """Compute the derivatives of inverse dynamics, ∂tau/∂q, ∂tau/∂v and ∂tau/∂v̇ = M, in closed form.
 
-        Those of forward dynamics follow, at v̇ = M⁻¹ (tau − h − g): ∂v̇/∂q = −M⁻¹ ∂tau/∂q, ∂v̇/∂v = −M⁻¹ ∂tau/∂v.
-        Rotor inertia, losses and contacts are not part of them, as of all methods here;
-        :meth:`dynsim.Simulation.linearize` has them all.
+        Parameters
+        ----------
+        q : array_like, shape (nq,)
+            Joint positions [rad or m].
+        v : array_like, shape (n,)
+            Joint rates [rad/s or m/s].
+        vdot : array_like, shape (n,)
+            Joint accelerations [rad/s² or m/s²].
+
+        Returns
+        -------
+        InverseDynamicsDerivatives
+            Matrices ``q``, ``v`` and ``vdot``, (n, n) each.
+
+        Raises
+        ------
+        ModelError
+            If a shape is wrong, or a value is not finite.
+
+        Notes
+        -----
+        After Singh, Russo and Wensing (2022). The derivatives of forward dynamics follow, at v̇ = M⁻¹ (tau − h − g):
+        ∂v̇/∂q = −M⁻¹ ∂tau/∂q, ∂v̇/∂v = −M⁻¹ ∂tau/∂v. Rotor inertia, losses and contacts are not included;
+        :meth:`dynsim.Simulation.linearize` includes them all.
+
+        Examples
+        --------
+        >>> import dynsim
+        >>> model = dynsim.build_model(dynsim.load_scenario("single_pendulum"))
+        >>> model.derivatives([0.0], [0.0], [0.0]).q.round(3).tolist()
+        [[-4.905]]
         """
         self.inverse_dynamics(q, v, vdot)
         return inverse_dynamics_derivatives(self.arrays, self._workspace.links)
 
     def brace_statics(self, q: ArrayLike, v: ArrayLike, vdot: ArrayLike, braces: Mapping[str, Brace]) -> BraceStatics:
-        """Torques and brace forces that realise v̇ with the least heat, or a certificate that none do.
-
-        tau = M v̇ + h + g + J_m v̇ + (D + D_m) v − J_cᵀ f,   minimise Σ R i², K_m i = tau
-
-        over |f_t| ≤ μ f_n, f_n ≥ min_N (or f_n as commanded, or f_t against the slip), the limits of the motors at a
-        steady current, and tau = 0 where there is none. The optimum uses friction as far as the cone allows; what a
-        real brace takes is decided by its history. Torques are unique; of forces that no motor feels the split is one
-        inside the cones.
+        """Compute the torques and brace forces of least heat for an acceleration, or prove that none exist.
 
         Parameters
         ----------
-        q, v, vdot : (nq,), (n,), (n,)
-        braces : by name, :class:`~dynsim.compile.bracing.Brace`
+        q : array_like, shape (nq,)
+            Joint positions [rad or m].
+        v : array_like, shape (n,)
+            Joint rates [rad/s or m/s].
+        vdot : array_like, shape (n,)
+            Joint accelerations [rad/s² or m/s²].
+        braces : mapping of str to Brace
+            Named braces.
+
+        Returns
+        -------
+        BraceStatics
+            Torques, heat, brace forces and their possible intervals, or a certificate of infeasibility.
 
         Raises
         ------
         ModelError
-            A brace on no body, without a direction, or with a force that pulls; a robot with coupled joints.
+            If a brace is on an unknown body, or the robot has coupled joints.
+
+        Notes
+        -----
+        tau = M v̇ + h + g + J_m v̇ + (D + D_m) v − J_cᵀ f,   minimize Σ R i², K_m i = tau
+
+        subject to |f_t| ≤ μ f_n, f_n ≥ min_N (or f_n as commanded, or f_t opposing the slip), the motor limits at a
+        steady current, and tau = 0 for joints without motors. The optimum uses friction up to the limit of the cone;
+        the friction force of a real brace depends on its history. Torques are unique; brace forces that no motor
+        affects are one possible split inside the cones.
+
+        Examples
+        --------
+        >>> import dynsim
+        >>> model = dynsim.build_model(dynsim.load_scenario("elbow_comparison"))
+        >>> braces = {"elbow_7": dynsim.Brace("link_7", [0, 0, 0], normal=[0, 0, 1], friction=0.1)}
+        >>> statics = model.brace_statics(model.robot.initial, [0] * 10, [0] * 10, braces)
+        >>> statics.feasible, round(statics.heat, 2), round(statics.normal_forces["elbow_7"], 2)
+        (True, 19.17, 8.03)
         """
         names = self.joint_names
         positions, rates = self._vector(q, "q", self._position_names), self._vector(v, "v", names)
         accelerations = self._vector(vdot, "vdot", names)
-        if self._braces is None or not self._braces.are(braces):
+        if self._braces is None or not self._braces.match(braces):
             self._braces = PreparedBraces(self.robot, self.arrays, braces)
         return self._braces.solve(positions, rates, accelerations)
 
@@ -254,25 +516,45 @@ class Model:
         braces: Sequence[Contact] = (),
         tolerance: float = 1e-9,
     ) -> Array:
-        """A posture near ``q`` that has the hand at ``target``, within the limits of the joints, (nq,).
-
-        Damped Gauss–Newton steps of least change dq = Jᵀ (J Jᵀ + λ 1)⁻¹ e, λ falling with the error; joints at their
-        limits leave the motion to the others.
+        """Find a posture near `q` that puts the hand at `target` within the joint limits.
 
         Parameters
         ----------
-        target : (3,) of the hand [m]
-        q : (nq,) to start from, which selects the branch; default: the initial posture
-        orientation : (3, 3) rotation of the hand's body or frame in the world; default: any
-        braces : points that are on their surfaces, see :func:`dynsim.scenario.build.contacts`
-        tolerance : what may be left of position, gaps [m] and angles [rad]
+        target : array_like, shape (3,)
+            Hand position in the world frame [m].
+        q : array_like, shape (nq,), optional
+            Start of the search, which selects the solution branch [rad or m]; default: the initial posture.
+        orientation : array_like, shape (3, 3), optional
+            Rotation of the hand's body or frame in the world; default: any.
+        braces : sequence of Contact, optional
+            Points to keep on their surfaces, see :func:`dynsim.scenario.build.contacts`.
+        tolerance : float, optional
+            Largest residual of position, gaps [m] and angles [rad].
+
+        Returns
+        -------
+        (nq,) ndarray
+            Joint positions [rad or m].
 
         Raises
         ------
         UnreachableReference
-            With what is left, and the joints that are at their limits.
+            If no posture is found; the message contains the residual and the joints at their limits.
         ModelError
-            Joints of several coordinates, coupled joints, no rotation.
+            If the robot has coupled joints or joints with several coordinates, or `orientation` is not a rotation.
+
+        Notes
+        -----
+        Damped Gauss–Newton steps of minimum norm, dq = Jᵀ (J Jᵀ + λ 1)⁻¹ e, with λ decreasing with the error. Joints at
+        their limits stay there, and the other joints take over.
+
+        Examples
+        --------
+        >>> import dynsim
+        >>> model = dynsim.build_model(dynsim.load_scenario("elbow_comparison"))
+        >>> q = model.inverse_kinematics([1.5, 1.5, 0.4])
+        >>> model.point_position(*model.robot.hand, q).round(6).tolist()
+        [1.5, 1.5, 0.4]
         """
         wanted = None
         if orientation is not None:
@@ -283,7 +565,34 @@ class Model:
         return hand_posture(self, self._point(target), np.array(start), wanted, braces, tolerance)
 
     def point_position(self, body: str | int, point: ArrayLike, q: ArrayLike) -> Array:
-        """World position of a point fixed on a body, or in a frame of one by its name, (3,) [m]."""
+        """Compute the world position of a point fixed on a body or frame.
+
+        Parameters
+        ----------
+        body : str or int
+            Name of a body or frame, or index of a body.
+        point : array_like, shape (3,)
+            Point in the frame of the body [m].
+        q : array_like, shape (nq,)
+            Joint positions [rad or m].
+
+        Returns
+        -------
+        (3,) ndarray
+            Position in the world frame [m].
+
+        Raises
+        ------
+        ModelError
+            If the body does not exist, a shape is wrong, or a value is not finite.
+
+        Examples
+        --------
+        >>> import dynsim
+        >>> model = dynsim.build_model(dynsim.load_scenario("single_pendulum"))
+        >>> model.point_position("link_1", [0, 0, 1], [0.0]).tolist()
+        [0.0, 0.0, 1.0]
+        """
         index, on_body = self._attached(body, point)
         self._sweep(q)
         out = np.zeros(3)
@@ -291,11 +600,68 @@ class Model:
         return out
 
     def point_jacobian(self, body: str | int, point: ArrayLike, q: ArrayLike) -> Array:
-        """Jacobian of a body-fixed point: its velocity in the world is J v, (3, n) [m/rad]."""
+        """Compute the Jacobian J of a body-fixed point: its velocity in the world frame is J v.
+
+        Parameters
+        ----------
+        body : str or int
+            Name of a body or frame, or index of a body.
+        point : array_like, shape (3,)
+            Point in the frame of the body [m].
+        q : array_like, shape (nq,)
+            Joint positions [rad or m].
+
+        Returns
+        -------
+        (3, n) ndarray
+            Jacobian [m/rad or 1].
+
+        Raises
+        ------
+        ModelError
+            If the body does not exist, a shape is wrong, or a value is not finite.
+
+        Examples
+        --------
+        >>> import dynsim
+        >>> model = dynsim.build_model(dynsim.load_scenario("single_pendulum"))
+        >>> model.point_jacobian("link_1", [0, 0, 1], [0.0]).tolist()
+        [[1.0], [0.0], [0.0]]
+        """
         return self.point_position_and_jacobian(body, point, q)[1]
 
     def point_position_and_jacobian(self, body: str | int, point: ArrayLike, q: ArrayLike) -> tuple[Array, Array]:
-        """World position, (3,) [m], and its Jacobian, (3, n) [m/rad], from one sweep."""
+        """Compute world position and Jacobian of a body-fixed point from a single sweep.
+
+        Parameters
+        ----------
+        body : str or int
+            Name of a body or frame, or index of a body.
+        point : array_like, shape (3,)
+            Point in the frame of the body [m].
+        q : array_like, shape (nq,)
+            Joint positions [rad or m].
+
+        Returns
+        -------
+        position : (3,) ndarray
+            Position in the world frame [m].
+        jacobian : (3, n) ndarray
+            Jacobian [m/rad or 1].
+
+        Raises
+        ------
+        ModelError
+            If the body does not exist, a shape is wrong, or a value is not finite.
+
+        Examples
+        --------
+        >>> import dynsim
+        >>> model = dynsim.build_model(dynsim.load_scenario("elbow_comparison"))
+        >>> position, jacobian = model.point_position_and_jacobian(*model.robot.hand, model.robot.initial)
+        >>> position.round(3).tolist(), jacobian.shape
+        ([1.536, 1.536, 0.424], (3, 10))
+        """
         index, on_body = self._attached(body, point)
         position = self.point_position(index, on_body, q)
         jacobian = np.zeros((3, self.n))
@@ -303,15 +669,65 @@ class Model:
         return position, jacobian
 
     def body_pose(self, body: str | int, q: ArrayLike) -> tuple[Array, Array]:
-        """Rotation R_WB, (3, 3), and origin p_WB, (3,) [m], of a body."""
+        """Compute rotation and origin of a body.
+
+        Parameters
+        ----------
+        body : str or int
+            Name or index of a body.
+        q : array_like, shape (nq,)
+            Joint positions [rad or m].
+
+        Returns
+        -------
+        rotation : (3, 3) ndarray
+            Rotation R_WB from the body frame to the world frame.
+        origin : (3,) ndarray
+            Origin p_WB in the world frame [m].
+
+        Raises
+        ------
+        ModelError
+            If the body does not exist, a shape is wrong, or a value is not finite.
+
+        Examples
+        --------
+        >>> import dynsim
+        >>> model = dynsim.build_model(dynsim.load_scenario("single_pendulum"))
+        >>> rotation, origin = model.body_pose("link_1", [0.0])
+        >>> rotation.shape, origin.tolist()
+        ((3, 3), [0.0, 0.0, 0.0])
+        """
         self._sweep(q)
         row = self._workspace.links[self.body_index(body)]
         return row[ka.R : ka.R + 9].reshape(3, 3).copy(), row[ka.P : ka.P + 3].copy()
 
     def joint_positions(self, q: ArrayLike, *further: tuple[str | int, ArrayLike]) -> Array:
-        """World origins of all bodies, then the hand, (n + 1, 3) [m]: what a posture is drawn from.
+        """Compute the world origins of all bodies, followed by the hand: the points of a drawn posture.
 
-        ``further`` : more points on bodies, after the hand
+        Parameters
+        ----------
+        q : array_like, shape (nq,)
+            Joint positions [rad or m].
+        *further : (str or int, array_like of shape (3,))
+            Body and point [m] of additional points, after the hand.
+
+        Returns
+        -------
+        (n + 1 + len(further), 3) ndarray
+            Positions in the world frame [m].
+
+        Raises
+        ------
+        ModelError
+            If a body does not exist, a shape is wrong, or a value is not finite.
+
+        Examples
+        --------
+        >>> import dynsim
+        >>> model = dynsim.build_model(dynsim.load_scenario("single_pendulum"))
+        >>> model.joint_positions([0.0]).tolist()
+        [[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
         """
         self._sweep(q)
         attached = [self._attached(body, point) for body, point in (self.robot.hand, *further)]
@@ -321,25 +737,89 @@ class Model:
         return np.vstack([self._workspace.links[:, ka.P : ka.P + 3], on_bodies])
 
     def kinetic_energy(self, q: ArrayLike, v: ArrayLike) -> float:
-        """½ vᵀ M v [J]; rotors not included."""
-        self._sweep(q, v)
-        return float(ledger.kinetic_energy(self._bodies, self._workspace))
+        """Compute the kinetic energy ½ vᵀ M v, without rotors.
 
-    def potential_energy(self, q: ArrayLike) -> float:
-        """−Σ m g·c [J], zero with all masses at the world origin."""
-        self._sweep(q)
-        return float(ledger.potential_energy(self.arrays, self._workspace))
+        Parameters
+        ----------
+        q : array_like, shape (nq,)
+            Joint positions [rad or m].
+        v : array_like, shape (n,)
+            Joint rates [rad/s or m/s].
 
-    def body_index(self, body: str | int) -> int:
-        """Index of a body by name; an index stays as it is.
+        Returns
+        -------
+        float
+            Kinetic energy [J].
 
         Raises
         ------
         ModelError
-            No such body.
+            If a shape is wrong, or a value is not finite.
+
+        Examples
+        --------
+        >>> import dynsim
+        >>> model = dynsim.build_model(dynsim.load_scenario("single_pendulum"))
+        >>> round(model.kinetic_energy([0.0], [1.0]), 4)
+        0.1667
+        """
+        self._sweep(q, v)
+        return float(ledger.kinetic_energy(self._bodies, self._workspace))
+
+    def potential_energy(self, q: ArrayLike) -> float:
+        """Compute the potential energy −Σ m g·c, zero with all masses at the world origin.
+
+        Parameters
+        ----------
+        q : array_like, shape (nq,)
+            Joint positions [rad or m].
+
+        Returns
+        -------
+        float
+            Potential energy [J].
+
+        Raises
+        ------
+        ModelError
+            If the shape is wrong, or a value is not finite.
+
+        Examples
+        --------
+        >>> import dynsim
+        >>> model = dynsim.build_model(dynsim.load_scenario("single_pendulum"))
+        >>> round(model.potential_energy([0.0]), 3)
+        4.905
+        """
+        self._sweep(q)
+        return float(ledger.potential_energy(self.arrays, self._workspace))
+
+    def body_index(self, body: str | int) -> int:
+        """Return the index of a body given its name or index.
+
+        Parameters
+        ----------
+        body : str or int
+            Name or index of a body.
+
+        Returns
+        -------
+        int
+            Index of the body.
+
+        Raises
+        ------
+        ModelError
+            If the body does not exist.
+
+        Examples
+        --------
+        >>> import dynsim
+        >>> dynsim.build_model(dynsim.load_scenario("elbow_comparison")).body_index("link_7")
+        6
         """
         if type(body) is int or isinstance(body, np.integer):
-            # The kernels do not look whether an index is within their tables.
+            # The kernels do not check whether an index is within their tables.
             if not 0 <= body < self.n:
                 raise ModelError(f"no body {body}; indices of this model are 0 to {self.n - 1}")
             return int(body)
@@ -349,7 +829,7 @@ class Model:
         raise ModelError(f"no body {body!r}; bodies: {', '.join(link.name for link in self.robot.links)}")
 
     def _attached(self, body: str | int, point: ArrayLike) -> tuple[int, Array]:
-        """Index of the body that carries a body or frame, and the point in its frame [m]."""
+        """Return the index of the body that carries a body or frame, and the point in its frame [m]."""
         checked = self._point(point)
         return self.robot.attach(body, checked) if isinstance(body, str) else (self.body_index(body), checked)
 
@@ -360,7 +840,7 @@ class Model:
     def _set(self, q: ArrayLike, v: ArrayLike | None = None) -> None:
         positions = self._vector(q, "q", self._position_names)
         if self.nq == self.n:
-            # A coordinate for each rate: most robots need not load the kernel that tells kinds of joints apart.
+            # One coordinate per rate: most robots need not load the kernel that distinguishes joint kinds.
             self._workspace.joints[:, ka.Q] = positions
         else:
             self._q[:] = positions
@@ -371,32 +851,32 @@ class Model:
         array = _numbers(values, name)
         if array.shape != (len(labels),):
             names = "joints" if self.nq == self.n else "coordinates" if name == "q" else "rates"
-            raise ModelError(f"{name} has shape {array.shape}; this model has {len(labels)} {names}")
-        # The sum of Python's numbers first: it neither warns nor takes as long as a look by numpy at every element.
+            raise ModelError(f"{name} must have {len(labels)} values ({names} of this model), got shape {array.shape}")
+        # Sum up Python numbers first: this neither warns nor takes as long as a numpy check of every element.
         if not math.isfinite(sum(array.tolist())) and not np.isfinite(array).all():
             k = int(np.flatnonzero(~np.isfinite(array))[0])
-            raise ModelError(f"{name} is {array[k]} at {labels[k]}; it must be finite")
+            raise ModelError(f"{name} must be finite, got {array[k]} at {labels[k]}")
         return array
 
     @staticmethod
     def _point(point: ArrayLike) -> Array:
-        # A copy: an array of another layout would be compiled for anew.
+        # A copy, because an array with another memory layout would be compiled for again.
         array = np.array(_numbers(point, "point"))
         if array.shape != (3,):
-            raise ModelError(f"point has shape {array.shape}; it must be (3,): x, y, z in the body's frame [m]")
+            raise ModelError(f"point must have shape (3,): x, y, z in the body's frame [m], got {array.shape}")
         if not math.isfinite(sum(array.tolist())) and not np.isfinite(array).all():
-            raise ModelError(f"point is {array.tolist()}; it must be finite [m]")
+            raise ModelError(f"point must be finite [m], got {array.tolist()}")
         return array
 
 
 def _numbers(values: ArrayLike, name: str) -> Array:
-    """Real numbers as float64; texts, complex numbers and rows of unequal length are none."""
+    """Return real numbers as float64; texts, complex numbers and rows of unequal length raise ModelError."""
     if type(values) is np.ndarray and values.dtype is _FLOAT64:
         return values
     try:
         array = np.asarray(values)
     except ValueError as error:
-        raise ModelError(f"{name} is no array of numbers: {error}") from error
+        raise ModelError(f"{name} must be an array of numbers: {error}") from error
     if array.dtype.kind not in "fiu":
-        raise ModelError(f"{name} must be real numbers, not {brief(values)}")
+        raise ModelError(f"{name} must be real numbers, got {brief(values)}")
     return np.asarray(array, dtype=np.float64)

@@ -1,4 +1,4 @@
-"""Postures with points of an arm on their surfaces (closure of the contact constraints), nearest to the initial one."""
+"""Postures with points on surfaces, nearest to the initial posture, and motor torques that hold a posture at rest."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from dynsim.model.drives import Servo
 
 HAND = "hand"
 
-# Distance from the surfaces that counts as none [m].
+# Distance from a surface that counts as zero [m].
 TOLERANCE = 1e-13
 REACHED = 1e-12
 ITERATIONS = 300
 # A point that no joint moves along its normal must start this close to its surface [m].
 START_TOLERANCE = 1e-6
-# Rounding by which a joint may be beyond its limit [rad or m].
+# Amount by which a joint may exceed its limit due to rounding [rad or m].
 BEYOND = 1e-9
-STEP_MAX = 0.3  # [rad or m] per iteration, against jumps to another branch of solutions
+STEP_MAX = 0.3  # [rad or m] per iteration; prevents jumps to another solution branch
 
 
 def gaps_and_rates(model: Model, contacts: Sequence[Contact], q: Array) -> tuple[Array, Array]:
-    """Distances of points and spheres from their surfaces, (c,) [m], and their rates by joint, (c, n) [m/rad]."""
+    """Return the distances of points and spheres from surfaces, (c,) [m], and their derivatives, (c, n) [m/rad]."""
     gaps, rates = np.zeros(len(contacts)), np.zeros((len(contacts), model.n))
     for k, contact in enumerate(contacts):
         position, jacobian = model.point_position_and_jacobian(contact.body, contact.point, q)
@@ -39,40 +39,52 @@ def gaps_and_rates(model: Model, contacts: Sequence[Contact], q: Array) -> tuple
 
 
 def on_surfaces(model: Model, contacts: Mapping[str, Contact], names: Sequence[str], keep: Sequence[str]) -> Array:
-    """The posture nearest to the initial one, |q − q_0| least, with the named points on their surfaces, (nq,).
+    """Find the posture nearest to the initial one, with minimum |q − q_0|, that puts the named points on their
+    surfaces.
 
-    Joints that would go beyond their limits stay there, the one that goes furthest first, and the others go on.
+    Joints that would exceed their limits stay there, the worst joint first, and the other joints continue.
 
-    Gauss–Newton steps q ← q_0 + J⁺ (J (q − q_0) − e), then Newton's without the pull to q_0 for the last digits.
+    Gauss–Newton steps q ← q_0 + J⁺ (J (q − q_0) − e), then Newton steps without the pull towards q_0 for the last
+    digits.
 
     Parameters
     ----------
-    contacts : of the scenario, by name
-    names : contacts that are to be on their surfaces
-    keep : joints that do not move; ``hand``: the hand stays where it is
+    model : Model
+        Model of the robot.
+    contacts : mapping of str to Contact
+        Contacts of the scenario.
+    names : sequence of str
+        Contacts to put on their surfaces.
+    keep : sequence of str
+        Joints that do not move; ``hand``: the hand keeps its position.
+
+    Returns
+    -------
+    (nq,) ndarray
+        Joint positions [rad or m].
 
     Raises
     ------
     ModelError
-        An unknown name, that of an axis, or surfaces that the points do not reach.
+        If a name is unknown or denotes an axis, or the points cannot reach their surfaces.
     """
     robot = model.robot
     for name in names:
         if name not in contacts:
-            raise ModelError(f"initial.on_surface: no contact {name!r}; those are: {', '.join(contacts) or 'none'}")
+            raise ModelError(f"initial.on_surface: unknown contact {name!r}; contacts: {', '.join(contacts) or 'none'}")
         if contacts[name].tip is not None:
-            raise ModelError(f"initial.on_surface: {name!r} is the axis of a link; name the points at its ends")
+            raise ModelError(f"initial.on_surface: {name!r} is the axis of a link; use the points at its ends")
         if contacts[name].left_out and abs(gap := gap_at(model, contacts[name], robot.initial)) > START_TOLERANCE:
             raise ModelError(
                 f"initial.on_surface: no joint moves {name!r} along the normal of "
-                f"{contacts[name].surface_name!r}, which it is {gap:+.4g} m from; take it off the list"
+                f"{contacts[name].surface_name!r} (gap {gap:+.4g} m); remove it from the list"
             )
     fixed = [name for name in keep if name != HAND]
     for name in fixed:
         if name not in robot.joint_names:
-            raise ModelError(f"initial.keep: no joint {name!r}; joints: {', '.join(robot.joint_names)}, and {HAND}")
+            raise ModelError(f"initial.keep: unknown joint {name!r}; use {HAND} or {', '.join(robot.joint_names)}")
     if robot.couplings:
-        raise ModelError("initial: not for robots with coupled joints; give their positions")
+        raise ModelError("initial: coupled joints are not supported; set the joint positions instead")
     columns = [
         k for k, link in enumerate(robot.links) if len(link.row.neutral) == 1 and robot.joint_names[k] not in fixed
     ]
@@ -83,8 +95,8 @@ def on_surfaces(model: Model, contacts: Mapping[str, Contact], names: Sequence[s
         if not worst <= REACHED:
             within = f" with {', '.join(robot.joint_names[k] for k in stopped)} at the limit" if stopped else ""
             raise ModelError(
-                f"initial: the joints that may move do not bring {', '.join(names)} onto the surfaces{within}; "
-                f"{worst:.3g} m are left: keep fewer joints, or start closer"
+                f"initial: cannot bring {', '.join(names)} onto their surfaces{within}: {worst:.3g} m remain; "
+                "list fewer joints in initial.keep or start closer"
             )
         beyond = _furthest_beyond(robot, columns, q)
         if beyond is None:
@@ -95,7 +107,7 @@ def on_surfaces(model: Model, contacts: Mapping[str, Contact], names: Sequence[s
 def _nearest(
     model: Model, points: Sequence[Contact], columns: Sequence[int], stopped: Mapping[int, float], keep_hand: bool
 ) -> tuple[Array, float]:
-    """Posture with the points on their surfaces, joints ``stopped`` at these values; and the largest distance left."""
+    """Return the posture with the points on their surfaces and joints ``stopped`` fixed, and the largest residual."""
     robot = model.robot
     moving = [k for k in columns if k not in stopped]
     places = [robot.position_index[k] for k in moving]
@@ -119,7 +131,7 @@ def _nearest(
 
 
 def _furthest_beyond(robot: Robot, columns: Sequence[int], q: Array) -> tuple[int, float] | None:
-    """The joint furthest beyond its limit, and that limit; joints that start beyond are refused elsewhere."""
+    """Return the joint that exceeds its limit most, and this limit; joints that start beyond are reported elsewhere."""
     worst, furthest = BEYOND, None
     for k in columns:
         link, at, start = robot.links[k], q[robot.position_index[k]], robot.initial[robot.position_index[k]]
@@ -129,7 +141,7 @@ def _furthest_beyond(robot: Robot, columns: Sequence[int], q: Array) -> tuple[in
     return furthest
 
 
-# Motor torques that hold a posture at rest against weight, loads and braces, with the least heat.
+# Motor torques of least heat that hold a posture at rest against weight, loads and braces.
 
 
 # Contacts with a gap below this are closed at the start [m].
@@ -147,10 +159,14 @@ class Rest:
 
     Attributes
     ----------
-    torques : (n,) motor torques [N m or N], zero for joints without a motor that can give a torque at rest
-    normal_forces : normal force of each contact that touches, keyed by its name [N]; negative: the surface pulls
-    forces : forces of these contacts on the arm: index of the link, point in its frame [m], force in the world [N]
-    on_edge : True if only all of the static friction holds it
+    torques : (n,) ndarray
+        Motor torques [N m or N], zero for joints whose motor cannot produce a torque at rest.
+    normal_forces : dict of str to float
+        Normal force of each contact that touches [N]; negative: the surface pulls.
+    forces : list of (int, (3,) ndarray, (3,) ndarray)
+        Forces of these contacts on the arm: link index, point in its frame [m], force in the world [N].
+    on_edge : bool
+        True if the posture requires the full static friction.
     """
 
     torques: Array
@@ -172,27 +188,39 @@ def holding_torques(
 
     Parameters
     ----------
-    q : (nq,) the posture
-    contacts : all contacts; only contacts that touch carry
-    loads : external loads, evaluated at t = 0
-    able : joints whose motors can give a torque at rest
-    real : True for the unilateral law
-    springs : normal force of the spring of each contact that carries [N], NaN for a rigid contact. Compliant contacts
-        have these forces if that is possible, otherwise the nearest forces, with any torques; default: contacts that
-        touch, all rigid
+    model : Model
+        Model of the robot.
+    q : (nq,) ndarray
+        Posture [rad or m].
+    contacts : sequence of Contact
+        All contacts; only contacts that touch carry load.
+    loads : sequence of Load
+        External loads, evaluated at t = 0.
+    able : sequence of str
+        Joints whose motors can produce a torque at rest.
+    real : bool
+        True for the unilateral law.
+    springs : mapping of str to float, optional
+        Spring force of each contact that carries [N], NaN for a rigid contact. Compliant contacts get these forces if
+        possible, otherwise the nearest forces, with any torques; default: all touching contacts, rigid.
+
+    Returns
+    -------
+    Rest
+        Torques and contact forces.
 
     Raises
     ------
     ModelError
-        If no torques hold the posture; the message names joints whose motors would have to give more than they can.
-        If the robot has coupled joints.
+        If no torques hold the posture; the message lists joints whose motors are too weak. Also if the robot has
+        coupled joints.
     """
     robot = model.robot
     if robot.couplings:
-        raise ModelError("initial.equilibrium: not for robots with coupled joints, which share a motor", keys=KEYS)
+        raise ModelError("initial.equilibrium: coupled joints are not supported, because they share a motor", keys=KEYS)
     touching = touching_contacts(model, contacts, q, real, springs)
-    # Frictionless first, then with a reserve, then with all friction that Coulomb allows; each with a minimum force
-    # first, so that contacts that press keep pressing.
+    # First frictionless, then with a reserve, then with the full Coulomb friction; each first with a minimum force, so
+    # that contacts that press continue to press.
     attempts = [(0.0, 0.0, False)]
     if real and touching:
         ways = (False,) if springs is None else (True, False)
@@ -210,7 +238,7 @@ def holding_torques(
     for share, least, follow_springs in attempts:
         rows = []
         for contact, link, point, normal, _ in touching:
-            # The force of its spring is given, or a force near it is sought.
+            # The force of the spring is prescribed, or a force near it is searched for.
             spring = np.nan if springs is None else springs[contact.name]
             commanded = spring if follow_springs else np.nan
             rows.append(_row(link, point, normal, share * contact.friction_at_rest, least, commanded))
@@ -229,27 +257,29 @@ def holding_torques(
             forces = arrays.forces[: len(rows)] if real else arrays.forces[: len(rows)].reshape(-1, 2, 3).sum(axis=1)
             places = [(link, point, force) for (_, link, point, *_), force in zip(touching, forces, strict=True)]
             return Rest(torques[0], dict(zip(names, normal.tolist(), strict=True)), places, share == 1.0)
-    raise ModelError(_why(model, arrays.motors, arrays.free, [contact[0].name for contact in touching]), keys=KEYS)
+    raise ModelError(
+        _describe_weak_joints(model, arrays.motors, arrays.free, [contact[0].name for contact in touching]), keys=KEYS
+    )
 
 
 def touching_contacts(
     model: Model, contacts: Sequence[Contact], q: Array, real: bool, named: Container[str] | None = None
 ) -> list[Touching]:
-    """Return the contacts that touch and can carry, or only the named contacts, whatever their gaps."""
+    """Return the contacts that touch and can carry load, or only the ``named`` contacts, whatever their gaps."""
     touching = [(contact, *_touching_point(model, contact, q)) for contact in contacts]
     touching = [
         entry
         for entry in touching
         if (abs(entry[-1]) <= TOUCHING or (real and entry[-1] < 0.0) if named is None else entry[0].name in named)
     ]
-    # A point that no joint moves along its normal carries nothing, see dynsim.integrators.contacts.impacts.
+    # A point that no joint moves along its normal carries no force, see dynsim.integrators.contacts.impacts.
     return [
         entry for entry in touching if not (entry[0].left_out or immobile_at(model, entry[1], entry[2], entry[3], q))
     ]
 
 
 def _touching_point(model: Model, contact: Contact, q: Array) -> tuple[int, Array, Array, float]:
-    """Return the link, the point in its frame [m] where a contact touches, the normal in the world and the gap [m]."""
+    """Return the link, the point of contact in its frame [m], the normal in the world and the gap [m]."""
     robot = model.robot
     position, point = model.point_position(contact.body, contact.point, q), contact.point
     if contact.tip is not None:
@@ -267,7 +297,7 @@ def _touching_point(model: Model, contact: Contact, q: Array) -> tuple[int, Arra
 def _row(
     link: int, point: Array, normal: Array, friction: float, least: float, force: float = np.nan
 ) -> tuple[int, Array]:
-    """Return a held brace for the kernels: its link and the row of its table."""
+    """Return a non-sliding brace for the kernels: its link and its table row."""
     return link, brace_rows(point, normal[None], np.array([friction]), least, force, np.zeros((1, 3)))[0]
 
 
@@ -300,8 +330,8 @@ def load_forces(model: Model, q: Array, loads: Sequence[Load]) -> list[tuple[int
     return forces
 
 
-def _why(model: Model, limits: Array, needed: Array, braces: Sequence[str]) -> str:
-    """Return a text that names the joints that cannot give the torques needed for weight and loads."""
+def _describe_weak_joints(model: Model, limits: Array, needed: Array, braces: Sequence[str]) -> str:
+    """Describe the joints that cannot produce the torques needed for weight and loads."""
     robot = model.robot
     motors = {motor.joint: motor for motor in robot.motors}
     weak = []
@@ -310,20 +340,20 @@ def _why(model: Model, limits: Array, needed: Array, braces: Sequence[str]) -> s
             continue
         motor, unit = motors.get(link.joint), link.units[3]
         if low < high:
-            reason = f"its motor gives {high:.4g} {unit}"
+            reason = f"its motor can produce {high:.4g} {unit}"
         elif motor is None:
             reason = "has no motor"
         elif isinstance(motor, Servo):
             reason = "its servo follows rates, not positions"
         else:
-            reason = "nothing makes its motor hold: no controller, or k_p = 0"
+            reason = "its motor does not hold it: no controller, or k_p = 0"
         weak.append((abs(torque), f"{link.joint} {torque:.4g} {unit} ({reason})"))
-    text = "initial.equilibrium: nothing holds this posture at rest"
+    text = "initial.equilibrium: this posture cannot be held at rest"
     if weak:
         largest = [entry for _, entry in sorted(weak, key=lambda entry: -entry[0])]
-        text += f": weight and loads ask for {first_few(largest)}"
+        text += f": weight and loads require {first_few(largest)}"
     carries = f"; {', '.join(braces)} cannot carry it" if braces else "; no contact touches"
-    return f"{text}{carries}. Change the posture, let a brace carry it, or take initial.equilibrium away"
+    return f"{text}{carries}; change the posture, add a brace, or remove initial.equilibrium"
 
 
 def static_margin(model: Model, q: Array, forces: Sequence[tuple[int, Array, Array]] = ()) -> float:
@@ -333,9 +363,13 @@ def static_margin(model: Model, q: Array, forces: Sequence[tuple[int, Array, Arr
 
     Parameters
     ----------
-    q : (nq,) coordinates
-    forces : external forces in addition to the weight: index of the link, point in its frame [m], force in the world
-        [N]; forces on objects next to the base do not count, and neither do the weights of these objects
+    model : Model
+        Model of a robot with a mobile base.
+    q : (nq,) ndarray
+        Coordinates.
+    forces : sequence of (int, (3,) ndarray, (3,) ndarray), optional
+        External forces in addition to the weight: link index, point in its frame [m], force in the world [N]. Forces on
+        objects next to the base, and weights of these objects, do not count.
     """
     robot, base = model.robot, model.robot.base
     assert base is not None
@@ -347,7 +381,7 @@ def static_margin(model: Model, q: Array, forces: Sequence[tuple[int, Array, Arr
             continue
         force += push
         moment += np.cross(model.point_position(link, point, q) - origin, push)
-    # Reaction of the ground, in the axes of the base.
+    # Ground reaction, in the axes of the base.
     pressed, (turn_x, turn_y) = -float(axes[:, 2] @ force), (-axes.T @ moment)[:2]
     if pressed <= 0.0:
         return -1.0

@@ -1,16 +1,17 @@
-"""Postures in which compliant contacts are as deep in their surfaces as the forces of an equilibrium need.
+"""Postures in which compliant contacts are pressed into their surfaces as deeply as an equilibrium requires.
 
 At rest a compliant contact carries its stiffness times its depth, f_n = −k g. Bodies displaced by d change the gaps by
 J d; the generalised forces of an equilibrium with normal forces f equal the generalised forces of the springs if
 
     Jᵀ K J d = Jᵀ (f + K g),    the least squares of K^½ J d = −K^(−½) (f + K g)
 
-so that supports which rigid bodies do not determine share their load as the springs do. Rigid contacts stay
-closed; a rigid contact that need not carry may open if compliant contacts cannot be pressed in otherwise.
+so that supports that rigid bodies do not determine share their load as the springs do. Rigid contacts stay closed; a
+rigid contact that need not carry load may open if compliant contacts cannot be pressed in otherwise.
 
 The first forces have the least heat in the initial posture. If motors can hold different forces, the next forces are
-nearest to the forces that the springs already carry: least heat may determine forces to few digits or leave them open,
-and may need more than can be pressed in, for example if an arm is wedged between a rigid and a compliant brace.
+nearest to the forces that the springs already carry. The heat criterion may determine forces only to few digits or not
+at all, and may require more depth than is possible, for example if an arm is wedged between a rigid and a compliant
+brace.
 """
 
 from __future__ import annotations
@@ -28,27 +29,28 @@ from dynsim.dynamics.tree.joints import normalise, positions_along, rates_across
 from dynsim.errors import ModelError, first_few
 from dynsim.model.description import Array, Contact, Load
 
-# Displacement that counts as zero [rad or m]: with a stiffness of 1e5 N/m it is a force of 1e-8 N.
+# Displacement that counts as zero [rad or m]: with a stiffness of 1e5 N/m, a force of 1e-8 N.
 DONE = 1e-13
-# Displacement that may remain if the equilibrium forces are not known better: 1e-4 N at 1e5 N/m [rad or m].
+# Displacement that may remain if the equilibrium forces are not known more accurately: 1e-4 N at 1e5 N/m [rad or m].
 NEARLY = 1e-9
 ITERATIONS = 50
-# A step is damped more if a gap differs from its linear prediction by more than this part of the largest change.
+# A step is damped more if a gap differs from its linear prediction by more than this fraction of the largest change.
 AGREES = 0.5
-# The search is repeated at most so often, as long as it ends nearer to the initial posture by this factor.
+# Maximum number of repeated searches, as long as each ends nearer to the initial posture by this factor.
 REPEATS, NEARER = 4, 0.9
-# Damping of the springs' least squares, in parts of its largest singular value. The last step is accepted unchanged.
+# Damping of the springs' least squares, relative to its largest singular value. The last step is accepted unchanged.
 DAMPINGS = (0.0, *4.0 ** np.arange(-5, 7))
-# Singular values of rows below this part of the largest are zero.
+# Row singular values below this fraction of the largest are zero.
 RANK = 1e-10
 
 
 def pressed_in(
     model: Model, contacts: Sequence[Contact], loads: Sequence[Load], able: Sequence[str], real: bool
 ) -> Model:
-    """Return the model in the nearest posture whose compliant contacts carry the forces that an equilibrium needs.
+    """Return the model in the posture nearest to the initial one whose compliant contacts carry their equilibrium
+    forces.
 
-    Nearest to the initial posture. The model itself if no compliant contact touches. For the parameters see
+    Returns the model itself if no compliant contact touches. For the parameters see
     :func:`dynsim.compile.posture.holding_torques`.
 
     Raises
@@ -70,7 +72,7 @@ def pressed_in(
 
     forces = holding_torques(model, model.robot.initial, contacts, loads, able, real).normal_forces
     if (balance := _search(model, contacts, real, names, forces, holding)) is None:
-        # A rigid contact that need not carry may keep a compliant one from being pressed in: it may open.
+        # A rigid contact that need not carry load may prevent a compliant contact from being pressed in: it may open.
         for name in [name for name in names if name not in compliant]:
             others = [other for other in names if other != name]
             if (without := holding(model.robot.initial, dict.fromkeys(others, np.nan))) is not None:
@@ -79,11 +81,11 @@ def pressed_in(
     if balance is None:
         raise ModelError(
             f"initial.equilibrium: no posture near this one presses {first_few(compliant)} in as deep as their forces "
-            "need; raise contacts.stiffness_N_per_m, or remove initial.equilibrium",
+            "require; raise contacts.stiffness_N_per_m, or remove initial.equilibrium",
             keys=KEYS,
         )
-    # Steps for forces that were given up, or for contacts that have opened, leave displacements that the equilibrium
-    # does not need. A search from the initial posture that begins with the forces found does not make them.
+    # Steps for forces that were abandoned, or for contacts that have opened, leave displacements that the equilibrium
+    # does not need. A search from the initial posture that starts with the final forces avoids them.
     q, forces = balance
     for _ in range(REPEATS):
         again = _search(model, contacts, real, list(forces), forces, holding)
@@ -108,19 +110,29 @@ def _search(
     forces: Mapping[str, float],
     holding: Callable[[Array, Mapping[str, float]], dict[str, float] | None],
 ) -> tuple[Array, dict[str, float]] | None:
-    """Return the posture (nq,) and the normal forces of contacts that carry [N], or None.
+    """Return the posture (nq,) and the normal forces of contacts that carry load [N], or None.
 
     Parameters
     ----------
-    names : contacts that carry at first, with these forces [N]
-    holding : function that returns forces of an equilibrium near the forces of springs, or None, see
-        :func:`dynsim.compile.posture.holding_torques`
+    model : Model
+        Model of the robot.
+    contacts : sequence of Contact
+        All contacts.
+    real : bool
+        True for the unilateral law.
+    names : sequence of str
+        Contacts that carry load at first.
+    forces : mapping of str to float
+        Their normal forces [N].
+    holding : callable
+        Returns forces of an equilibrium near the forces of springs, or None, see
+        :func:`dynsim.compile.posture.holding_torques`.
     """
     q, before = model.robot.initial, np.inf
     touching = touching_contacts(model, contacts, q, real, names)
     for _ in range(ITERATIONS):
         q, size = _step(model, q, touching, forces) if touching else (q, 0.0)
-        # A contact that carries may open within a step. A contact that carried nothing carries only if the posture
+        # A contact that carries load may open within a step. An unloaded contact carries load only if the posture
         # cannot be held otherwise.
         meeting = [c.name for c, *_, gap in touching_contacts(model, contacts, q, real) if not c.stiffness or gap < 0.0]
         carrying = [c.name for c, *_ in touching if not c.stiffness or forces[c.name] > NEARLY * c.stiffness]
@@ -134,7 +146,7 @@ def _search(
         # If friction shares the load with normal forces, the split between them is as accurate as its search.
         if size <= DONE or before <= size <= NEARLY:
             lacking = [abs(forces[c.name] / c.stiffness + gap) for c, *_, gap in touching if c.stiffness > 0.0]
-            # Rigid contacts or limits may keep joints from pressing springs in further.
+            # Rigid contacts or limits may prevent joints from pressing springs in further.
             if max(lacking, default=0.0) <= NEARLY:
                 return q, forces
             if size <= DONE:
@@ -154,8 +166,8 @@ def spring_forces(touching: Sequence[Touching]) -> dict[str, float]:
 def _step(model: Model, q: Array, touching: Sequence[Touching], forces: Mapping[str, float]) -> tuple[Array, float]:
     """Return the posture in which these forces press contacts in, by the Jacobian, and the largest displacement to it.
 
-    The step is damped until the gaps change about as the Jacobian predicts: a spring that only a large turn would press
-    in, for example at a wedged arm, is not pressed in as deep.
+    The step is damped until the gaps change approximately as the Jacobian predicts: a spring that requires a large
+    rotation, for example at a wedged arm, is pressed in less.
     """
     rigid = np.array([contact.stiffness == 0.0 for contact, *_ in touching])
     roots = np.sqrt([contact.stiffness for contact, *_ in touching])
@@ -179,7 +191,7 @@ def _step(model: Model, q: Array, touching: Sequence[Touching], forces: Mapping[
 def _within_limits(
     model: Model, q: Array, rows: Array, wanted: Array, rigid: NDArray[np.bool_], roots: Array, damping: float
 ) -> Array:
-    """Return the displacement of least norm (n,) that changes gaps as wanted, (c,) [m]; joints keep their limits."""
+    """Return the displacement of minimum norm (n,) that changes gaps as wanted, (c,) [m], within the joint limits."""
     robot, wheels = model.robot, () if model.robot.base is None else model.robot.base.wheels
     free = np.array([link.joint not in wheels for link in robot.links])
     while True:
@@ -207,7 +219,7 @@ def _displacement(rows: Array, wanted: Array, rigid: NDArray[np.bool_], roots: A
     springs = roots[~rigid, None] * rows[~rigid]
     left = roots[~rigid] * wanted[~rigid] - springs @ particular
     from_left, sizes, to_right = np.linalg.svd(springs @ null, full_matrices=False)
-    # Rows of springs that closed rigid contacts keep as they are consist of rounding errors.
+    # Rows of springs that closed rigid contacts keep fixed consist of rounding errors.
     least, largest = RANK * float(np.linalg.norm(springs)), sizes.max(initial=0.0)
     inverse = np.divide(sizes, sizes**2 + (damping * largest) ** 2, out=np.zeros_like(sizes), where=sizes > least)
     return np.asarray(particular + null @ (to_right.T @ (inverse * (from_left.T @ left))))

@@ -1,6 +1,6 @@
-"""Interfaces of the families: a member is a module with ``Config`` and ``build(config, context)``.
+"""Interfaces of the plug-in families: a member is a module with ``Config`` and ``build(config, context)``.
 
-A scenario names a member by ``type``. The member's ``Config`` validates the section; ``build`` turns it into the
+A scenario selects a member by ``type``. The member's ``Config`` validates the section; ``build`` turns it into the
 object that the engines use.
 """
 
@@ -28,12 +28,20 @@ class BuildContext:
 
     Attributes
     ----------
-    duration : simulated time [s]
-    machine : what a controller, or the path of a base, is built for; None for the other families
-    joint : the joint of a motor, "" for the other families
-    contacts : contacts of the scenario by name, also disabled points
-    declared : names of the enabled points; disabled : of the others, which a path may still follow along a surface
-    progress : to be called with the time [s] that references have come to, when they take long; None: nobody listens
+    duration : float
+        Simulated time [s].
+    machine : Model, SnakeDescription or None
+        Machine that a controller or a base path is built for; None for other families.
+    joint : str
+        Joint of a motor; "" for other families.
+    progress : callable or None
+        Called with the time [s] that slowly computed references have reached.
+    contacts : mapping of str to Contact
+        Contacts of the scenario, including disabled points.
+    declared : sequence of str
+        Names of the enabled points.
+    disabled : sequence of str
+        Names of the disabled points, which a path may still follow along a surface.
     """
 
     duration: float
@@ -45,41 +53,41 @@ class BuildContext:
     disabled: Sequence[str] = ()
 
     def at_joint(self, joint: str) -> BuildContext:
-        """The context of a motor on that joint."""
+        """Return the context for a motor on this joint."""
         return replace(self, joint=joint)
 
     @property
     def model(self) -> Model:
-        """The rigid-body model to be controlled; ModelError where there is none."""
+        """Rigid-body model to control; raises ModelError if the machine is not a model."""
         if not isinstance(self.machine, Model):
-            raise ModelError("there is no rigid-body model to build this for")
+            raise ModelError("requires a plant with a rigid-body model")
         return self.machine
 
     @property
     def snake(self) -> SnakeDescription:
-        """The snake to be controlled; ModelError where there is none."""
-        # Imported here: an arm needs nothing of a snake.
+        """Snake to control; raises ModelError if the machine is not a snake."""
+        # Imported here because an arm does not need the snake modules.
         from dynsim.snake.description import SnakeDescription
 
         if not isinstance(self.machine, SnakeDescription):
-            raise ModelError("there is no snake to build this for")
+            raise ModelError("requires a snake plant")
         return self.machine
 
 
 class Member(Protocol):
-    """A module of any family; the first line of its docstring is what ``dynsim list`` shows."""
+    """A module of any family; ``dynsim list`` shows the first line of its docstring."""
 
     @property
     def Config(self) -> type[StrictConfig]:
-        """Keys of its section; ``type`` is ``Literal["name of the member"]``."""
+        """Configuration class of its section; ``type`` is ``Literal["name of the member"]``."""
 
     def build(self, config: Any, context: BuildContext) -> Any:
-        """What the section describes.
+        """Build the object that the section describes.
 
         Raises
         ------
         ModelError
-            It describes nothing that can be built.
+            If the object cannot be built.
         """
 
 
@@ -93,7 +101,7 @@ class PlantModule(Member, Protocol):
 
 
 class ControllerModule(Member, Protocol):
-    """A controller of the plants of ``ENGINE``, built for ``context.model`` or ``context.snake``."""
+    """A controller for plants of ``ENGINE``, built for ``context.model`` or ``context.snake``."""
 
     @property
     def ENGINE(self) -> str: ...
@@ -108,7 +116,7 @@ class PathModule(Member, Protocol):
 
 
 class BasePathModule(Member, Protocol):
-    """A path of a mobile base; built for ``context.model``, which has one."""
+    """A path of a mobile base, built for ``context.model`` with a base."""
 
     def build(self, config: Any, context: BuildContext) -> BasePath: ...
 

@@ -1,4 +1,4 @@
-"""Tables of the inverse kinematics of a hand: its point, moving joints with limits, braces, and scratch."""
+"""Kernel tables for the inverse kinematics of a hand: hand point, moving joints with limits, braces, workspace."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from dynsim.model.description import Contact
 def path_arrays(
     model: Model, joints: Sequence[str], braces: Sequence[Contact] = (), limited: bool = False
 ) -> PathArrays:
-    """Tables for joints that move the hand of a robot along a path while braces stay on their surfaces.
+    """Return tables for joints that move the hand of a robot along a path while braces stay on their surfaces.
 
-    ``limited`` : the limits of the joints hold along the path
+    With ``limited``, the joint limits are enforced along the path.
     """
     columns = [model.joint_names.index(name) for name in joints]
     link, point = model.robot.attach(*model.robot.hand)
-    # Friction moves nothing here: sweeps over it have the same path.
+    # Remove friction, which has no effect here, so that sweeps over it have the same path.
     points = [replace(contact, tip=None, friction=0.0) for contact in braces]
     rows = 3 + len(braces)
     links = [model.robot.links[column] for column in columns if limited]

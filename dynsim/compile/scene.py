@@ -1,4 +1,4 @@
-"""The scene of an arm or a snake for its record, for pictures: bodies, joints, shapes, surfaces and points."""
+"""Scene of an arm or a snake for pictures: bodies, joints, shapes, surfaces and points."""
 
 from __future__ import annotations
 
@@ -31,19 +31,19 @@ from dynsim.record.scene import (
 if TYPE_CHECKING:
     from dynsim.snake.description import SnakeDescription
 
-# Of a height field: as many lines each way as a picture can show.
+# Grid lines of a drawn height field in each direction.
 GRID_LINES = 61
-# Of a wheel, in parts of its radius; a snake's description has no width.
+# Width of a wheel relative to its radius; the description of a snake contains no width.
 WHEEL_WIDTH = 0.48
 BASE_WHEEL_WIDTH = 0.5
-# Thickness of the snake's body, likewise.
+# Radius of the snake's body relative to the wheel radius.
 BODY_RADIUS = 0.5
 _ALONG_X: Quaternion = (math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0)
 _ALONG_Y: Quaternion = (math.sqrt(0.5), -math.sqrt(0.5), 0.0, 0.0)
 
 
 def robot_scene(robot: Robot, contacts: Sequence[Contact], surfaces: Mapping[str, Surface]) -> Scene | None:
-    """The scene of a tree of bodies whose joint positions are the signal ``q``; None where one has no kind for it."""
+    """Return the scene of a tree of bodies with joint positions ``q``; None if a joint cannot be drawn."""
     index = {link.name: k for k, link in enumerate(robot.links)}
     bodies = []
     for link in robot.links:
@@ -71,7 +71,7 @@ def robot_scene(robot: Robot, contacts: Sequence[Contact], surfaces: Mapping[str
 
 
 def drawn_surface(name: str, surface: Surface) -> SceneSurface:
-    """A surface as a scene keeps it."""
+    """Return a surface in the form stored in a scene."""
     nothing = np.zeros((3, 3))
     if isinstance(surface, Box):
         return replace(
@@ -98,7 +98,7 @@ def drawn_surface(name: str, surface: Surface) -> SceneSurface:
 
 
 def _thinned(rows: Array, spacing: float) -> tuple[Array, float]:
-    """Rows at equal distances from the first to the last, no more than are drawn, and their distance [m]."""
+    """Return equally spaced rows from the first to the last, at most GRID_LINES, and their spacing [m]."""
     count = len(rows)
     if count <= GRID_LINES:
         return rows, spacing
@@ -109,7 +109,7 @@ def _thinned(rows: Array, spacing: float) -> tuple[Array, float]:
 
 
 def _wheels(base: MobileBase, body: int) -> list[Body]:
-    """Wheels as bodies of their own, which turn on the base."""
+    """Return the wheels as separate bodies that rotate on the base."""
     r, wheels = base.wheel_radius, []
     for name, side in zip(base.wheels, (0.5, -0.5), strict=True):
         position = (0.0, side * base.track, r)
@@ -121,14 +121,14 @@ def _wheels(base: MobileBase, body: int) -> list[Body]:
 
 
 def _supports(base: MobileBase, body: int) -> tuple[Point, ...]:
-    """Where wheels and caster touch the ground, with the names of their loads."""
+    """Return the ground points of wheels and caster, with the names of their loads."""
     left, right = (vector3((0.0, side * base.track, 0.0)) for side in (0.5, -0.5))
     places = zip(SUPPORTS, (left, right, vector3(base.caster)), strict=True)
     return tuple(Point(name, "support", body, position) for name, position in places)
 
 
 def _joint(link: Link, kind: JointKind) -> Joint:
-    if link.kind == "left_wheel":  # its angles are not where it is
+    if link.kind == "left_wheel":  # wheel angles do not determine its pose
         position, columns = (0.0, 0.0, 0.0), ("x", "y", "heading")
         return Joint(
             link.joint, kind, (0.0, 0.0, 1.0), position, HERE, "base_pose", columns, part_of=link.joint_of_rows or ""
@@ -152,17 +152,17 @@ def _limit(value: float) -> float | None:
 
 
 def shapes(link: Link) -> tuple[Shape, ...]:
-    """The looks of a link's body: its shapes, else the cylinder about its axis where that is known."""
+    """Return the shapes of a link's body, or the cylinder about its axis if that is known."""
     return link.shapes or _rod(link)
 
 
 def with_shapes(robot: Robot) -> Robot:
-    """The same robot whose links name the shapes that they are drawn with."""
+    """Return the robot with the drawn shapes added to its links."""
     return replace(robot, links=tuple(replace(link, shapes=shapes(link)) for link in robot.links))
 
 
 def _rod(link: Link) -> tuple[Shape, ...]:
-    """The cylinder about the body's axis; nothing where its radius or its end is not known."""
+    """Return the cylinder about the body's axis; empty if its radius or end is unknown."""
     if link.tip is None or not link.radius > 0.0:
         return ()
     length = float(np.linalg.norm(link.tip))
@@ -173,7 +173,7 @@ def _rod(link: Link) -> tuple[Shape, ...]:
 
 
 def turn_from_z(direction: Array) -> Quaternion:
-    """A turn that takes z to a unit vector."""
+    """Return a rotation that takes z to a unit vector."""
     axis = np.cross([0.0, 0.0, 1.0], direction)
     size = float(np.linalg.norm(axis))
     if size == 0.0:
@@ -183,11 +183,11 @@ def turn_from_z(direction: Array) -> Quaternion:
 
 
 def snake_scene(description: SnakeDescription) -> Scene:
-    """The scene of an articulated mobile robot on the ground z = 0.
+    """Return the scene of an articulated mobile robot on the ground z = 0.
 
-    Its base part starts at wheel pair 1, which is placed by the signal ``base_pose``; joints are those of ``phi``, a
-    joint of the head part turns its head side by −phi. Active wheels turn by ``rho``. That a pair is lifted the model
-    has no height for ([T] II.A).
+    Its base part starts at wheel pair 1, which is placed by the signal ``base_pose``. Joints follow ``phi``; a joint of
+    the head part rotates its head side by −phi. Active wheels rotate by ``rho``. Lifted pairs are drawn on the ground
+    because the model has no height for them ([T] II.A).
     """
     d, l, n_h = description, description.link_length, description.head_joints
     base = Joint("base", "planar", (0.0, 0.0, 1.0), (0.0, 0.0, d.wheel_radius), HERE, "base_pose", ("x", "y", "yaw"))
@@ -219,19 +219,19 @@ def _snake_joint(d: SnakeDescription, j: int, axis: tuple[float, float, float], 
 
 
 def snake_tube(d: SnakeDescription, start: float, end: float) -> Shape:
-    """The body of a snake along x of a link, from start to end [m]."""
+    """Return the body of a snake along x of a link, from start to end [m]."""
     return Shape("cylinder", (BODY_RADIUS * d.wheel_radius, end - start), (0.5 * (start + end), 0.0, 0.0), _ALONG_X)
 
 
 def _passive_wheels(d: SnakeDescription, pair: int, x: float) -> tuple[Shape, ...]:
-    """Wheels that follow the ground: their angle is not recorded."""
+    """Return the passive wheels, whose angles are not recorded."""
     sides = [side for side in (1, -1) if side != d.driven_side[pair]]
     wheel = snake_wheel(d)
     return tuple(replace(wheel, position=(x, side * float(d.half_track[pair]), 0.0)) for side in sides)
 
 
 def snake_wheel(d: SnakeDescription) -> Shape:
-    """A wheel of a snake about y of its body."""
+    """Return a wheel of a snake about y of its body."""
     return Shape("cylinder", (d.wheel_radius, WHEEL_WIDTH * d.wheel_radius), orientation=_ALONG_Y)
 
 

@@ -14,12 +14,12 @@ from dynsim.model.surfaces import SIMPLE, Array, Box, Quadric, Surface, shape_ar
 
 
 def compile_shapes(robot: Robot, contacts: Sequence[Contact]) -> kd.ShapeArrays | None:
-    """Shapes of the candidates; None when all are points on quadrics, which need none.
+    """Return the shapes of the candidates; None if all are points on quadrics, which need no shapes.
 
     Raises
     ------
     ModelError
-        A candidate with a radius or an axis against a surface that has no exact distance.
+        If a candidate with a radius or an axis touches a surface without exact distance.
     """
     entries = []
     for contact in contacts:
@@ -31,8 +31,8 @@ def compile_shapes(robot: Robot, contacts: Sequence[Contact]) -> kd.ShapeArrays 
             raise ModelError(f"contact {contact.name}: radius {contact.radius} m must be zero or positive")
         if not point and isinstance(contact.surface, Quadric) and contact.surface.drawn.kind not in SIMPLE:
             raise ModelError(
-                f"contact {contact.name}: {contact.surface_name!r} is a quadric of another kind, which only points can "
-                "touch; spheres and capsules touch planes, spheres, cylinders, boxes and height fields"
+                f"contact {contact.name}: only points can touch the general quadric {contact.surface_name!r}; use a "
+                "point (no radius_m, no link axis), or a plane, sphere, cylinder, box or height field"
             )
         entries.append((None if point else contact.surface, contact.radius, along, moves(contact)))
     if all(surface is None for surface, _, _, _ in entries):
@@ -41,28 +41,28 @@ def compile_shapes(robot: Robot, contacts: Sequence[Contact]) -> kd.ShapeArrays 
 
 
 def moves(contact: Contact) -> bool:
-    """Whether the nearest point of a contact's axis touches: on a sphere, a cylinder or a box, from outside.
+    """Return whether the contact point can move along the axis: on a sphere, a cylinder or a box, from outside.
 
-    Elsewhere an axis is nearest with one of its ends, which are candidates of their own.
+    On other surfaces the nearest point is one of the ends, which are separate candidates.
     """
     return contact.tip is not None and bends_outward(contact.surface)
 
 
 def bends_outward(surface: Surface) -> bool:
-    """Whether a straight axis can be nearest to a surface between its ends, which all lie on the free side."""
+    """Return whether a straight axis can be nearest to a surface between its ends, on the free side."""
     if isinstance(surface, Quadric):
         return surface.drawn.kind in ("sphere", "cylinder") and (surface.drawn.radius or 0.0) > 0.0
     return isinstance(surface, Box)
 
 
 def gap_at(model: Model, contact: Contact, q: Array) -> float:
-    """Gap [m] of a contact at a configuration, (nq,); ModelError for a body that the model does not have."""
+    """Return the gap [m] of a contact at a configuration, (nq,); raises ModelError for an unknown body."""
     ends = [model.point_position(contact.body, end, q) for end in (contact.point, contact.tip) if end is not None]
     return contact_gap(contact, *ends)
 
 
 def contact_gap(contact: Contact, start: Array, end: Array | None = None) -> float:
-    """Gap [m] of a contact whose point is at ``start``, (3,), and the other end of whose axis is at ``end``."""
+    """Return the gap [m] of a contact with its point at ``start``, (3,), and the other end of its axis at ``end``."""
     nearest = start if end is None else start + share_of_axis(contact, start, end) * (end - start)
     try:
         return contact.surface.gap(nearest) - contact.radius
@@ -71,7 +71,9 @@ def contact_gap(contact: Contact, start: Array, end: Array | None = None) -> flo
 
 
 def share_of_axis(contact: Contact, start: Array, end: Array) -> float:
-    """Where on the axis from ``start`` to ``end``, (3,), a capsule is nearest to its surface, 0 to 1."""
+    """Return the position, 0 to 1, on the axis from ``start`` to ``end``, (3,), where a capsule is nearest to its
+    surface.
+    """
     if not moves(contact):
         return 0.0
     along = np.asarray(end) - start
@@ -82,9 +84,18 @@ def share_of_axis(contact: Contact, start: Array, end: Array) -> float:
 
 
 def touching_points(contact: Contact, starts: Array, ends: Array | None = None) -> Array:
-    """Where the surface touches a sphere or capsule, and its force acts, (T, 3) [m]; see dynamics.contact.shapes.
+    """Return the points where a surface touches a sphere or capsule and its force acts, (T, 3) [m].
 
-    ``starts``, ``ends`` : (T, 3) of the axis [m]; no ends: of the centre
+    See dynamics.contact.shapes.
+
+    Parameters
+    ----------
+    contact : Contact
+        Sphere or capsule.
+    starts : (T, 3) ndarray
+        Centres of the sphere, or start points of the axis [m].
+    ends : (T, 3) ndarray, optional
+        End points of the axis [m].
     """
     nearest = np.array(starts, dtype=np.float64)
     if ends is not None and moves(contact):

@@ -4,13 +4,13 @@
                      ├ pair2 (theta4) ─ plate2 (psi4) ─ pair3 (theta5) ─ …   tail branch
                      └ wheel1L, wheel1R on pair1, wheel2L, wheel2R on pair2, …
 
-The root is the body behind the axle of wheel pair 1, at that axle. Going tailward a joint turns by Rz(θ) or Ry(ψ), so a
-joint of the head branch, which turns its head side, has the axis −e_z or −e_y. The angle of a joint is that of
+The root is the body behind the axle of wheel pair 1, at that axle. Towards the tail a joint rotates by Rz(θ) or Ry(ψ),
+so a joint of the head branch, which rotates its head side, has the axis −e_z or −e_y. Joint angles are defined as in
 :mod:`dynsim.snake.kinematics`. Pitch joints on the axles of the base part, ψ4 … ψ8, lift wheel pairs
 (:mod:`dynsim.snake.lifting`).
 
-All wheels are bodies, spheres where they touch: a driven one has a servo in velocity mode, the others turn freely.
-Their masses are in those of the links, which are the ones of the kinematic level; they add only their spin inertia.
+All wheels are bodies with spherical contacts: a driven wheel has a servo in velocity mode, the other wheels rotate
+freely. Their masses are included in the link masses of the kinematic level; they add only their spin inertia.
 """
 
 from __future__ import annotations
@@ -35,22 +35,29 @@ GROUND = "ground"
 ROOT = "pair1"
 HEAD = "head"
 _X, _Y, _Z = np.eye(3)
-# Of solid boxes as long as a link and so wide and high [m] (assumed).
+# Width and height of the solid boxes that represent links, which are as long as the link [m] (assumed).
 BOX_WIDTH = 0.08
 
 
 @dataclass(frozen=True)
 class SnakeTree(Robot):
-    """The tree, and what its controller knows of it.
+    """The tree of a snake with the data for its controller.
 
     Attributes
     ----------
-    description : of the snake
-    base_part : its base part, as it is folded along its axles
-    lifts : how high and how fast wheel pairs are lifted
-    sag_compensation : of lifted pairs: their pitch joints are told by so much more as their servos give way
-    raised : a run begins with the head raised from below; False: with the head let go in its posture, nothing sags yet
-    gripper : on its head
+    description : SnakeDescription
+        Description of the snake.
+    base_part : BasePart
+        Its base part, as folded along its axles.
+    lifts : Lifts
+        Height and timing of lifted wheel pairs.
+    sag_compensation : bool
+        If True, commands of the pitch joints of lifted pairs compensate the sag of their servos.
+    raised : bool
+        If True, a run starts after raising the head from below; if False, with the head released in its posture, before
+        anything sags.
+    gripper : Gripper
+        Gripper on its head.
     """
 
     description: SnakeDescription = field(kw_only=True)
@@ -61,12 +68,12 @@ class SnakeTree(Robot):
     gripper: Gripper = field(kw_only=True)
 
     def holding(self, name: str) -> list[Tie]:
-        """Ties by which the gripper can hold the object of that name."""
+        """Return the ties by which the gripper can hold an object."""
         return self.gripper.ties(name)
 
     @property
     def lifting_joints(self) -> tuple[str, ...]:
-        """Pitch joints on the axles of pairs 1, 2, …, all but the last; the first is the last head joint."""
+        """Pitch joints on the axles of pairs 1, 2, …, except the last; the first is the last head joint."""
         return self.lifts.joints
 
     @property
@@ -77,19 +84,21 @@ class SnakeTree(Robot):
 
 
 def wheel_joint(pair: int, side: int) -> str:
-    """Name of the joint of a wheel: pair from 0, side 1 left, −1 right."""
+    """Return the joint name of a wheel: pair from 0, side 1 left, −1 right."""
     return f"wheel{pair + 1}{'L' if side > 0 else 'R'}"
 
 
 def snake_base_part(d: SnakeDescription) -> BasePart:
-    """Lengths of the base part of a snake."""
+    """Return the lengths of the base part of a snake."""
     links = np.full(d.base_joints, d.link_length)
     pairs = tuple(f"pair{k + 1}" for k in range(d.pairs))
     return BasePart(pairs, links, links, d.half_track, d.wheel_radius, "phi", d.joint_names[d.head_joints :])
 
 
 def lifting_joints(d: SnakeDescription) -> tuple[str, ...]:
-    """Names of the pitch joints on the axles of pairs 1, 2, …, all but the last; that of pair 1 carries the head."""
+    """Return the names of the pitch joints on the axles of pairs 1, 2, …, except the last; pair 1's joint carries the
+    head.
+    """
     first = d.head_joints // 2
     return tuple(f"psi{first + k}" for k in range(d.pairs - 1))
 
@@ -109,21 +118,33 @@ def snake_tree(
     raised: bool,
     gripper: Gripper,
 ) -> SnakeTree:
-    """The tree of a snake in its initial posture, all wheels on the ground z = 0.
+    """Return the tree of a snake in its initial posture, all wheels on the ground z = 0.
 
     Parameters
     ----------
-    joint_servo, wheel_servo : the servo of a joint by its name
-    yaw_stop, pitch_stop : mechanical stops of the joints, on both sides of zero [rad]
-    wheel_inertia : about its axle, of each wheel without its servo [kg m²]
-    bearing_drag : viscous drag of each wheel [N m s/rad]
-    gripper : its tip ahead of the head point
-    massless_wheels : wheels without servo are no bodies: they have no friction along their way, and no drag
+    d : SnakeDescription
+        Description of the snake.
+    joint_servo, wheel_servo : callable
+        Return the servo of a joint, given its name.
+    yaw_stop, pitch_stop : float
+        Mechanical stops of the joints, on both sides of zero [rad].
+    wheel_inertia : float
+        Inertia of each wheel about its axle, without its servo [kg m²].
+    bearing_drag : float
+        Viscous drag of each wheel [N m s/rad].
+    massless_wheels : bool
+        If True, wheels without servo are not bodies: they have no friction in the rolling direction, and no drag.
+    lifts : Lifts
+        Height and timing of lifted wheel pairs.
+    sag_compensation, raised : bool
+        See :class:`SnakeTree`.
+    gripper : Gripper
+        Gripper, with its tip in front of the head point.
 
     Raises
     ------
     ModelError
-        A servo that does not follow positions (joints) or rates (wheels).
+        If a servo does not follow positions (joints) or rates (wheels).
     """
     l, n_h = d.link_length, d.head_joints
     masses = d.link_mass  # head to tail
@@ -146,7 +167,7 @@ def snake_tree(
             lower=-stop,
             upper=stop,
             radius=BODY_RADIUS * d.wheel_radius,
-            # What the head carries ahead is its gripper.
+            # The gripper extends the head forwards.
             tip=np.array([end + float(gripper.tip[0]) if name == HEAD else start + end, 0.0, 0.0]),
             shapes=(snake_tube(d, start, end),),
         )
@@ -217,9 +238,10 @@ def snake_tree(
 
 
 def configuration(robot: SnakeTree, phi: Array, height: Array) -> Array:
-    """Coordinates (nq,) of the tree on its wheels, at angles phi (n_phi,) [rad], the pairs at heights (pairs,) [m].
+    """Return the coordinates (nq,) of the tree on its wheels, at angles phi (n_phi,) [rad] and pair heights (pairs,)
+    [m].
 
-    Pair 1 is flat on the ground. The heights are those of thin discs; where a bent base twists, spheres beside them
+    Pair 1 is flat on the ground. The heights are computed for thin discs; if a bent base twists, spheres next to them
     would be lower, and the robot is raised until the lowest one touches.
     """
     d = robot.description
@@ -231,9 +253,10 @@ def configuration(robot: SnakeTree, phi: Array, height: Array) -> Array:
 
 
 def at_angles(robot: SnakeTree, angles: Mapping[str, float], tilt: float = 0.0) -> Array:
-    """Coordinates (nq,) of the tree with its lowest wheel on the ground, the body behind pair 1 tilted tail up [rad].
+    """Return the coordinates (nq,) of the tree with its lowest wheel on the ground and the body behind pair 1 tilted
+    [rad].
 
-    ``angles`` : by joint [rad]; others are where they start
+    A positive tilt raises the tail. ``angles`` contains joint angles [rad]; other joints stay at their start.
     """
     d = robot.description
     q = robot.initial.copy()
@@ -245,34 +268,34 @@ def at_angles(robot: SnakeTree, angles: Mapping[str, float], tilt: float = 0.0) 
     # Rz(yaw) Ry(hinge)
     q[:7] = x, y, d.wheel_radius, c * cp, -s * sp, c * sp, s * cp
     model = Model(robot)
-    own = robot.feet[: 2 * d.pairs + 1]  # before those of objects beside it
+    own = robot.feet[: 2 * d.pairs + 1]  # excludes the feet of objects
     q[2] -= min(model.point_position(foot.body, foot.point, q)[2] - foot.radius for foot in own)
     return q
 
 
 def _link_inertia(mass: float, length: float, ahead: float) -> Inertia:
-    """A solid box from the joint on, ahead (1) or behind (−1)."""
+    """Return the inertia of a solid box in front of the joint (1) or behind it (−1)."""
     across = mass * (length**2 + BOX_WIDTH**2) / 12.0
     tensor = np.diag([mass * BOX_WIDTH**2 / 6.0, across, across])
     return Inertia(float(mass), np.array([0.5 * ahead * length, 0.0, 0.0]), tensor)
 
 
 def lifted_moments(robot: SnakeTree, lifted: NDArray[np.bool_]) -> Array:
-    """Moments of weight at the pitch joints of lifted pairs, (pairs − 1,) [N m], as if the base part was straight.
+    """Return the weight moments at the pitch joints of lifted pairs, (pairs − 1,) [N m], for a straight base part.
 
-    Between two pairs on the ground the base part is taken as simply supported there, behind the last one as a
-    cantilever. Positive ones sink what is behind the joint.
+    Between two grounded pairs the base part is treated as simply supported, behind the last one as a cantilever.
+    Positive moments lower the part behind the joint.
     """
     d = robot.description
     n, l, g = d.pairs, d.link_length, float(-robot.gravity[2])
-    # Weight of the plate behind each axle: the two links between it and the next one.
+    # Weight of the plate behind each axle: the two links up to the next axle.
     masses = d.link_mass[d.head_joints :]
     weight = [g * float(masses[2 * k] + masses[2 * k + 1]) for k in range(n - 1)]
     moments = np.zeros(n - 1)
     down = np.flatnonzero(~lifted).tolist()
     for first, last in zip(down, [*down[1:], n], strict=True):
         count = last - first
-        if last == n:  # the tail, behind the last pair on the ground
+        if last == n:  # the tail, behind the last grounded pair
             for k in range(first, n - 1):
                 moments[k] = sum(weight[i] * l * (2 * (i - k) + 1) for i in range(k, n - 1))
         elif count > 1:

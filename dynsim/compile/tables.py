@@ -1,4 +1,4 @@
-"""Kernel tables of bodies, drives, contacts, loads, couplings and mobile base; checks of descriptions."""
+"""Kernel tables of bodies, drives, contacts and contact laws, loads, couplings and base; checks of descriptions."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ from dynsim.model.description import WORLD, Contact, Coupling, Link, Load, Quadr
 from dynsim.model.drives import Drive, Motor, Servo, TorqueSource, servo_row
 from dynsim.model.surfaces import shape_arrays
 
-# Tables of the unilateral law for the kernels: law of each contact, joint stops, dry friction, ties.
+# Tables of the unilateral law: law of each contact, joint stops, dry friction, ties.
 
 
 # A joint may start this far beyond its stop [rad or m].
 START_TOLERANCE = 1e-6
-# After an impact a point that separates more slowly than this stays closed, which ends a series of ever smaller
-# bounces [m/s]. It exceeds 6e-5 m/s, the speed gained by falling through the depth at which a point counts as landed:
-# with a lower bound two points of a rocking body would land in turn without end.
+# After an impact a point that separates more slowly than this stays closed, which ends a series of ever smaller bounces
+# [m/s]. It exceeds 6e-5 m/s, the speed gained by falling through the depth at which a point counts as landed: with a
+# lower bound two points of a rocking body would land alternately without end.
 SETTLE_SPEED = 1e-4
 
 
 @dataclass(frozen=True)
 class JointStop:
-    """What a joint comes up against: side 1 keeps q ≥ position, side −1 q ≤ position [rad or m]."""
+    """A joint stop: side 1 keeps q ≥ position, side −1 q ≤ position [rad or m]."""
 
     joint: str
     side: float
@@ -45,7 +45,7 @@ class JointStop:
 
 @dataclass(frozen=True)
 class DryFriction:
-    """Friction of a joint that holds it at rest, of its gear and of its bearing [N m or N]."""
+    """Dry friction of a joint that can hold it at rest, from its gear and its bearing [N m or N]."""
 
     joint: str
     gear: float
@@ -53,14 +53,14 @@ class DryFriction:
 
 
 def dry_frictions(robot: Robot) -> list[DryFriction]:
-    """The joints of a robot with friction that is not smoothed."""
+    """Return the joints of a robot with dry friction that is not smoothed."""
     gears = {motor.joint: motor.dry_friction for motor in robot.motors if not isinstance(motor, TorqueSource)}
     frictions = [DryFriction(link.joint, gears.get(link.joint, 0.0), link.friction) for link in robot.links]
     return [friction for friction in frictions if friction.gear + friction.bearing > 0.0]
 
 
 def format_quantity(value: float, unit: str, digits: int = 5) -> str:
-    """A joint coordinate for a line of text; an angle in degrees first, which scenarios are written in."""
+    """Return a joint coordinate as text; angles in degrees, as in scenarios, and radians."""
     if unit != "rad":
         return f"{value:.{digits}g} {unit}"
     return f"{np.degrees(value):.{digits}g}° ({value:.{min(digits, 4)}g} rad)"
@@ -74,14 +74,22 @@ def compile_unilateral(
     creep: float,
     dry: Sequence[DryFriction] = (),
 ) -> UnilateralArrays:
-    """Tables of the unilateral law.
+    """Return the tables of the unilateral law.
 
     Parameters
     ----------
-    stops : what joints come up against
-    slow : speed below which slip has no direction of its own [m/s]
-    creep : rate below which a joint that rubs may be at rest [rad/s or m/s]
-    dry : joints that rub
+    robot : Robot
+        Description of the robot.
+    contacts : sequence of Contact
+        Contact candidates.
+    stops : sequence of JointStop
+        Joint stops.
+    slow : float
+        Speed below which slip has no defined direction [m/s].
+    creep : float
+        Rate below which a joint with dry friction may be at rest [rad/s or m/s].
+    dry : sequence of DryFriction, optional
+        Joints with dry friction.
     """
     c, s, ties = len(contacts), len(stops), robot.ties
     shares = share_count(len(robot.couplings), c, s, len(dry))
@@ -128,17 +136,17 @@ def compile_unilateral(
 
 
 def _compile_tie(robot: Robot, tie: Tie, table: NDArray[np.int64], row: NDArray[np.float64]) -> None:
-    """Rows of the tables of a tie."""
+    """Fill the table rows of a tie."""
     where = f"tie {tie.name}"
     if not (tie.stiffness >= 0.0 and tie.damping >= 0.0 and tie.stiffness + tie.damping > 0.0 and tie.bound > 0.0):
-        raise ModelError(f"{where}: needs a stiffness or a damping, neither negative, and a positive bound")
+        raise ModelError(f"{where}: stiffness or damping must be positive, neither negative, and the bound positive")
     a, point = robot.attach(tie.body, tie.point)
     b, other = (-1, tie.other_point) if tie.other == WORLD else robot.attach(tie.other, tie.other_point)
     if a == b:
         raise ModelError(f"{where}: both ends are on {robot.links[a].name}")
     length = float(np.linalg.norm(tie.axis))
     if not length > 0.0:
-        raise ModelError(f"{where}: its axis has no direction")
+        raise ModelError(f"{where}: its axis must not be the zero vector")
     kind = kc.ONE_WAY if tie.pushes else kc.BOX
     table[[ku.TIE_A, ku.TIE_B, ku.TIE_TURNS, ku.TIE_KIND]] = a, b, tie.turns, kind if tie.holds else -1
     row[[ku.TIE_STIFFNESS, ku.TIE_DAMPING, ku.TIE_BOUND, ku.TIE_REST]] = tie.stiffness, tie.damping, tie.bound, tie.rest
@@ -148,16 +156,16 @@ def _compile_tie(robot: Robot, tie: Tie, table: NDArray[np.int64], row: NDArray[
 
 
 def contact_laws(robot: Robot, contacts: Sequence[Contact]) -> NDArray[np.float64]:
-    """The law of each contact, (c, CONTACT_LAW_SIZE), see dynsim.dynamics.tables.
+    """Return the law of each contact, (c, CONTACT_LAW_SIZE), see dynsim.dynamics.tables.
 
     Raises
     ------
     ModelError
-        Static friction below the kinetic one, negative numbers, or restitution above one.
+        If static friction is below kinetic friction, a value is negative, or restitution is above one.
     """
     law = np.ones((len(contacts), ka.CONTACT_LAW_SIZE))
-    # Isotropic friction has no axis: tangents that turned with the body would turn the rates of a step, also rates
-    # that it has stopped.
+    # Isotropic friction has no axis: tangents that rotate with the body would rotate the rates of a step, including
+    # rates that friction has stopped.
     law[:, [ka.FLOOR, ka.GRIP_AXIS, ka.GRIP_AXIS + 1, ka.GRIP_AXIS + 2]] = 0.0
     for row, contact in zip(law, contacts, strict=True):
         where = f"contact {contact.name}"
@@ -167,10 +175,11 @@ def contact_laws(robot: Robot, contacts: Sequence[Contact]) -> NDArray[np.float6
             raise ModelError(f"{where}: slip smoothing {contact.slip_smoothing} m/s must be positive")
         if not contact.friction_at_rest >= contact.friction:
             raise ModelError(
-                f"{where}: static friction {contact.static_friction:g} is less than the kinetic {contact.friction:g}"
+                f"{where}: static friction {contact.static_friction:g} must not be less than kinetic friction "
+                f"{contact.friction:g}"
             )
         if not 0.0 <= contact.restitution <= 1.0:
-            raise ModelError(f"{where}: restitution {contact.restitution:g} is not between 0 and 1")
+            raise ModelError(f"{where}: restitution must be between 0 and 1, got {contact.restitution:g}")
         if not (contact.stribeck >= 0.0 and contact.viscous_friction >= 0.0):
             raise ModelError(f"{where}: Stribeck speed and viscous friction must not be negative")
         row[[ka.MU, ka.V_S, ka.STATIC]] = contact.friction, contact.slip_smoothing, contact.friction_at_rest
@@ -178,7 +187,7 @@ def contact_laws(robot: Robot, contacts: Sequence[Contact]) -> NDArray[np.float6
         row[ka.RESTITUTION] = contact.restitution
         stiffness, damping = contact.stiffness, contact.damping
         if not (stiffness >= 0.0 and damping >= 0.0) or (damping > 0.0 and stiffness == 0.0):
-            raise ModelError(f"{where}: stiffness and damping must not be negative, and damping needs a stiffness")
+            raise ModelError(f"{where}: stiffness and damping must not be negative, and damping requires a stiffness")
         row[[ka.CONTACT_STIFFNESS, ka.CONTACT_DAMPING]] = stiffness, damping
         if contact.grip_axis is not None and contact.grip != 1.0:
             row[ka.GRIP] = contact.grip
@@ -215,32 +224,32 @@ def joint_stops(
                 if beyond > tolerance:
                     raise ModelError(
                         f"{link.joint}: starts at {format_quantity(q[k], link.units[0])}, beyond its "
-                        f"stop at {format_quantity(limit, link.units[0])}; "
-                        f"contacts.law: unilateral enforces it: {remedy}",
+                        f"stop at {format_quantity(limit, link.units[0])}, which "
+                        f"contacts.law: unilateral enforces; {remedy}",
                         keys=("plant",),
                     )
                 stops.append(JointStop(link.joint, side, float(limit)))
     return stops
 
 
-# Largest initial angle [rad]: beyond it the reduction to a quarter turn leaves too few digits
+# Largest initial angle [rad]: beyond it the reduction to a quarter turn loses too many digits
 # (dynsim.dynamics.tree.joints.sine_cosine).
 ANGLE_LIMIT = 1e6
-# Rounding by which the initial position of a follower may differ from that by its leader [rad or m].
+# Tolerance of the initial position of a follower with respect to its leader [rad or m].
 COUPLING_TOLERANCE = 1e-6
 
 _FRICTION = {"signed": ka.FRICTION_SIGNED, "dissipative": ka.FRICTION_DISSIPATIVE}
 
 
 def compile_model(robot: Robot) -> ka.ModelArrays:
-    """Tables of the tree of bodies.
+    """Return the tables of the tree of bodies.
 
     Raises
     ------
     ModelError
-        Duplicate names, a parent that does not come first, an impossible inertia, a joint that nothing can accelerate,
-        a hand on a body that there is not, an impossible coupling or an initial configuration that breaks one, or
-        vectors of another shape or with what is no finite number.
+        If names are duplicate, a parent does not come first, an inertia is impossible, a joint cannot be accelerated,
+        the hand is on an unknown body, a coupling is impossible or violated by the initial configuration, or a vector
+        has the wrong shape or a value that is not finite.
     """
     links = robot.links
     if not links:
@@ -255,24 +264,24 @@ def compile_model(robot: Robot) -> ka.ModelArrays:
     for i, link in enumerate(links):
         if link.kind == "revolute" and abs(initial[position[i]]) > ANGLE_LIMIT:
             raise ModelError(
-                f"{link.joint}: an initial angle of {initial[position[i]]:.3g} rad; more than {ANGLE_LIMIT:g} rad "
-                "cannot be told from other angles, take it modulo a turn"
+                f"{link.joint}: initial angle {initial[position[i]]:.3g} rad is too large (limit {ANGLE_LIMIT:g} rad); "
+                "subtract whole turns"
             )
         if link.kind == "ball_x":
             length = float(np.linalg.norm(initial[position[i] : position[i] + 4]))
             if not abs(length - 1.0) < 1e-9:
-                raise ModelError(f"{link.joint_of_rows}: the initial quaternion has length {length:.6g}; it must be 1")
+                raise ModelError(f"{link.joint_of_rows}: the initial quaternion must have length 1, got {length:.6g}")
         if link.name in index or link.joint in joints:
             raise ModelError(f"{link.name}: the name of a body or joint occurs twice")
         if link.parent is not None and link.parent not in index:
-            raise ModelError(f"{link.name}: its parent {link.parent!r} must be a body that comes before it")
+            raise ModelError(f"{link.name}: parent {link.parent!r} must be a body defined before it")
         link.inertia.check(link.name)
         for loss in ("damping", "friction"):
             if not getattr(link, loss) >= 0.0:
-                raise ModelError(f"{link.joint}: {loss} {getattr(link, loss)}; a loss must be zero or positive")
+                raise ModelError(f"{link.joint}: {loss} must be zero or positive, got {getattr(link, loss)}")
         norm = float(np.linalg.norm(link.axis))
         if not abs(norm - 1.0) < 1e-9:
-            raise ModelError(f"{link.joint}: the axis {link.axis} has length {norm:.6g}; it must be a unit vector")
+            raise ModelError(f"{link.joint}: axis must be a unit vector, got {link.axis} with length {norm:.6g}")
         R_PJ = np.asarray(link.R_PJ)
         turned = not np.array_equal(R_PJ, unturned)
         if turned and (np.abs(R_PJ @ R_PJ.T - unturned).max() > 1e-9 or np.linalg.det(R_PJ) < 0.0):
@@ -282,7 +291,7 @@ def compile_model(robot: Robot) -> ka.ModelArrays:
         tree[i, ka.PARENT] = parent
         tree[i, ka.KIND] = _joint_kind(link)
         tree[i, ka.POSITION_INDEX] = position[i]
-        # Later rows of a joint are mounted where its first one is.
+        # Later rows of a joint have the same mounting as its first row.
         tree[i, ka.BASE] = parent if link.row.neutral else tree[parent, ka.BASE]
         tree[i, ka.TURNED] = int(turned)
         if parent >= 0 and parent != i - 1:
@@ -302,14 +311,16 @@ def compile_model(robot: Robot) -> ka.ModelArrays:
         if frame.name in names:
             raise ModelError(f"{frame.name}: the name of a body or frame occurs twice")
         if frame.body is not None and frame.body not in index:
-            raise ModelError(f"frame {frame.name}: no body {frame.body!r}")
+            raise ModelError(f"frame {frame.name}: unknown body {frame.body!r}")
         names.add(frame.name)
     by_joint = {link.joint: link for link in links}
     for motor in robot.motors:
         _check_motor(motor, by_joint)
         i = joints[motor.joint]
         if len(links[i].row.neutral) != 1 and not links[i].row.own_position:
-            raise ModelError(f"motor: {motor.joint} is one of several rates of a joint and has no position to control")
+            raise ModelError(
+                f"motor of {motor.joint}: this is one of several rates of a joint, without a position to control"
+            )
         if not isinstance(motor, TorqueSource):
             body[i, ka.ARMATURE] += motor.armature
             body[i, ka.GEAR_DAMPING] += motor.reflected_damping
@@ -325,13 +336,18 @@ def compile_model(robot: Robot) -> ka.ModelArrays:
 def compile_drives(
     robot: Robot, *, k_p: Sequence[float], k_d: Sequence[float], sampled: bool = False, dry: bool = False
 ) -> ka.DriveArrays:
-    """Tables of the motors.
+    """Return the tables of the motors.
 
     Parameters
     ----------
-    k_p, k_d : gains of the voltage PD, one per motor [V/rad, V s/rad]; only DC motors take them
-    sampled : commands are held between ticks, see :func:`dynsim.dynamics.drive.law.take_commands`
-    dry : friction of gears that need not be smoothed has rows, see :func:`dynsim.compile.tables.dry_frictions`
+    robot : Robot
+        Description of the robot.
+    k_p, k_d : sequence of float
+        Gains of the voltage PD controller, one per motor [V/rad, V s/rad]; only DC motors use them.
+    sampled : bool, optional
+        If True, commands are held between ticks, see :func:`dynsim.dynamics.drive.law.take_commands`.
+    dry : bool, optional
+        If True, gear friction that need not be smoothed has separate rows, see :func:`dry_frictions`.
     """
     joints = {link.joint: i for i, link in enumerate(robot.links)}
     table = np.zeros((len(robot.motors), ka.DRIVE_SIZE), dtype=np.int64)
@@ -372,14 +388,21 @@ def _dc_motor(m: Motor, k_p: float, k_d: float) -> np.ndarray:
 
 
 def compile_contacts(robot: Robot, contacts: Sequence[Contact], floors: np.ndarray | None = None) -> ka.ContactArrays:
-    """Tables of the contact points.
+    """Return the tables of the contact points.
 
-    floors : (c,) mobilities along the normals up to which contacts have no force [1/kg], for the bilateral law
+    Parameters
+    ----------
+    robot : Robot
+        Description of the robot.
+    contacts : sequence of Contact
+        Contact candidates.
+    floors : (c,) ndarray, optional
+        Mobilities along the normals up to which contacts have no force [1/kg], for the bilateral law.
 
     Raises
     ------
     ModelError
-        Unknown body, negative friction or smoothing speed.
+        If a body is unknown, or friction or smoothing speed is negative.
     """
     link = np.zeros((len(contacts), ka.CONTACT_LINK_SIZE), dtype=np.int64)
     point = np.zeros((len(contacts), ka.POINT_SIZE))
@@ -392,7 +415,7 @@ def compile_contacts(robot: Robot, contacts: Sequence[Contact], floors: np.ndarr
         link[k, ka.LINK], link[k, ka.FRICTION_LAW] = body, _FRICTION[contact.pulling_friction]
         link[k, ka.LEFT_OUT] = contact.left_out
         point[k, ka.POINT : ka.POINT + 3] = on_body
-        if not isinstance(surface, Quadric):  # any plane will do: its rows are overwritten
+        if not isinstance(surface, Quadric):  # any plane: its rows are overwritten
             point[k, ka.QUADRIC + 8] = 1.0
             continue
         curved = bool(surface.Q.any())
@@ -408,12 +431,12 @@ def compile_contacts(robot: Robot, contacts: Sequence[Contact], floors: np.ndarr
 
 
 def compile_loads(robot: Robot, loads: Sequence[Load]) -> LoadArrays:
-    """Tables of the external wrenches.
+    """Return the tables of the external wrenches.
 
     Raises
     ------
     ModelError
-        A body that the robot does not have.
+        If a body is unknown.
     """
     table = np.zeros((len(loads), kl.TABLE_SIZE), dtype=np.int64)
     parts: list[np.ndarray] = []
@@ -431,7 +454,7 @@ def compile_loads(robot: Robot, loads: Sequence[Load]) -> LoadArrays:
 
 
 def compile_couplings(robot: Robot) -> ka.CouplingArrays:
-    """Tables of the couplings of a robot that :func:`compile_model` has accepted."""
+    """Return the tables of the couplings of a robot that passes :func:`compile_model`."""
     joints = {link.joint: i for i, link in enumerate(robot.links)}
     joint = np.zeros((len(robot.couplings), ka.COUPLING_JOINT_SIZE), dtype=np.int64)
     law = np.zeros((len(robot.couplings), ka.COUPLING_SIZE))
@@ -442,12 +465,12 @@ def compile_couplings(robot: Robot) -> ka.CouplingArrays:
 
 
 def compile_support(robot: Robot) -> ks.SupportArrays:
-    """Tables of the mobile base; of size zero for a robot without one.
+    """Return the tables of the mobile base; size zero for a robot without a base.
 
     Raises
     ------
     ModelError
-        Its body or wheels are none of the robot's, or it has no triangle to stand on.
+        If its body or wheels do not belong to the robot, or its support triangle is degenerate.
     """
     base = robot.base
     if base is None:
@@ -456,13 +479,14 @@ def compile_support(robot: Robot) -> ks.SupportArrays:
     bodies, joints = [link.name for link in robot.links], robot.joint_names
     if base.body not in bodies or not set(base.wheels) <= set(joints):
         raise ModelError(
-            f"{robot.name}: the mobile base is {base.body!r} on {', '.join(base.wheels)}, not of the robot"
+            f"{robot.name}: body {base.body!r} and wheels {', '.join(base.wheels)} of the mobile base must belong to "
+            "the robot"
         )
     if not (base.wheel_radius > 0.0 and base.track > 0.0 and base.wheel_friction > 0.0):
         raise ModelError(f"{robot.name}: wheel radius, track and friction of the wheels must be positive")
     x, y = (float(part) for part in base.caster[:2])
     if x == 0.0:
-        raise ModelError(f"{robot.name}: the caster is below the axle, so that the base has no triangle to stand on")
+        raise ModelError(f"{robot.name}: the caster is below the axle, so the base has no support triangle; move it")
     own = integers(robot.tree_of(base.body))
     numbers = (reals(np.full(size, np.inf)) for size in sizes)
     arrays = ks.SupportArrays(integers(np.zeros(ks.INDEX_SIZE)), own, *numbers)
@@ -476,21 +500,21 @@ def compile_support(robot: Robot) -> ks.SupportArrays:
 
 
 def _check_couplings(robot: Robot) -> None:
-    """Refuse couplings of unknown joints, two of one joint, cycles, and numbers that are none."""
+    """Raise ModelError for couplings of unknown joints, two couplings of one joint, cycles, and invalid numbers."""
     joints = {link.joint: link for link in robot.links}
     leads: dict[str, Coupling] = {}
     for coupling in robot.couplings:
         name = f"coupling of {coupling.joint}"
         for joint in (coupling.joint, coupling.leader):
             if joint not in joints:
-                raise ModelError(f"{name}: no joint {joint!r}; joints: {', '.join(joints)}")
+                raise ModelError(f"{name}: unknown joint {joint!r}; joints: {', '.join(joints)}")
             if joints[joint].kind not in ("revolute", "prismatic"):
                 raise ModelError(
-                    f"{name}: {joint} is {joints[joint].kind}; only revolute and prismatic joints are coupled"
+                    f"{name}: {joint} is {joints[joint].kind}; only revolute and prismatic joints can be coupled"
                 )
         if coupling.joint in leads:
             raise ModelError(
-                f"{name}: the joint follows {leads[coupling.joint].leader!r} already; it can follow only one"
+                f"{name}: the joint already follows {leads[coupling.joint].leader!r}; it can follow only one joint"
             )
         for quantity in ("ratio", "offset"):
             value = getattr(coupling, quantity)
@@ -509,24 +533,25 @@ def _check_couplings(robot: Robot) -> None:
 
 
 def check_couplings(robot: Robot, initial: np.ndarray) -> None:
-    """Raise :class:`ModelError` for coordinates at the start, (nq,), that break a coupling."""
+    """Raise :class:`ModelError` if coordinates at the start, (nq,), violate a coupling."""
     position = dict(zip(robot.joint_names, robot.position_index, strict=True))
     for coupling in robot.couplings:
         q, leader = (initial[position[joint]] for joint in (coupling.joint, coupling.leader))
         wanted = coupling.ratio * leader + coupling.offset
         if not abs(q - wanted) <= COUPLING_TOLERANCE:
             raise ModelError(
-                f"coupling of {coupling.joint}: it starts at {q:.6g}, but {coupling.leader} at {leader:.6g} leads it "
-                f"to {coupling.ratio:g} · {leader:.6g} + {coupling.offset:g} = {wanted:.6g}; leave its position away"
+                f"coupling of {coupling.joint}: initial position {q:.6g} does not match {coupling.ratio:g} · "
+                f"{leader:.6g} ({coupling.leader}) + {coupling.offset:g} = {wanted:.6g}; omit the initial position "
+                f"of {coupling.joint}"
             )
 
 
 def _check_shapes(robot: Robot) -> None:
-    """Refuse what numpy would spread over the tables, or the kernels carry on as NaN."""
+    """Raise ModelError for values that numpy would broadcast over the tables, or that are NaN."""
     names = [link.name for link in robot.links]
     body, point = robot.hand
     if body not in names:
-        raise ModelError(f"{robot.name}: the hand is on {body!r}, which is no body; bodies: {', '.join(names)}")
+        raise ModelError(f"{robot.name}: the hand is on the unknown body {body!r}; bodies: {', '.join(names)}")
     quantities: list[tuple[str, object, tuple[int, ...]]] = [
         (f"{robot.name}: gravity", robot.gravity, (3,)),
         (f"{robot.name}: the hand's point", point, (3,)),
@@ -549,7 +574,7 @@ def _check_shapes(robot: Robot) -> None:
             array = np.array(None)
         if array.dtype.kind not in "fiu" or array.shape != shape or not np.isfinite(array).all():
             wanted = f"an array of shape {shape} of finite numbers" if shape else "a finite number"
-            raise ModelError(f"{quantity} is {brief(value)}; it must be {wanted}")
+            raise ModelError(f"{quantity} must be {wanted}, got {brief(value)}")
 
 
 def _joint_kind(link: Link) -> int:
@@ -560,7 +585,7 @@ def _joint_kind(link: Link) -> int:
     return link.row.code
 
 
-# What must be positive, and what zero or positive, of each kind of motor.
+# Quantities of each kind of motor that must be positive, and that must not be negative.
 _POSITIVE: dict[type, dict[str, str]] = {
     Motor: {"torque_constant": "N m/A", "resistance": "ohm", "gear_ratio": "1"},
     Servo: {"torque_constant": "N m/A", "resistance": "ohm", "coulomb_speed": "rad/s", "current_limit": "A"},
@@ -575,7 +600,7 @@ _NOT_NEGATIVE: dict[type, tuple[str, ...]] = {
 
 def _check_motor(motor: Drive, joints: dict[str, Link]) -> None:
     if motor.joint not in joints:
-        raise ModelError(f"motor: no joint {motor.joint!r}; joints: {', '.join(joints)}")
+        raise ModelError(f"motor: unknown joint {motor.joint!r}; joints: {', '.join(joints)}")
     for quantity, unit in _POSITIVE[type(motor)].items():
         value = getattr(motor, quantity)
         if value is not None and not value > 0.0:
@@ -583,7 +608,7 @@ def _check_motor(motor: Drive, joints: dict[str, Link]) -> None:
     if isinstance(motor, Motor) and not motor.inductance > 0.0:
         raise ModelError(
             f"motor of {motor.joint}: inductance {motor.inductance} H must be positive; "
-            "for a circuit without inductance take a small one (1e-6 H) and integrator.method: auto or radau5"
+            "for a circuit without inductance use a small value (1e-6 H) and integrator.method: auto or radau5"
         )
     for quantity in _NOT_NEGATIVE[type(motor)]:
         if not getattr(motor, quantity) >= 0.0:
@@ -595,28 +620,29 @@ def _check_motor(motor: Drive, joints: dict[str, Link]) -> None:
     if not isinstance(motor, Motor) and not motor.torque_limit > 0.0:
         raise ModelError(f"motor of {motor.joint}: torque limit {motor.torque_limit} N m must be positive")
     if isinstance(motor, Servo) and joints[motor.joint].units[0] != "rad":
-        raise ModelError(f"motor of {motor.joint}: a servo turns, the joint is {joints[motor.joint].kind}")
+        raise ModelError(f"motor of {motor.joint}: a servo requires a revolute joint (here {joints[motor.joint].kind})")
 
 
 def _check_movable(robot: Robot, tree: np.ndarray, body: np.ndarray) -> None:
-    """A joint with nothing heavy beyond it and no motor inertia has no equation of motion."""
+    """Raise ModelError for a joint without motor inertia and without mass beyond it: it has no equation of motion."""
     carried = np.abs(body[:, ka.MASS]) + np.abs(body[:, ka.INERTIA : ka.INERTIA + 6]).sum(axis=1)
     for i in range(len(tree) - 1, -1, -1):
         if carried[i] + body[i, ka.ARMATURE] <= 0.0:
             raise ModelError(
-                f"{robot.links[i].joint}: moves no mass and has no motor inertia, so it cannot be simulated"
+                f"{robot.links[i].joint} moves no mass and has no motor inertia; set the mass of a link beyond it, or "
+                "the rotor inertia of its motor"
             )
         if tree[i, ka.PARENT] >= 0:
             carried[tree[i, ka.PARENT]] += carried[i]
 
 
-# Shape tables for time stepping where a system has none, so that one compiled program fits all scenes.
+# Empty shape tables for time stepping, so that one compiled program fits all scenes.
 
 
 def with_shapes(system: System) -> System:
-    """A system with tables of shapes where it has none: they say then that all its contacts are points on quadrics.
+    """Return the system with shape tables; added tables treat all contacts as points on quadrics.
 
-    The numbers are the same up to rounding, and the speed within 2 %.
+    The results are the same up to rounding, and the speed within 2 %.
     """
     if system.shapes is not None:
         return system

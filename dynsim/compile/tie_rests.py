@@ -1,7 +1,7 @@
-"""Rests of ties of a run that goes on from a state: measured where its scenario starts, not where the state is.
+"""Rest values of ties in a run that starts from a state: measured at the start of the scenario, not at the state.
 
-A run from its own start leaves this to its first step, ``begin_tie`` in
-:mod:`dynsim.integrators.stepping.contacts`, whose formulas these are.
+In a run from the scenario's start the first step does this, in ``begin_tie`` in
+:mod:`dynsim.integrators.stepping.contacts`, with the same formulas.
 """
 
 from __future__ import annotations
@@ -16,12 +16,18 @@ from dynsim.model.description import Array, Tie
 
 
 def set_rests(model: Model, unilateral: UnilateralArrays, at_start: Array, rests: Array | None) -> None:
-    """Write x_0 of the ties that hold from the start on into their table.
+    """Write x_0 of the ties that hold from the start into their table.
 
     Parameters
     ----------
-    at_start : (nq,) coordinates at which the scenario starts
-    rests : (e,) x_0 in the state [m or rad]; NaN, or None: as at the scenario's start
+    model : Model
+        Model of the robot.
+    unilateral : UnilateralArrays
+        Tables of the unilateral law.
+    at_start : (nq,) ndarray
+        Coordinates at the start of the scenario.
+    rests : (e,) ndarray or None
+        x_0 in the state [m or rad]; NaN or None: as at the start of the scenario.
     """
     for k, (tie, row) in enumerate(zip(model.robot.ties, unilateral.tie, strict=True)):
         if not tie.holds:
@@ -33,7 +39,7 @@ def set_rests(model: Model, unilateral: UnilateralArrays, at_start: Array, rests
 
 
 def rest_here(model: Model, unilateral: UnilateralArrays, k: int, q: Array) -> None:
-    """Write the rest of tie k into its table, so that it has no deflection at coordinates (nq,)."""
+    """Write the rest value of tie k into its table, so that it has no deflection at coordinates (nq,)."""
     row = unilateral.tie[k]
     row[ku.TIE_REST] = 0.0
     if unilateral.tie_table[k, ku.TIE_TURNS] == 1:
@@ -44,12 +50,12 @@ def rest_here(model: Model, unilateral: UnilateralArrays, k: int, q: Array) -> N
 
 
 def may_have_slid(tie: Tie) -> bool:
-    """Whether x_0 of a tie may have moved since its run began."""
+    """Return whether x_0 of a tie may have moved since its run started."""
     return tie.holds and not tie.pushes and tie.stiffness > 0.0 and bool(np.isfinite(tie.bound))
 
 
 def deflection(model: Model, unilateral: UnilateralArrays, k: int, q: Array) -> float:
-    """x − x_0 of tie k at coordinates (nq,), of a torsion within half a turn [m or rad]."""
+    """Return x − x_0 of tie k at coordinates (nq,); for a torsion within half a turn [m or rad]."""
     row = unilateral.tie[k]
     (A, at), (B, other) = _ends(model, unilateral, k, q)
     axis = row[ku.TIE_AXIS : ku.TIE_AXIS + 3]
@@ -62,6 +68,6 @@ def deflection(model: Model, unilateral: UnilateralArrays, k: int, q: Array) -> 
 
 
 def _ends(model: Model, unilateral: UnilateralArrays, k: int, q: Array) -> tuple[tuple[Array, Array], ...]:
-    """Rotation and origin of both bodies of tie k; the second may be the world."""
+    """Return rotation and origin of both bodies of tie k; the second body may be the world."""
     a, b = unilateral.tie_table[k, [ku.TIE_A, ku.TIE_B]].tolist()
     return model.body_pose(a, q), (np.eye(3), np.zeros(3)) if b < 0 else model.body_pose(b, q)

@@ -1,4 +1,4 @@
-"""Simulation and check of a scenario by the engine of its plant; types of progress and of a checked start."""
+"""Simulation and check of a scenario with the engine of its plant; types for progress and the start state."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from dynsim.system.memo import remembering
 logging.getLogger("dynsim").addHandler(logging.NullHandler())
 log = logging.getLogger(__name__)
 
-# Modules of the engines, by name.
+# Modules of the engines.
 ENGINES = {"dynamics": "dynsim.engine.simulation", "kinematic": "dynsim.engine.kinematic"}
 REFERENCES, SIMULATION = "references", "simulation"
 
 
 class Progress(Protocol):
-    """Called about ten times a second with the time [s] that a stage has come to.
+    """Callback for progress, called about ten times a second with the time [s] that a stage has reached.
 
-    The stage is ``REFERENCES`` while the controller prepares them, if that takes long; then ``SIMULATION``.
+    The stage is ``REFERENCES`` while the controller prepares its references, if that takes long; then ``SIMULATION``.
     """
 
     def __call__(self, time: float, stage: str = SIMULATION) -> None: ...
@@ -39,21 +39,30 @@ class Progress(Protocol):
 
 @dataclass(frozen=True)
 class Start:
-    """Where a scenario starts, in the world [m].
+    """Start of a scenario: positions in the world [m], gaps, tip margins and warnings.
 
     Attributes
     ----------
-    hand : (3,) the controlled point
-    contacts : (3,) of each enabled contact point, by its name
-    gaps : of the same from their surfaces [m]; negative: below
-    aloft : line of a scenario that would put the declared points which do not touch on their surfaces; empty: all do
-    solved : joints that ``initial.on_surface`` has moved: where to and from where [° or m], and the unit
-    tip_margin : of a mobile base at rest under weight and loads alone; None: it stands fixed or floats
-    tip_margin_braced : the same with the contacts that touch, whose forces cost the motors least heat; None: there are
-        none, or they do not hold the arm
-    warnings : keys of the scenario that change nothing, bodies that begin below surfaces, contact points that no joint
-        moves along the normal, an unstable sampled loop, and what jumps or moves at a start in equilibrium
-    off_path : how far the hand is from where its path begins [m]; None: it has none
+    hand : (3,) ndarray
+        Position of the controlled point [m].
+    contacts : dict of str to (3,) ndarray
+        Position of each enabled contact point [m].
+    gaps : dict of str to float
+        Distance of each of these points from its surface [m]; negative: below the surface.
+    aloft : str
+        Scenario line that would put all declared points onto their surfaces; empty if all touch.
+    solved : dict of str to (float, float, str)
+        Joints that ``initial.on_surface`` moved: new position, previous position and unit [deg or m].
+    tip_margin : float or None
+        Tip margin of a mobile base at rest under weight and loads; None for a fixed or floating base.
+    tip_margin_braced : float or None
+        Tip margin including the contacts that touch, with forces of least motor heat; None without such contacts, or if
+        they do not hold the arm.
+    warnings : sequence of str
+        Keys without effect, bodies below surfaces, contact points that no joint moves along the normal, an unstable
+        sampled loop, and jumps at a start in equilibrium.
+    off_path : float or None
+        Distance of the hand from the start of its path [m]; None without a path.
     """
 
     hand: NDArray[np.float64]
@@ -68,27 +77,47 @@ class Start:
 
 
 def simulate(scenario: Scenario, progress: Progress | None = None, *, pictured: bool = True) -> Record:
-    """Simulate a scenario; within :func:`dynsim.system.memo.remembering` it takes over what others have computed.
+    """Simulate a scenario and return its record.
 
     Parameters
     ----------
     scenario : Scenario
-    progress : called with time [s] and stage, see :class:`Progress`
-    pictured : with scene, poses of bodies and provenance, which only figures, viewers and files need
+        Scenario to simulate, see :func:`dynsim.load_scenario`.
+    progress : callable, optional
+        Called about ten times a second with the time [s] and the stage, see :class:`Progress`.
+    pictured : bool, optional
+        If False, omit the scene, body poses and provenance, which only figures, viewers and files need.
 
     Returns
     -------
     Record
-        Signals, units, summary and provenance.
+        Signals, units, events, summary and provenance.
 
     Raises
     ------
     SimulationStopped
-        Divergence or no solution; ``error.record`` holds what was simulated until then.
+        If the run diverges or has no solution; ``error.record`` contains the results up to the stop.
     SimulationInterrupted
-        Ctrl-C; ``error.record`` likewise.
-    ModelError, UnreachableReference
-        The scenario describes no physics, or a path that the hand cannot follow.
+        On Ctrl-C; ``error.record`` likewise.
+    ModelError
+        If the scenario does not define a valid physical model.
+    UnreachableReference
+        If the hand cannot follow its path.
+    ScenarioError
+        If the record would exceed its size limit, or options conflict.
+
+    Notes
+    -----
+    The equations of motion are [WM] eqs 42–44 and 54–55 with motors and contacts, see docs/physics.md. Runs within one
+    ``dynsim.system.memo.remembering`` block, as in a sweep, share intermediate results.
+
+    Examples
+    --------
+    >>> import dynsim
+    >>> scenario = dynsim.load_scenario("single_pendulum", overrides={"duration_s": 1})
+    >>> record = dynsim.simulate(scenario)
+    >>> record["q"].shape, record.units["q"], record.complete
+    ((201, 1), 'rad', True)
     """
     with named(scenario), remembering():
         interruption.heed()
@@ -103,25 +132,50 @@ def simulate(scenario: Scenario, progress: Progress | None = None, *, pictured: 
 
 
 def note_warnings(scenario: Scenario, record: Record | None) -> None:
+    """Log the warnings in the summary of a record."""
     for warning in record.summary["warnings"] if record is not None else ():
         log.warning("%s: %s", scenario.title, warning)
 
 
 def check(scenario: Scenario, started: Callable[[Start], None] | None = None) -> Start:
-    """Do all that comes before the first step: model, contacts and their forces, references, size of the record.
+    """Validate a scenario up to the first step and return its start positions and contact gaps.
 
-    ``started`` : called with what is returned, but for ``off_path``, before contacts and references are looked at
+    Builds the model, solves the start posture and the contact forces, prepares the references and checks the record
+    size.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Scenario to check.
+    started : callable, optional
+        Called with the :class:`Start`, still without ``off_path``, before contacts and references are checked.
 
     Returns
     -------
     Start
-        Positions of the hand and of the contact points at t = 0, and what else a start has.
+        Positions of the hand and the contact points at t = 0 [m], gaps [m], tip margins and warnings.
 
     Raises
     ------
-    ModelError, UnreachableReference, ScenarioError
+    ModelError
+        If the scenario does not define a valid physical model.
+    UnreachableReference
+        If the hand cannot follow its path.
+    ScenarioError
+        If the record would exceed its size limit, or options conflict.
     SimulationStopped
         If contact forces at the start do not exist or cannot last (Painlevé's paradox).
+
+    Notes
+    -----
+    Nothing is integrated. Criteria for the existence of contact forces: docs/physics.md.
+
+    Examples
+    --------
+    >>> import dynsim
+    >>> start = dynsim.check(dynsim.load_scenario("falling_arm"))
+    >>> list(start.contacts), start.hand.shape
+    (['joint_2', 'joint_3', 'joint_4', 'joint_5', 'hand'], (3,))
     """
     with named(scenario), remembering():
         start: Start = _module(scenario).check(scenario, started or (lambda start: None))
@@ -130,7 +184,7 @@ def check(scenario: Scenario, started: Callable[[Start], None] | None = None) ->
 
 @contextmanager
 def named(scenario: Scenario) -> Iterator[None]:
-    """Say in errors which scenario and variant they are about; those of reading it name file and line themselves."""
+    """Prefix errors with the scenario and variant they concern."""
     require_scenario(scenario)
     variant = f" ({scenario.variant})" if scenario.variant else ""
     name = scenario.location(variant=variant)
@@ -141,19 +195,19 @@ def named(scenario: Scenario) -> Iterator[None]:
     except ScenarioError as error:
         raise type(error)(f"{name}: {error}") from error
     except (ArithmeticError, np.linalg.LinAlgError) as error:
-        raise ModelError(f"{name}: numbers of very different size, no result can be computed ({error})") from error
+        raise ModelError(f"{name}: values differ too much in magnitude to compute a result ({error})") from error
     except MemoryError as error:
         reason = f"not enough memory ({error})" if str(error) else "not enough memory"
-        raise ScenarioError(
-            f"{name}: {reason}; fewer joints, a lower record.rate_hz or duration_s need less"
-        ) from error
+        raise ScenarioError(f"{name}: {reason}; use fewer joints, or lower record.rate_hz or duration_s") from error
     except KeyboardInterrupt:
         interruption.answered()
-        raise SimulationInterrupted(f"{name}: interrupted before there was anything to save") from None
+        raise SimulationInterrupted(f"{name}: interrupted before the first result; nothing was saved") from None
 
 
 def _module(scenario: Scenario) -> ModuleType:
     if scenario.engine not in ENGINES:
         known = ", ".join(ENGINES)
-        raise ModelError(f"plant {scenario.plant.type!r} wants the engine {scenario.engine!r}; there are: {known}")
+        raise ModelError(
+            f"plant {scenario.plant.type!r} requires the unknown engine {scenario.engine!r}; engines: {known}"
+        )
     return importlib.import_module(ENGINES[scenario.engine])

@@ -1,4 +1,4 @@
-"""Brakes of a stepped simulation: very heavy joints, and the contacts that only these would move."""
+"""Brakes of a stepped simulation: joints with a very large armature, and the contacts they block."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from dynsim.scenario import Scenario, build
 
 
 def projection_loss(prepared: Prepared, time: float) -> float:
-    """Project rates onto the rows of the bilateral law; returns the kinetic energy that they lose [J].
+    """Project rates onto the rows of the bilateral law and return the kinetic energy lost [J].
 
-    Steps project rates too, by their own error, which the ledger has to show.
+    Steps also project rates, by their own error; the ledger must show this loss separately.
     """
     system, workspace, y = prepared.system, prepared.workspace, prepared.run.y
     if workspace.counts[ka.ROWS] == 0:
@@ -32,11 +32,12 @@ def projection_loss(prepared: Prepared, time: float) -> float:
 
 
 class Brakes:
-    """What joints and contacts are like without brakes, and which contacts are left out behind brakes.
+    """State of joints and contacts without brakes, and the contacts left out behind brakes.
 
     Attributes
     ----------
-    armature : of the joints without brakes, (n,) [kg m² or kg]
+    armature : (n,) ndarray
+        Armature of the joints without brakes [kg m² or kg].
     """
 
     def __init__(self, scenario: Scenario, prepared: Prepared) -> None:
@@ -45,10 +46,24 @@ class Brakes:
         self._floors = prepared.system.contacts.law[:, ka.FLOOR].copy()
 
     def leave_contacts_out(self, prepared: Prepared, time: float) -> tuple[Prepared, list[str]]:
-        """Leave out the contacts that only braked joints would move along their normals, and take back the others.
+        """Leave out contacts that only braked joints would move along their normals, and restore the other contacts.
 
-        The force of such a contact would be any share of the load on the brakes. Call it at a time [s] at which brakes
-        have closed or opened. Returns a sentence for each contact on its surface that is left out for the first time.
+        The force of such a contact could be any share of the load on the brakes. Call this whenever brakes have closed
+        or opened.
+
+        Parameters
+        ----------
+        prepared : Prepared
+            Prepared run.
+        time : float
+            Present time [s].
+
+        Returns
+        -------
+        Prepared
+            Run with updated contacts.
+        list of str
+            A warning for each contact on its surface that is left out for the first time.
         """
         model, contacts, workspace = prepared.model, prepared.contacts, prepared.workspace
         table, law = prepared.system.contacts.link, prepared.system.contacts.law

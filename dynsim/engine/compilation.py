@@ -1,7 +1,7 @@
-"""Messages about the compilation of kernels: which kernels, why they are compiled again, and for how long.
+"""Messages about kernel compilation: which kernels, the reason, and the expected duration.
 
-Each compilation gives one line in the log. On a terminal without progress bars, lines on stderr mark its begin and its
-end. Commands show it in their progress bars, also that of worker processes, which mark it by a file beside the kernels.
+Each compilation writes one log line. On a terminal without progress bars, lines on stderr mark its start and end.
+Commands show it in their progress bars, also for worker processes, which announce it in a file next to the kernels.
 """
 
 from __future__ import annotations
@@ -19,28 +19,31 @@ from pathlib import Path
 
 from dynsim.jit.kernel import cache_folder, on_compilation
 
-# File beside the folders of kernels: duration of the last compilation of each kind [s].
+# File next to the kernel folders: duration of the last compilation of each kind [s].
 LAST = "compiled_in_s.json"
-# Suffix of the file that marks a compilation under way; its name is the process id.
+# Suffix of the file that announces a compilation in progress; the file name is the process id.
 MARK = ".compiling"
-# Expected duration, in words, where no earlier one is known.
+# Expected duration as text if no earlier compilation is known.
 USUAL = "seconds to two minutes on two cores"
-# Interval at which a display reads those files [s].
+# Interval at which displays read these files [s].
 LOOK_S = 0.5
 
-# False where a command shows progress bars of its own.
+# False if the command shows its own progress bars.
 _on_terminal = True
 
 
 @dataclass(frozen=True)
 class Compilation:
-    """A compilation that is under way.
+    """A compilation in progress.
 
     Attributes
     ----------
-    text : kernels, reason and expected duration
-    since : time of the clock at its beginning [s]
-    expected : how long the last one of this kind took [s]; None: there was none
+    text : str
+        Kernels, reason and expected duration.
+    since : float
+        Clock time of the start [s].
+    expected : float or None
+        Duration of the last compilation of this kind [s]; None if unknown.
     """
 
     text: str
@@ -49,22 +52,28 @@ class Compilation:
 
     @property
     def elapsed(self) -> float:
-        """[s]"""
+        """Time since the start [s]."""
         return max(clock.time() - self.since, 0.0)
 
 
 def shown_by_caller() -> None:
-    """From now on nothing of this process is written to stderr: its caller has bars."""
+    """Write nothing more to stderr in this process, because the caller shows progress bars."""
     global _on_terminal
     _on_terminal = False
 
 
 @contextmanager
 def kernels_logged(log: logging.Logger, kind: str = "", loads: bool = True) -> Iterator[None]:
-    """Log the time in which kernels are loaded, or compiled.
+    """Log the time that loading or compiling kernels takes.
 
-    kind : of what system they are
-    loads : also say how long it took when none had to be compiled
+    Parameters
+    ----------
+    log : logging.Logger
+        Logger to write to.
+    kind : str, optional
+        Kind of system that the kernels are for.
+    loads : bool, optional
+        If False, log nothing when the kernels were only loaded.
     """
     started, compiling, marks = clock.perf_counter(), False, ExitStack()
     on_terminal = _on_terminal and sys.stderr is not None and sys.stderr.isatty()
@@ -90,7 +99,7 @@ def kernels_logged(log: logging.Logger, kind: str = "", loads: bool = True) -> I
 
 
 def _durations() -> dict[str, float]:
-    """How long the last compilation of each kind took [s]; of a file that cannot be read none."""
+    """Return the duration of the last compilation of each kind [s]; empty if the file cannot be read."""
     with suppress(OSError, ValueError, TypeError, AttributeError):
         known = json.loads((cache_folder().parent / LAST).read_text())
         return {kind: float(seconds) for kind, seconds in known.items()}
@@ -113,7 +122,7 @@ def _beginning(kind: str) -> Compilation:
 
 @contextmanager
 def _marked(compilation: Compilation) -> Iterator[None]:
-    """What is compiled is written where displays look for it, within."""
+    """Announce a compilation in the file that displays read, until the block ends."""
     path = cache_folder() / f"{os.getpid()}{MARK}"
     with suppress(OSError):
         path.write_text(json.dumps([_group(), compilation.text, compilation.since, compilation.expected]))
@@ -125,18 +134,18 @@ def _marked(compilation: Compilation) -> Iterator[None]:
 
 
 def _group() -> int:
-    """Number of this process's group; of a system without groups that of the process."""
+    """Return the process group id, or the process id on systems without process groups."""
     return os.getpgrp() if hasattr(os, "getpgrp") else os.getpid()
 
 
 def under_way() -> Compilation | None:
-    """What this process or one of its group compiles, the one that began first; None: nothing."""
+    """Return the oldest compilation in progress in this process group, or None."""
     running = []
     for path in cache_folder().glob(f"*{MARK}"):
         with suppress(OSError, ValueError, TypeError):
             group, text, since, expected = json.loads(path.read_text())
-            if hasattr(os, "getpgrp"):  # elsewhere signal 0 would end it
-                os.kill(int(path.name.removesuffix(MARK)), 0)  # of a process that died it stays
+            if hasattr(os, "getpgrp"):  # without process groups, signal 0 would end the process
+                os.kill(int(path.name.removesuffix(MARK)), 0)  # the file of a dead process remains
             if group == _group():
                 running.append(Compilation(str(text), float(since), expected))
     return min(running, key=lambda compilation: compilation.since, default=None)
@@ -144,7 +153,7 @@ def under_way() -> Compilation | None:
 
 @contextmanager
 def watched(show: Callable[[Compilation | None], None]) -> Iterator[None]:
-    """Call ``show`` now and then while something is compiled, and once with None when that is over."""
+    """Call ``show`` regularly while a compilation is in progress, and once with None when it ends."""
     shown_by_caller()
     over, folder = threading.Event(), Path(cache_folder())
 

@@ -1,12 +1,12 @@
-"""Equilibrium start (``initial.equilibrium``): motor currents that hold the posture, and references that keep them.
+"""Equilibrium start (``initial.equilibrium``): motor currents that hold the posture, and shifted references.
 
-At rest u = R i, so a controller whose references are the posture has to give R i. Planned voltages supply it, except
-for external loads. The part that is missing is given by a shift of all motors' references, constant over the run,
+At rest u = R i, so a controller whose reference is the posture itself has to supply R i. Planned voltages supply it,
+except for external loads. The missing part is added as a shift of each motor's reference, constant over the run:
 
     DC motor, position servo: q_d + R i / k_p        torque source: τ_d + τ
 
-which cancels the sag under the weight at the start. Compliant contacts that carry are pressed in: references move with
-the joints that do this. Errors, tracking and ledger refer to the original references.
+The shift cancels the sag under gravity at the start. Compliant contacts that carry load are pressed in: the references
+move with the joints. Errors, tracking and ledger refer to the original references.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from dynsim.errors import first_few
 from dynsim.model.description import Array, Contact, Load
 from dynsim.model.drives import Motor, Servo, TorqueSource
 
-# A reference starts at rest and without offset if its offset and its rate are below this [rad or m, rad/s or m/s].
+# A reference starts at rest and without offset if offset and rate are below this [rad or m, rad/s or m/s].
 AT_REST = 1e-4
-# Joints that pressing moves by more than this [rad, m] start in another posture than the requested one.
+# Joints that pressing moves by more than this [rad, m] start in a different posture from the requested one.
 MOVED = {"rad": math.radians(1.0), "m": 5e-3}
-# A normal force below this part of the weight of the robot counts as zero: spline references leave forces of this size.
+# A normal force below this fraction of the robot's weight counts as zero; spline references leave forces of this size.
 NO_FORCE = 1e-4
 
 
@@ -41,12 +41,18 @@ class Balance:
 
     Attributes
     ----------
-    current : (na,) motor currents [A; N m for a torque source]
-    shift : (na,) shifts of their references [rad or m; N m for a torque source]
-    heat : Σ R i² [W]
-    normal_forces : normal force of each contact that touches [N]; empty if the controller plans them
-    warnings : jumps that remain at the start
-    on_edge : True if only all of the static friction holds the posture
+    current : (na,) ndarray
+        Motor currents [A; N m for a torque source].
+    shift : (na,) ndarray
+        Shifts of the references [rad or m; N m for a torque source].
+    heat : float
+        Motor heat Σ R i² [W].
+    normal_forces : dict of str to float
+        Normal force of each contact that touches [N]; empty if the controller plans them.
+    warnings : tuple of str
+        Jumps that remain at the start.
+    on_edge : bool
+        True if the posture requires the full static friction.
     """
 
     current: Array
@@ -60,13 +66,13 @@ class Balance:
 def pressed(
     model: Model, contacts: Sequence[Contact], loads: Sequence[Load], control: JointControl, real: bool
 ) -> Model:
-    """Return the model in the posture of its start at rest; for parameters and errors see :func:`balanced`.
+    """Return the model in its posture at rest; for parameters and errors see :func:`balanced`.
 
     Only compliant contacts change the posture: they carry no load unless they are pressed in.
     """
     if len(control.reference.voltage):
         return model
-    return pressed_in(model, contacts, loads, _able(model, control), real)
+    return pressed_in(model, contacts, loads, _torque_joints(model, control), real)
 
 
 def balanced(
@@ -77,13 +83,27 @@ def balanced(
     real: bool,
     requested: Array | None = None,
 ) -> Balance:
-    """Return the start at rest of a robot under its controller.
+    """Compute the start at rest of a robot under its controller.
 
     Parameters
     ----------
-    loads : loads of the scenario, evaluated at t = 0
-    real : True for the unilateral law
-    requested : (nq,) posture before :func:`pressed`, in which references begin; default: the initial one
+    model : Model
+        Model in its posture at rest, see :func:`pressed`.
+    contacts : sequence of Contact
+        Contacts of the scenario.
+    loads : sequence of Load
+        Loads of the scenario, evaluated at t = 0.
+    control : JointControl
+        Controller with its references.
+    real : bool
+        True for the unilateral law.
+    requested : (nq,) ndarray, optional
+        Posture before :func:`pressed`, in which references start; default: the initial posture.
+
+    Returns
+    -------
+    Balance
+        Currents, reference shifts, normal forces and warnings.
 
     Raises
     ------
@@ -100,14 +120,14 @@ def balanced(
     if not len(planned):
         touching = touching_contacts(model, contacts, robot.initial, real)
         springs = spring_forces([entry for entry in touching if entry[0].stiffness == 0.0 or entry[-1] < 0.0])
-        balance = holding_torques(model, robot.initial, contacts, loads, _able(model, control), real, springs)
+        balance = holding_torques(model, robot.initial, contacts, loads, _torque_joints(model, control), real, springs)
         torques, on_edge = balance.torques, balance.on_edge
         forces = {contact.name: balance.normal_forces.get(contact.name, 0.0) for contact, *_ in touching}
     else:
         # The plan determines the contact forces; it does not include loads, which the motors carry.
         torques, forces = load_torques(model, robot.initial, loads), {}
-        if compliant := _counted_on(model, contacts, planned[0, :, 0], index, real):
-            jumps.append(f"the planned voltages count on {first_few(compliant)}, which deform before they carry")
+        if compliant := _relied_on(model, contacts, planned[0, :, 0], index, real):
+            jumps.append(f"the planned voltages rely on {first_few(compliant)}, which deform before they carry load")
     for a, (motor, i) in enumerate(zip(motors, index, strict=True)):
         if isinstance(motor, TorqueSource):
             current[a] = torques[i]
@@ -116,7 +136,7 @@ def balanced(
             elif abs(torques[i] - begin[a]) > AT_REST:
                 force = robot.links[i].units[3]
                 jumps.append(
-                    f"the {'torque' if force == 'N m' else 'force'} of {motor.joint} begins with {begin[a]:.4g} "
+                    f"the {'torque' if force == 'N m' else 'force'} of {motor.joint} starts at {begin[a]:.4g} "
                     f"{force}, at rest it would be {torques[i]:.4g}"
                 )
             continue
@@ -133,15 +153,15 @@ def balanced(
             shift[a] += robot.initial[robot.position_index[i]] - at
         if k_p > 0.0 and abs(begin[a] - at) > AT_REST:
             jumps.append(
-                f"the reference of {motor.joint} begins {format_quantity(begin[a] - at, unit[0], 3)} from "
-                "where it stands"
+                f"the reference of {motor.joint} starts {format_quantity(begin[a] - at, unit[0], 3)} from "
+                "the joint position"
             )
         elif k_p > 0.0 and abs(rate[a]) > AT_REST:
-            jumps.append(f"the reference of {motor.joint} begins with {rate[a]:.3g} {unit[1]}")
+            jumps.append(f"the reference of {motor.joint} starts with {rate[a]:.3g} {unit[1]}")
     resistance = np.array([getattr(motor, "resistance", 0.0) for motor in motors])
     said: tuple[str, ...] = (
-        ("initial.equilibrium: " + "; ".join(jumps) + ": that jumps at the start all the same; a path that begins at "
-         "rest where the hand is does not",)
+        ("initial.equilibrium: " + "; ".join(jumps) + ": the motion still jumps at the start; use a path that "
+         "starts at rest at the hand",)
         if jumps
         else ()
     )  # fmt: skip
@@ -161,17 +181,17 @@ def _moved(model: Model, requested: Array) -> tuple[str, ...]:
     if not moved:
         return ()
     return (
-        f"initial.equilibrium: moves {first_few(moved)} from the requested posture, so that compliant contacts carry: "
-        "they are soft, or press at short levers; raise contacts.stiffness_N_per_m, or change the posture",
+        f"initial.equilibrium: moves {first_few(moved)} from the requested posture, so that compliant contacts carry "
+        "load: they are soft or have short lever arms; raise contacts.stiffness_N_per_m or change the posture",
     )
 
 
-def _counted_on(
+def _relied_on(
     model: Model, contacts: Sequence[Contact], voltages: Array, index: Sequence[int], real: bool
 ) -> list[str]:
-    """Return the compliant contacts to which planned voltages, (na,), leave a part of the weight.
+    """Return the compliant contacts on which planned voltages, (na,), rely for part of the weight.
 
-    ``index`` : joint of each motor
+    ``index`` is the joint of each motor.
     """
     robot = model.robot
     left = np.asarray(model.bias_forces(robot.initial, np.zeros(model.n)))
@@ -190,8 +210,8 @@ def _counted_on(
     return [contact.name for (contact, *_), force in named if contact.stiffness > 0.0 and abs(force) > least]
 
 
-def _able(model: Model, control: JointControl) -> list[str]:
-    """Return the joints whose motors can give a torque at rest."""
+def _torque_joints(model: Model, control: JointControl) -> list[str]:
+    """Return the joints whose motors can produce a torque at rest."""
     return [
         motor.joint
         for motor, k_p in zip(model.robot.motors, control.k_p, strict=True)
@@ -210,7 +230,7 @@ def shifted(reference: ReferenceArrays, shift: Array) -> ReferenceArrays:
 
 
 def _begin(reference: ReferenceArrays, motors: int) -> tuple[Array, Array]:
-    """Return values and rates of the references at their beginning, both (na,)."""
+    """Return values and rates of the references at their start, both (na,)."""
     begin, rate = reference.held.copy(), np.zeros(motors)
     for a, column in enumerate(reference.spline):
         if column >= 0:

@@ -1,8 +1,8 @@
-"""Diagnosis of contact forces that are not unique: Painlevé's paradox, dependent rows; texts for warnings and stops.
+"""Contact forces that are not unique: Painlevé's paradox, dependent rows, contacts wedged by friction.
 
-The check during a run is compiled (dynsim.dynamics.contact.delassus); here its finding is located in time and
-described, and the range of accelerations that dependent frictional rows allow is computed. docs/physics.md derives the
-criteria.
+The check during a run is compiled (dynsim.dynamics.contact.delassus). This module locates its result in time and
+describes it in texts for warnings and stops. It also computes the range of accelerations that dependent frictional rows
+allow. docs/physics.md derives the criteria.
 """
 
 from __future__ import annotations
@@ -28,21 +28,21 @@ from dynsim.record import Record
 
 Array = NDArray[np.float64]
 
-# Where the step size has collapsed, a determinant below this fraction of the frictionless one counts as the cause.
+# When the step size has collapsed, a determinant below this fraction of the frictionless one counts as the cause.
 NEAR_ZERO = 1e-3
-# A factor on the friction coefficients that avoids the paradox is reported if it is below this.
+# A friction factor that avoids the paradox is reported if it is below this.
 WORTH_SAYING = 0.99
-# Halvings of the interval in which forces ceased to be unique.
+# Halvings of the interval in which forces stop being unique.
 BISECTIONS = 50
-# Recorded samples at which the range of accelerations of dependent rows is computed.
+# Recorded samples at which the acceleration range of dependent rows is computed.
 SPREAD_SAMPLES = 5
 # Singular values of A below this fraction of the largest are null: well above rounding, well below those of braces.
 NULL_TOLERANCE = 1e-9
-# A spread below this fraction of the accelerations is rounding of the null space.
+# A spread below this fraction of the accelerations is rounding error of the null space.
 SPREAD_TOLERANCE = 1e-7
-# Most sets of modes that are examined, each by a singular value decomposition of the rows of all closed contacts.
+# Maximum number of mode sets examined, each by a singular value decomposition of the rows of all closed contacts.
 MOST_SETS = 50
-# Singular values of unit rows below this count as zero: their square is the tolerance of the elimination of A.
+# Singular values of unit rows below this count as zero; the square is the tolerance of the elimination of A.
 DEPENDENT = 1e-6
 
 
@@ -52,9 +52,16 @@ class MotionSpread:
 
     Attributes
     ----------
-    joint : name; unit : of its acceleration
-    time : [s]
-    low, high : least and greatest acceleration; taken : that of the run, from the split of least norm
+    joint : str
+        Name of the joint.
+    unit : str
+        Unit of its acceleration.
+    time : float
+        Time of the sample [s].
+    low, high : float
+        Minimum and maximum acceleration.
+    taken : float
+        Acceleration in the run, from the least-norm split.
     """
 
     joint: str
@@ -67,9 +74,9 @@ class MotionSpread:
 
 @dataclass(frozen=True)
 class Sharing:
-    """Names of contacts, and of joints that dry friction keeps at rest, whose forces the motion does not determine.
+    """Contacts, and joints that dry friction keeps at rest, whose forces the motion does not determine.
 
-    Contacts of a snake have the names of its wheels, and so have the wheels' joints.
+    Contacts of a snake, and the joints of its wheels, have the names of the wheels.
     """
 
     contacts: list[str]
@@ -78,14 +85,24 @@ class Sharing:
 
 @dataclass(frozen=True)
 class ContactMatrices:
-    """A(σ) = A0 − B diag(σ) of one state, A(σ) f = rhs, of the p active rows.
+    """A(σ) = A0 − B diag(σ) of one state, A(σ) f = rhs, for the p active rows.
 
     Attributes
     ----------
-    frictionless : A0 = J M⁻¹ Jᵀ, (p, p); friction : B, (p, p), zero for rows of sticking points and of joints
-    rhs : (p,); force : f as the run has it, (p,); signs : σ as the run has it, (p,)
-    free : (p,) bool: dissipative contacts with friction, whose σ is the sign of f
-    owner : (p,) the contact of each row that slides, −1 for other rows
+    frictionless : (p, p) ndarray
+        A0 = J M⁻¹ Jᵀ.
+    friction : (p, p) ndarray
+        B, zero for rows of sticking points and of joints.
+    rhs : (p,) ndarray
+        Right-hand side.
+    force : (p,) ndarray
+        f in the run.
+    signs : (p,) ndarray
+        σ in the run.
+    free : (p,) ndarray of bool
+        True for dissipative contacts with friction, whose σ is the sign of f.
+    owner : (p,) ndarray of int
+        Contact of each sliding row, −1 for other rows.
     """
 
     frictionless: Array
@@ -97,21 +114,24 @@ class ContactMatrices:
     owner: NDArray[np.int64]
 
     def matrix(self, signs: Array) -> Array:
-        """A(σ), (p, p)."""
+        """Return A(σ), (p, p)."""
         return self.frictionless - self.friction * signs
 
     def basis(self) -> Array:
-        """Orthonormal basis of the range of A0, (p, rank)."""
+        """Return an orthonormal basis of the range of A0, (p, rank)."""
         values, vectors = np.linalg.eigh(self.frictionless)
         return vectors[:, values > RANK_TOLERANCE * values.max(initial=0.0)]
 
     def determinant(self, signs: Array) -> float:
-        """det A(σ) / det A0; with dependent rows of both on the range of A0."""
+        """Return det A(σ) / det A0; with dependent rows, both are taken on the range of A0."""
         Q = self.basis()
         return float(np.linalg.det(Q.T @ self.matrix(signs) @ Q) / np.linalg.det(Q.T @ self.frictionless @ Q))
 
     def choices(self) -> list[Array]:
-        """The signs that are tried, the present ones first: all, or beyond SIGNS_LIMIT those that differ at one."""
+        """Return the sign vectors to try, the present one first.
+
+        Beyond SIGNS_LIMIT free rows, only vectors that differ in one sign are returned.
+        """
         index = np.flatnonzero(self.free)
         if len(index) <= SIGNS_LIMIT:
             turned = [index[list(bits)] for bits in itertools.product((False, True), repeat=len(index))]
@@ -125,7 +145,10 @@ class ContactMatrices:
         return result
 
     def solutions(self) -> list[Array]:
-        """Forces (p,) of every choice of signs that agrees with them, each once; only for independent rows."""
+        """Return the forces (p,) of every sign choice that is consistent with them, without duplicates.
+
+        Requires independent rows.
+        """
         solutions: list[Array] = []
         for signs in self.choices():
             try:
@@ -139,7 +162,7 @@ class ContactMatrices:
         return solutions
 
     def critical_friction(self) -> float | None:
-        """The least factor s ≤ 1 on all friction at which a determinant vanishes, det(A0 − s B diag(σ)) = 0."""
+        """Return the smallest factor s ≤ 1 on all friction for which det(A0 − s B diag(σ)) = 0, or None."""
         Q, largest = self.basis(), 0.0
         frictionless = Q.T @ self.frictionless @ Q
         for signs in self.choices():
@@ -149,10 +172,10 @@ class ContactMatrices:
         return 1.0 / largest if largest >= 1.0 else None
 
     def described(self, solution: Array) -> str:
-        """The normal forces of one of the ``solutions`` at the points that slide.
+        """Describe the normal forces of one of the ``solutions`` at the sliding points.
 
-        A solution appears where the determinant for its signs passes through zero, with forces that have no bound:
-        computed there, they have signs and no size.
+        A solution appears where the determinant for its signs passes through zero, with unbounded forces: there only
+        their signs are meaningful.
         """
         sliding = solution[self.owner >= 0]
         signs = np.where(self.free, np.copysign(1.0, solution), self.signs)
@@ -161,16 +184,16 @@ class ContactMatrices:
         return f"({', '.join(f'{force:.4g}' for force in sliding)}) N"
 
     def reversed(self) -> NDArray[np.bool_]:
-        """Rows whose own force alone would accelerate them against it: negative diagonal entries, (p,)."""
+        """Return the rows, (p,), whose own force alone would accelerate them against it: negative diagonal entries."""
         own = np.diag(self.frictionless)
         return (own > 0.0) & (np.diag(self.matrix(self.signs)) < -kq.DIAGONAL_TOLERANCE * own)
 
     def finite(self) -> bool:
-        """False for a state that has diverged."""
+        """Return False for a state that has diverged."""
         return bool(np.isfinite(self.frictionless).all() and np.isfinite(self.friction).all())
 
     def unique(self) -> bool:
-        """False where the compiled watch stops a run."""
+        """Return False if the compiled watch would stop the run."""
         if not self.finite() or self.determinant(self.signs) <= 0.0 or self.reversed().all():
             return False
         if not self.free.any() or self.basis().shape[1] < len(self.rhs):
@@ -179,7 +202,7 @@ class ContactMatrices:
 
 
 def contact_matrices(system: System, ws: ka.Workspace, t: float, y: Array) -> ContactMatrices:
-    """Evaluate the right-hand side at (t, y) and take A0, B and the forces out of the workspace."""
+    """Evaluate the right-hand side at (t, y) and return A0, B and the forces from the workspace."""
     derivative(system, t, y, ws, np.zeros_like(y))
     p = int(ws.counts[ka.ROWS])
     state, active = ws.rows[:p], ws.active[:p]
@@ -203,9 +226,9 @@ def contact_matrices(system: System, ws: ka.Workspace, t: float, y: Array) -> Co
 
 
 def locate(system: System, ws: ka.Workspace, run: ki.Run) -> tuple[float, Array]:
-    """Time and state at which forces ceased to be unique, by halving the step that was not accepted.
+    """Return time [s] and state at which forces stopped being unique, by bisection of the rejected step.
 
-    The state is taken as linear over that step, so the time is good to the second order of the step.
+    The state is taken as linear over that step, so the time is second-order accurate in the step size.
     """
     start, end = float(run.clock[ki.TIME]), float(run.clock[ki.NOT_UNIQUE])
     low, high = 0.0, 1.0
@@ -224,10 +247,10 @@ def locate(system: System, ws: ka.Workspace, run: ki.Run) -> tuple[float, Array]
 def paradox(
     system: System, ws: ka.Workspace, run: ki.Run, contacts: Sequence[Contact]
 ) -> tuple[float, Array, str] | None:
-    """Time, state and words of a stop by Painlevé's paradox, None when the run ended for another reason.
+    """Return time [s], state and message of a stop by Painlevé's paradox, or None if the run ended for another reason.
 
-    A step size that collapses and a state that diverges count where the determinant has all but vanished: there the
-    forces grow beyond bounds before any step can pass over the singularity.
+    A collapsed step size or a diverged state counts if the determinant has nearly vanished: the forces grow without
+    bound before any step can pass the singularity.
     """
     status, near = int(run.count[ki.STATUS]), False
     if status in (ki.FORCES_REVERSED, ki.SEVERAL_FORCES):
@@ -251,52 +274,58 @@ def paradox(
         forces = " and ".join(matrices.described(solution) for solution in solutions)
         count = "two" if len(solutions) == 2 else len(solutions)
         finding = (
-            f"{count} consistent solutions (Painlevé's paradox) at {names}: normal forces {forces} agree with "
-            "dissipative friction, so that the motion is not determined"
+            f"{count} consistent solutions (Painlevé's paradox) at {names}: normal forces {forces} are both "
+            "consistent with dissipative friction, so the motion is not determined"
         )
     elif near:
         finding = (
-            f"Painlevé's paradox at {names}: det J M⁻¹F falls to zero ({value:.1e} of its value without friction), "
-            "where normal forces have no bound"
+            f"Painlevé's paradox at {names}: det J M⁻¹F approaches zero ({value:.1e} of its value without friction), "
+            "where normal forces are unbounded"
         )
     elif abs(value) < NEAR_ZERO:
         finding = (
-            f"Painlevé's paradox at {names}: det J M⁻¹F passes through zero, where normal forces have no bound and "
-            "turn round"
+            f"Painlevé's paradox at {names}: det J M⁻¹F passes through zero, where normal forces are unbounded and "
+            "change sign"
         )
     elif value < 0.0:
         finding = (
             f"Painlevé's paradox at {names}: det J M⁻¹F is negative ({value:.2g} of its value without friction), so "
-            "that the contact moves against a force that pushes it"
+            "the contact accelerates against the force that pushes it"
         )
     else:
         finding = (
             f"Painlevé's paradox at {names}: {'every' if turned.all() else 'its'} diagonal entry of J M⁻¹F is "
-            "negative, so that each of these points moves against a force that pushes it"
+            "negative, so each of these points accelerates against the force that pushes it"
         )
     factor = matrices.critical_friction()
     below = ""
     if factor is not None and factor < WORTH_SAYING:
         coefficients = {contact.friction for contact in contacts}
         below = f" below {factor * max(coefficients):.3g}" if len(coefficients) == 1 else f" to less than {factor:.0%}"
-    advice = f"lower contacts.friction{below}, or take another posture or direction of slip"
+    advice = f"lower contacts.friction{below}, or change the posture or the slip direction"
     return t, y, f"{finding}; {advice}"
 
 
 def motion_spread(
     system: System, times: Array, states: Array, joints: Sequence[tuple[str, str]]
 ) -> MotionSpread | None:
-    """The widest range of a joint's acceleration over all admissible splits of dependent forces, at a few samples.
+    """Find the widest range of a joint's acceleration over all admissible splits of dependent forces.
 
     Parameters
     ----------
-    times, states : recorded samples, (T,) and (T, m); up to SPREAD_SAMPLES of them are looked at
-    joints : name of each joint and unit of its acceleration
+    system : System
+        System of the run.
+    times : (T,) ndarray
+        Times of the recorded samples [s]; at most SPREAD_SAMPLES of them are examined.
+    states : (T, m) ndarray
+        States at these times.
+    joints : sequence of (str, str)
+        Name of each joint and unit of its acceleration.
 
     Returns
     -------
-    MotionSpread | None
-        None when forces alone are left open, and no motion.
+    MotionSpread or None
+        None if only forces are indeterminate and the motion is not.
     """
     worst: MotionSpread | None = None
     for row in np.unique(np.linspace(0, len(times) - 1, SPREAD_SAMPLES).astype(int)):
@@ -312,11 +341,11 @@ def motion_spread(
 
 
 def acceleration_range(system: System, t: float, y: Array) -> tuple[Array, Array, Array]:
-    """Accelerations at (t, y): those of the least-norm split, and least and greatest over all admissible ones, (n,).
+    """Return accelerations at (t, y), (n,) each: the least-norm split, and minimum and maximum over admissible splits.
 
-    Admissible are all f with A f = rhs whose normal forces have the signs that they have in the least-norm split (so a
-    support that pushes never pulls); friction keeps its direction. f = f0 + N z with the null space N of A, and the
-    accelerations are linear in z: one linear programme per joint and end. Infinite where the set has no end.
+    Admissible are all f with A f = rhs whose normal forces have the same signs as in the least-norm split (a support
+    that pushes never pulls); friction keeps its direction. f = f0 + N z with the null space N of A, and the
+    accelerations are linear in z: one linear program per joint and bound. Unbounded sets give infinite values.
     """
     ws = new_workspace(system)
     matrices = contact_matrices(system, ws, t, np.array(y))
@@ -341,7 +370,7 @@ def acceleration_range(system: System, t: float, y: Array) -> tuple[Array, Array
     for direction in (1.0, -1.0):
         change = np.zeros(n)
         for j in range(n):
-            # In units of the largest force, so that the solver's absolute tolerances mean something.
+            # In units of the largest force, to match the absolute tolerances of the solver.
             optimum = linprog(
                 direction * slope[j],
                 A_ub=-signs[:, None] * N,
@@ -357,21 +386,32 @@ def acceleration_range(system: System, t: float, y: Array) -> tuple[Array, Array
 def sharing(
     model: Model, contacts: Sequence[Contact], q: Array, modes: Array, rests: NDArray[np.bool_] | None = None
 ) -> Sharing:
-    """Contacts and joints whose rows depend on each other, in one sample of each set of modes.
+    """Find contacts and joints whose rows depend on each other, in one sample of each set of modes.
 
-    The sample is the first with the most joints at rest: rows that depend on each other do so among more rows too.
+    The sample is the first with the most joints at rest: dependent rows stay dependent when rows are added. Contacts
+    may share forces with each other and with joints that dry friction keeps at rest; joints alone share nothing.
 
-    Contacts may share with each other, and with joints that dry friction keeps at rest; joints alone share nothing.
-
-    Rows that are zero, such as that across a planar arm, and those that depend on each other within one contact, as
-    where an arm has two joints before it, leave no choice between contacts: each contact counts with an orthonormal
-    basis of its own rows. Those that share are in the left null space of all bases together.
+    Zero rows, such as the row across a planar arm, and rows that depend on each other within one contact, as with only
+    two joints before it, leave no choice between contacts: each contact is represented by an orthonormal basis of its
+    rows. Contacts that share forces appear in the left null space of all bases together.
 
     Parameters
     ----------
-    q : samples, (T, nq) [rad or m]
-    modes : of the contacts in them, (T, c), dynsim.dynamics.tables: OPEN, SLIDING, STICKING
-    rests : which joints dry friction keeps at rest in them, (T, n)
+    model : Model
+        Model of the robot.
+    contacts : sequence of Contact
+        The c contacts of the run.
+    q : (T, nq) ndarray
+        Positions of the samples [rad or m].
+    modes : (T, c) ndarray
+        Contact modes: OPEN, SLIDING or STICKING of dynsim.dynamics.tables.
+    rests : (T, n) ndarray of bool, optional
+        Joints that dry friction keeps at rest.
+
+    Returns
+    -------
+    Sharing
+        Names of the contacts and joints.
     """
     free = free_rates(model)
     rests = np.zeros((len(modes), model.n), dtype=bool) if rests is None else rests
@@ -400,13 +440,13 @@ def sharing(
 
 
 def free_rates(model: Model) -> Array:
-    """Rates that couplings of joints allow, (n, n − k)."""
+    """Return a basis of the rates that joint couplings allow, (n, n − k)."""
     rows = model.coupling_rows
     return np.linalg.svd(rows)[2][len(rows) :].T
 
 
 def contact_point(model: Model, contact: Contact, q: Array) -> tuple[Array, Array]:
-    """Normal of the surface, (3,), and Jacobian of the point that is nearest to it, (3, n)."""
+    """Return the surface normal, (3,), and the Jacobian of the point nearest to the surface, (3, n)."""
     body, point = model.robot.attach(contact.body, contact.point)
     if contact.tip is not None:
         end = model.robot.attach(contact.body, contact.tip)[1]
@@ -418,10 +458,10 @@ def contact_point(model: Model, contact: Contact, q: Array) -> tuple[Array, Arra
 
 
 def touching_rows(model: Model, contact: Contact, q: Array, sticks: bool) -> Array:
-    """Jacobian of the forces of a contact that rigid bodies would have to determine, (r, n).
+    """Return the Jacobian rows of the contact forces that rigid bodies would have to determine, (r, n).
 
-    A point that sticks has three, one that slides the normal force. The depth of a compliant contact determines its
-    normal force: it has those across the normal, or none.
+    A sticking point has three rows, a sliding point one (its normal force). The depth of a compliant contact determines
+    its normal force: only the tangential rows remain, or none.
     """
     normal, jacobian = contact_point(model, contact, q)
     if contact.stiffness > 0.0:
@@ -430,24 +470,36 @@ def touching_rows(model: Model, contact: Contact, q: Array, sticks: bool) -> Arr
 
 
 def row_basis(rows: Array) -> Array:
-    """Orthonormal basis of the space of some rows, (r, n)."""
+    """Return an orthonormal basis of the row space, (r, n)."""
     _, sizes, basis = np.linalg.svd(rows, full_matrices=False)
-    # A row of zeros has rounding of its size.
+    # A zero row contains rounding errors of this size.
     return basis[sizes > max(DEPENDENT * sizes.max(initial=0.0), 1e-9)]
 
 
-# Contacts that friction can wedge by itself: forces of one contact that push against no joint, inside its cone.
+# Contacts wedged by friction alone: forces of one contact, inside its cone, that push against no joint.
 
 
-# Samples in which a contact is examined, at equal distances among those in which it is closed.
+# Number of samples in which a contact is examined, evenly spaced over the samples in which it is closed.
 POSTURES = 20
-# A force that leaves its cone by less, relative or in N, lies on it except for rounding.
+# A force outside its cone by less than this, relative or in N, counts as on the cone.
 ON_CONE = 1e-6
 
 
 @dataclass(frozen=True)
 class Wedge:
-    """A contact that can wedge itself, the least coefficient that does it, its own at rest, and the time [s]."""
+    """A contact that can wedge itself.
+
+    Attributes
+    ----------
+    contact : Contact
+        The contact.
+    least : float
+        Smallest friction coefficient that wedges it.
+    friction : float
+        Its friction coefficient at rest.
+    time : float
+        Time of the sample [s].
+    """
 
     contact: Contact
     least: float
@@ -456,10 +508,25 @@ class Wedge:
 
 
 def wedges(model: Model, contacts: Sequence[Contact], record: Record) -> list[Wedge]:
-    """Contacts whose motion is not unique because they can wedge themselves, each where the least friction does it.
+    """Find contacts that can wedge themselves, so that their motion is not unique.
 
-    Springs decide the normal forces of compliant contacts. Friction that depends on direction (``grip``) is left out:
-    it has another cone, and does not oppose slip.
+    Each is reported at the sample that requires the least friction. Compliant contacts are skipped because springs
+    determine their normal forces. Friction that depends on direction (``grip``) is skipped because it has a different
+    cone and does not oppose slip.
+
+    Parameters
+    ----------
+    model : Model
+        Model of the robot.
+    contacts : sequence of Contact
+        Contacts of the run.
+    record : Record
+        Record with ``q``, ``contact_mode`` and ``contact_force``.
+
+    Returns
+    -------
+    list of Wedge
+        At most one entry per contact.
     """
     result, free, q = list[Wedge](), free_rates(model), record["q"]
     for k, contact in enumerate(contacts):
@@ -478,29 +545,29 @@ def wedges(model: Model, contacts: Sequence[Contact], record: Record) -> list[We
             if mode[t] == ka.SLIDING or not _holds(moving, normal, friction, record["contact_force"][t, k]):
                 own.append(Wedge(contact, least, friction, float(record.time[t])))
         if own:
-            # The first of those that are equal except for rounding.
+            # The first of several values that are equal up to rounding.
             result.append(min(own, key=lambda wedge: float(f"{wedge.least:.4g}")))
     return result
 
 
 def least_coefficient(jacobian: Array, normal: Array) -> tuple[float, Array]:
-    """μ* of a contact with ``jacobian`` (3, f), infinite for none, and the directions Q of its motion, (3, r).
+    """Return μ* of a contact with ``jacobian`` (3, f), and the directions Q of its motion, (3, r).
 
-    A point that joints do not move along the normal carries nothing, and has none either.
+    μ* is infinite if friction cannot wedge the contact, or if no joint moves the point along the normal.
     """
     moving = row_basis(jacobian.T).T
     along = normal @ moving
     own, other = float(np.linalg.norm(along)), float(np.linalg.norm(normal - moving @ along))
-    # Blocked directions are known up to DEPENDENT: what is less is a direction across the normal.
+    # Blocked directions are known up to DEPENDENT; smaller parts count as zero.
     if own <= DEPENDENT or other <= DEPENDENT:
         return np.inf, moving
     return own / other, moving
 
 
 def _holds(moving: Array, normal: Array, friction: float, force: Array) -> bool:
-    """Whether the contact would stick without the force that blocks it too, ``force`` (3,) being all that it has."""
+    """Return whether the contact would stick even without the wedging force; ``force`` (3,) is its total force."""
     along = normal @ moving
-    # Of two directions one is along the surface; of one, which is not across the normal, none is.
+    # Two directions include one along the surface; a single direction, not across the normal, does not.
     slips = np.array([[-along[1]], [along[0]]]) / np.linalg.norm(along) if len(along) == 2 else np.zeros((1, 0))
     needed = np.linalg.solve(np.column_stack([along, slips]), moving.T @ force)
     slack = ON_CONE * (1.0 + float(np.linalg.norm(force)))

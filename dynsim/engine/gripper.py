@@ -1,7 +1,7 @@
-"""The gripper in a run: soft, hardening, hardened, softening; what it captures, how that slips, and why a run ends.
+"""Gripper during a run: soft, hardening, hardened, softening; capture, slip and loss of objects, and stops.
 
-A command to close hardens the gripper. The captured object is held in its present position: the springs begin without
-force, and the stiffness that the hardening adds is not deflected yet.
+A close command hardens the gripper. The captured object is held in its present position: the springs start without
+force, and stiffness added by hardening starts undeflected.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from dynsim.model.gripper import DIRECTIONS, Gripper, grasp_frame, tie_name
 from dynsim.record import Event, Record
 from dynsim.record.measures import GRIPPER_STATES
 
-# Kinds of events are this word and one of these.
+# Kind of an event: this word and one of the following.
 EVENT, EVENT_KINDS = "gripper", ("captures", "slips", "loses", "releases")
 SOFT, HARDENING, HARDENED, SOFTENING = range(4)
-# A gripper that holds an object has at least this share of its springs: a tie needs a stiffness.
+# Minimum share of the springs while an object is held: a tie needs a stiffness.
 LEAST_SHARE = 0.01
 # Smaller slips are not recorded [m, rad].
 SLIPPED = np.array([1e-3, 2e-2])
-# A tie is at its bound when less than this share of it is missing.
+# A tie is at its bound if less than this fraction of the bound is missing.
 AT_BOUND = 1e-3
-# A held object on a hinge or rails that moves no faster is at rest [rad/s or m/s], and stuck after this time [s].
+# A held object on a hinge or rails slower than this is at rest [rad/s or m/s], and stuck after this time [s].
 AT_REST, STUCK_FOR = 1e-3, 1.0
 
 
@@ -41,12 +41,22 @@ class GripperControl:
 
     Attributes
     ----------
-    objects : names of the objects that have a grasp frame
-    period : control period [s]
-    mode : SOFT, HARDENING, HARDENED or SOFTENING; share : present share of the hardened springs
-    held : name of the object in it
-    slipping : the slip of the present object is recorded; stuck_since : time since which this object is stuck [s]
-    trace : state and share after each period
+    objects : tuple of str
+        Objects that have a grasp frame.
+    period : float
+        Control period [s].
+    mode : int
+        SOFT, HARDENING, HARDENED or SOFTENING.
+    share : float
+        Present share of the hardened springs, 0 to 1.
+    held : str or None
+        Name of the object in the gripper.
+    slipping : bool
+        True once the slip of the present object is recorded.
+    stuck_since : float or None
+        Time since which this object has been stuck [s].
+    trace : list of (int, float)
+        Mode and share after each period.
     """
 
     model: Model
@@ -63,38 +73,38 @@ class GripperControl:
 
     def __post_init__(self) -> None:
         self._body = self.model.body_index(self.gripper.body)
-        # Of objects on hinges or rails: their rates.
+        # Rate index of each object on a hinge or rails.
         joints = [link.joint for link in self.model.robot.links]
         self._rate = {name: joints.index(name) for name in self.objects if name in joints}
 
     @property
     def state_in_words(self) -> str:
-        """The state, for the page of a pilot."""
-        return in_words(self.mode, self.held)
+        """State as text for the pilot's page."""
+        return state_text(self.mode, self.held)
 
-    def remembered(self) -> GripperControl:
+    def saved_state(self) -> GripperControl:
         """Return a copy of the state and of the recorded samples."""
         return replace(self, trace=list(self.trace))
 
     def restore(self, kept: GripperControl) -> None:
-        """Go back to what :meth:`remembered` gave."""
+        """Restore the result of :meth:`saved_state`."""
         for name in ("mode", "share", "held", "slipping", "stuck_since", "events"):
             setattr(self, name, getattr(kept, name))
         self.trace = list(kept.trace)
 
     def nearest(self, q: Array, gripper: Gripper | None = None) -> tuple[str, float, float]:
-        """See :func:`nearest_object`, at coordinates (nq,)."""
+        """Return the nearest object at coordinates (nq,), see :func:`nearest_object`."""
         R, p = self.model.body_pose(self._body, q)
         return nearest_object(self.model, self.objects, q, (R, p + R @ self.gripper.tip), gripper)
 
     def step(self, time: float, closed: bool, state: State, simulation: Referenced) -> None:
-        """One control period, which begins with this state of the simulation.
+        """Run one control period that starts in this state of the simulation.
 
         Raises
         ------
         SimulationStopped
-            ``too_far``: it closes, and nothing is within capture; ``lost``: an object has slipped out; ``too_stiff``:
-            an object on a hinge or rails does not move.
+            ``too_far``: the gripper closes and no object is within capture; ``lost``: an object has slipped out;
+            ``too_stiff``: an object on a hinge or rails does not move.
         """
         if closed and self.mode in {SOFT, SOFTENING}:
             if self.held is None:
@@ -111,12 +121,12 @@ class GripperControl:
         name, distance, angle = self.nearest(q, self.gripper)
         refuse_capture(self.gripper, time, name, distance, angle)
         self.held, self.slipping, self.stuck_since = name, False, None
-        self._tell(time, "captures", name, distance)
+        self._add_event(time, "captures", name, distance)
         for direction in DIRECTIONS:
             simulation.set_tie(tie_name(name, direction), holds=True)
 
     def _harden(self, time: float, simulation: Referenced) -> None:
-        """Let the springs grow or fade, and release the object when they are gone."""
+        """Increase or decrease the spring share, and release the object when it reaches zero."""
         before = self.share
         if self.mode == HARDENING:
             self.share = min(self.share + self.period / self.gripper.hardening, 1.0)
@@ -132,12 +142,12 @@ class GripperControl:
             simulation.set_tie(tie_name(name, direction), holds=self.mode != SOFT, **spring)
         if self.mode == SOFT:
             self.held = None
-            self._tell(time, "releases", name)
+            self._add_event(time, "releases", name)
 
     def _look(self, name: str, time: float, state: State, simulation: Referenced) -> None:
-        """Check whether the held object slips, is lost, or is stuck."""
+        """Check whether the held object slips, is lost or is stuck."""
         g = self.gripper
-        if self.mode == SOFTENING:  # what slips out now is let go
+        if self.mode == SOFTENING:  # an object that slips out now is being released
             self.stuck_since = None
             return
         force, slip = simulation.tie_force, simulation.tie_slip
@@ -148,7 +158,7 @@ class GripperControl:
         moved = float(np.linalg.norm(slips[:3])), float(np.linalg.norm(slips[3:]))
         if not self.slipping and (np.array(moved) > SLIPPED).any():
             self.slipping = True
-            self._tell(time, "slips", name, moved[0])
+            self._add_event(time, "slips", name, moved[0])
         still = name in self._rate and abs(float(state.v[self._rate[name]])) < AT_REST
         if not (still and bound.any()):
             self.stuck_since = None
@@ -159,49 +169,49 @@ class GripperControl:
             f"{name} has slipped by {1e3 * moved[0]:.3g} mm and {moved[1]:.3g} rad in the gripper at t = {time:g} s"
         )
         if lost:
-            self._tell(time, "loses", name, moved[0])
+            self._add_event(time, "loses", name, moved[0])
         if self.stuck_since is not None and (lost or time - self.stuck_since >= STUCK_FOR):
             worst = DIRECTIONS[int((loads / bounds).argmax())]
             direction = f"along {worst}" if len(worst) == 1 else f"about {worst[1]}"
             raise SimulationStopped(
-                f"too_stiff: {name} does not move from t = {self.stuck_since:g} s on, the gripper is at its bound "
+                f"too_stiff: {name} has not moved since t = {self.stuck_since:g} s, the gripper is at its bound "
                 f"{direction}; {slipped} (plant.gripper)",
                 time=time,
                 kind="too_stiff",
             )
         if lost:
             raise SimulationStopped(
-                f"lost: {slipped}; it holds {g.along.bound:g} N and {g.about.bound:g} N m (plant.gripper)",
+                f"lost: {slipped}; its limits are {g.along.bound:g} N and {g.about.bound:g} N m (plant.gripper)",
                 time=time,
                 kind="lost",
             )
 
-    def _tell(self, time: float, kind: str, name: str, value: float | None = None) -> None:
+    def _add_event(self, time: float, kind: str, name: str, value: float | None = None) -> None:
         self.events = (*self.events, gripper_event(time, kind, name, value))
 
     def add_to(self, record: Record) -> None:
-        """Signals and events of the gripper, and its part of the summary."""
+        """Add signals, events and summary of the gripper to a record."""
         ticks = np.floor(record.time / self.period + 1e-6).astype(int)
         rows = np.array(self.trace or [(SOFT, 0.0)])
         state, share = rows[np.minimum(ticks, len(rows) - 1)].T
-        record.add("gripper_share", share, "1", description="of the springs of the hardened gripper that it has")
+        record.add("gripper_share", share, "1", description="share of the hardened gripper's springs")
         distance = np.array([self.nearest(q)[1] for q in record["q"]])
         add_gripper(record, state.astype(np.int64), distance, self.events)
         record.summary = {**record.summary, "gripper": gripper_summary(record, self.objects)}
 
 
 def gripper_event(time: float, kind: str, name: str, value: float | None = None) -> Event:
-    """Event of one of the :data:`EVENT_KINDS`, of an object."""
+    """Return an event of one of the :data:`EVENT_KINDS` for an object."""
     return Event(time, f"{EVENT} {kind}", name, value)
 
 
-def in_words(state: int, name: str | None) -> str:
-    """State of a gripper and the object in it."""
+def state_text(state: int, name: str | None) -> str:
+    """Return the state of a gripper and its object as text."""
     return GRIPPER_STATES[state] + (f" around {name}" if name is not None else "")
 
 
 def add_gripper(record: Record, state: NDArray[np.int64], distance: Array, events: Iterable[Event]) -> None:
-    """Add the signals that both levels have: states and distances [m], (T,); and the events within the samples."""
+    """Add the signals common to both levels, states and distances [m], (T,), and the events within the samples."""
     text = ", ".join(f"{number} {name}" for number, name in enumerate(GRIPPER_STATES))
     record.add("gripper_state", state, "1", description=text)
     text = "from the tip of the gripper to the nearest grasp frame"
@@ -212,9 +222,10 @@ def add_gripper(record: Record, state: NDArray[np.int64], distance: Array, event
 
 
 def gripper_summary(record: Record, objects: Iterable[str]) -> dict[str, Any]:
-    """What the gripper did and how far objects have moved, for ``summary.json``.
+    """Summarise the actions of the gripper and the displacement of objects for ``summary.json``.
 
-    ``moved`` : last less first coordinate of an object on a hinge or rails [rad or m], displacement of a free one [m]
+    The key ``moved`` is the change of the coordinate of an object on a hinge or rails [rad or m], or the displacement
+    of a free object [m].
     """
     labels, q = list(record.labels["q"]), record["q"]
     moved: dict[str, float | list[float]] = {}
@@ -235,12 +246,20 @@ def gripper_summary(record: Record, objects: Iterable[str]) -> dict[str, Any]:
 def nearest_object(
     model: Model, objects: Iterable[str], q: Array, tip: tuple[Array, Array], gripper: Gripper | None = None
 ) -> tuple[str, float, float]:
-    """The object with the nearest grasp frame, its distance [m], and the angle between the two axes [rad].
+    """Return the object with the nearest grasp frame, its distance [m], and the angle between the two axes [rad].
 
     Parameters
     ----------
-    tip : rotation and position of the tip of the gripper
-    gripper : objects within its capture come first
+    model : Model
+        Model of robot and objects.
+    objects : iterable of str
+        Objects to consider.
+    q : (nq,) ndarray
+        Positions [rad or m].
+    tip : ((3, 3) ndarray, (3,) ndarray)
+        Rotation and position [m] of the gripper tip.
+    gripper : Gripper, optional
+        If set, objects within its capture range come first.
     """
     seen = []
     for name in objects:
@@ -255,7 +274,7 @@ def nearest_object(
 
 
 def captures(gripper: Gripper, distance: float, angle: float) -> bool:
-    """Whether a grasp frame is within capture [m, rad]."""
+    """Return whether a grasp frame is within capture range [m, rad]."""
     return distance <= gripper.capture_distance and angle <= gripper.capture_angle
 
 

@@ -1,4 +1,4 @@
-"""Engine of the kinematic snake: preparation, check and simulation of a scenario."""
+"""Engine of the kinematic snake: task-space signals and warnings, carried objects, the run, its record and check."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ from dynsim.engine.gripper import (
     add_gripper,
     gripper_event,
     gripper_summary,
-    in_words,
     nearest_object,
     refuse_capture,
+    state_text,
 )
 from dynsim.engine.outcome import check_size, interrupted, raise_stopped
 from dynsim.engine.recording import provenance
@@ -51,15 +51,15 @@ from dynsim.snake.kinematics import new_chain, posture_points
 from dynsim.snake.ticks import SnakeTrace, new_trace, record_row, run_ticks
 from dynsim.system import interruption
 
-# Signals, summary and warnings of the snake's task-space control, for both snake plants.
+# Signals, summary and warnings of the task-space control, for both snake plants.
 
 
 OUT_OF_REACH = 1.0
-"""A target whose motion has waited for this time at the end of a run [s] is reported out of reach."""
+"""A target that has waited at least this long at the end of a run [s] is reported as out of reach."""
 
 
-ASTRAY = 1e-3
-"""A head that is further than this from where its controller takes it to be [m] is reported."""
+ESTIMATE_ERROR = 1e-3
+"""Errors of the controller's head position estimate above this [m] are reported."""
 
 
 def _wrapped(angle: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -67,7 +67,7 @@ def _wrapped(angle: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def attitude(w: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rotation matrices R = Rz(gamma) Ry(beta) Rx(alpha) of poses w, shape (T, 6) -> (T, 3, 3)."""
+    """Return the rotation matrices R = Rz(gamma) Ry(beta) Rx(alpha) of poses w, shape (T, 6) -> (T, 3, 3)."""
     (sa, sb, sg), (ca, cb, cg) = np.sin(w[:, 3:]).T, np.cos(w[:, 3:]).T
     return np.array(
         [
@@ -79,14 +79,14 @@ def attitude(w: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def attitude_distance(w: NDArray[np.float64], w_target: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Angle of the rotation between two attitudes [rad], shape (T,)."""
-    # From the Frobenius norm: the arc cosine of a trace loses half the digits near zero.
+    """Return the rotation angle between two attitudes [rad], shape (T,)."""
+    # Use the Frobenius norm: the arc cosine of a trace loses half the digits near zero.
     norm = np.linalg.norm(attitude(w) - attitude(w_target), axis=(1, 2))
     return 2.0 * np.arcsin(np.clip(norm / np.sqrt(8.0), 0.0, 1.0))
 
 
 def hold_last(trace: SnakeTrace) -> None:
-    """Complete the last row, at whose time no control period begins, with the values held until then."""
+    """Fill the last row, at whose time no control period starts, with the values held until then."""
     if len(trace.u) > 1:
         for array in (trace.u, trace.slip, trace.at_limit):
             array[-1] = array[-2]
@@ -95,15 +95,22 @@ def hold_last(trace: SnakeTrace) -> None:
 def add_task(
     record: Record, run: SnakeControl, trace: SnakeTrace, w: NDArray[np.float64], points: NDArray[np.float64]
 ) -> None:
-    """Signals of the controlled point, the modes, the redundancy, the support, and the posture as a polyline.
+    """Add signals of the controlled point, the modes, the redundancy, the support, and the posture as a polyline.
 
     Parameters
     ----------
-    trace : a row for each sample of the record
-    w : (T, 6) pose of the controlled point
-    points : (T, points, 3) [m]
+    record : Record
+        Record to extend.
+    run : SnakeControl
+        Control of the run.
+    trace : SnakeTrace
+        One row for each sample of the record.
+    w : (T, 6) ndarray
+        Pose of the controlled point [m, rad].
+    points : (T, points, 3) ndarray
+        Points of the posture [m].
     """
-    # Angles of w on the branch of the target, so that no curve jumps by 2 pi.
+    # Angles of w on the branch of the target, to avoid jumps by 2 pi.
     w = w.copy()
     w[:, 3:] = trace.w_target[:, 3:] + _wrapped(w[:, 3:] - trace.w_target[:, 3:])
     position_error = np.linalg.norm(w[:, :3] - trace.w_target[:, :3], axis=1)
@@ -115,34 +122,39 @@ def add_task(
     pairs = tuple(f"pair{i + 1}" for i in range(run.description.pairs))
     add = record.add
     add("w", w, "m, rad", labels=COORDINATES, description="pose of the controlled point")
-    add("w_target", trace.w_target, "m, rad", labels=COORDINATES, description="its target")
-    add("w_estimate", trace.w_hat, "m, rad", labels=COORDINATES, description="what the controller takes it for")
+    add("w_target", trace.w_target, "m, rad", labels=COORDINATES, description="target pose")
+    add("w_estimate", trace.w_hat, "m, rad", labels=COORDINATES, description="pose estimated by the controller")
     add("position_error", position_error, "m", description="distance of the controlled point from its target")
-    add("attitude_error", attitude_error, "rad", description="angle between its attitude and the target's")
+    add("attitude_error", attitude_error, "rad", description="angle between its attitude and the target attitude")
     add("base_pose", trace.base, "m, rad", labels=("x", "y", "yaw"), description="base part, at wheel pair 1")
     add("mode", np.array(run.controller.modes.numbers)[trace.mode], "1", description="mode number")
-    add("grounded", grounded, "1", labels=pairs, description="1 where the wheel pair is on the ground")
+    add("grounded", grounded, "1", labels=pairs, description="1 if the wheel pair is on the ground")
     add("gripper", gripper, "1", description="1 closed (hardened), 0 open (soft)")
-    add("cost", trace.cost, "1", description="V of the redundancy")
+    add("cost", trace.cost, "1", description="redundancy cost V")
     add("sigma_min", trace.sigma, "1", description="smallest singular value of B~ of the mode, unweighted")
-    add("support_margin", trace.margin, "m", description="centre of mass inside the support polygon by this much")
-    add("support_area", trace.area, "m^2", description="of the support polygon")
+    add(
+        "support_margin",
+        trace.margin,
+        "m",
+        description="distance of the centre of mass inside the edges of the support polygon",
+    )
+    add("support_area", trace.area, "m^2", description="area of the support polygon")
     add("centre_of_mass", trace.centre, "m", labels=("x", "y", "z"))
     add("slip", trace.slip, "m/s", description="largest violation of a wheel row within the period")
-    add("at_limit", trace.at_limit, "1", labels=names, description="1 joint out of the allocation, 2 clamped")
+    add("at_limit", trace.at_limit, "1", labels=names, description="1 joint removed from the allocation, 2 clamped")
     labels = tuple(f"point{i}" for i in range(points.shape[1]))
     add("posture", points, "m", labels=labels, description="polyline: controlled point, joints, axles to the tail")
 
 
 def _waiting_for(counts: NDArray[np.int64], period: float) -> dict[str, float]:
-    """Why the target waited, and how long [s]; reasons that did not occur are left out."""
+    """Return the reasons for which the target waited, with durations [s]; reasons that did not occur are omitted."""
     known = counts[ss.WAITED_FOR + 1 : ss.PATH_SLOWED]
     ticks = [*known, counts[ss.WAITED] - known.sum()]
     return {name: float(count * period) for name, count in zip(OBSTACLES, ticks, strict=True) if count}
 
 
 def _out_of_reach(counts: NDArray[np.int64], period: float, duration: float) -> dict[str, Any] | None:
-    """Since when a target has waited that waits at the end of the run, and for what; None where it does not."""
+    """Return start time and reason of a wait that lasts to the end of the run, or None."""
     still = float(counts[ss.STILL] * period)
     if still < OUT_OF_REACH:
         return None
@@ -150,7 +162,7 @@ def _out_of_reach(counts: NDArray[np.int64], period: float, duration: float) -> 
 
 
 def task_summary(run: SnakeControl, record: Record) -> dict[str, Any]:
-    """What the control has done, for ``summary.json``."""
+    """Return the controller's part of ``summary.json``."""
     description, law, period = run.description, run.controller.law, run.controller.schedule.period
     counts = run.state.counts
     phi, w, at_limit = record["phi"], record["w"], record["at_limit"]
@@ -186,7 +198,7 @@ def task_summary(run: SnakeControl, record: Record) -> dict[str, Any]:
             {
                 "time_s": refusal.tick * period,
                 "mode": run.controller.modes.numbers[refusal.row],
-                # JSON has no infinity: None where the predicted state is no longer finite
+                # JSON has no infinity: None if the predicted state is not finite
                 "support_margin_m": refusal.margin if np.isfinite(refusal.margin) else None,
                 "taken": refusal.taken,
             }
@@ -205,7 +217,7 @@ def task_summary(run: SnakeControl, record: Record) -> dict[str, Any]:
 
 
 def effort(summary: dict[str, Any]) -> dict[str, Any]:
-    """What a battery gives for a dynamic run, and the servo whose rms torque is the largest part of its rating."""
+    """Return the battery energy of a dynamic run, and the servo with the largest ratio of rms torque to its rating."""
     rated = {k: m.get("nominal_torque_N_m", m.get("stall_torque_N_m")) for k, m in enumerate(summary["motors"])}
     share = {k: summary["motors"][k]["torque_rms_N_m"] / rating for k, rating in rated.items() if rating}
     return {
@@ -215,7 +227,7 @@ def effort(summary: dict[str, Any]) -> dict[str, Any]:
 
 
 def task_warnings(run: SnakeControl, record: Record, summary: dict[str, Any]) -> list[str]:
-    """What a user should know of the control, a line each."""
+    """Return the warnings of the task-space control."""
     warnings = []
     if summary["waiting_s"] >= SHORT * summary["duration_s"] > 0.0:
         share = percent(min(summary["waiting_s"] / summary["duration_s"], 1.0))
@@ -224,36 +236,36 @@ def task_warnings(run: SnakeControl, record: Record, summary: dict[str, Any]) ->
     if (gone := summary["out_of_reach"]) is not None:
         target = ", ".join(f"{value:.3f}" for value in record["w_target"][-1])
         warnings.append(
-            f"the path is out of reach from t = {gone['since_s']:.2f} s on ({gone['reason']}): the target waited there "
-            f"to the end of the run, at ({', '.join(COORDINATES)}) = ({target})"
+            f"the path is out of reach from t = {gone['since_s']:.2f} s on ({gone['reason']}): the target waited "
+            f"until the end of the run at ({', '.join(COORDINATES)}) = ({target})"
         )
     if summary["path_slowed_s"] > 0.0:
         warnings.append(
             f"the path is too fast for the joints: the target was slower than commanded for "
-            f"{summary['path_slowed_s']:.2f} s and came {summary['path_late_s']:.2f} s late "
+            f"{summary['path_slowed_s']:.2f} s and is {summary['path_late_s']:.2f} s late "
             "(controller.rate_limit_rad_s)"
         )
     if summary["slowed_s"] > 0.0:
         warnings.append(
-            f"feedback and shape points were slowed down for {summary['slowed_s']:.2f} s: they asked for more than the "
-            "limits of joints and rates allow"
+            f"feedback and shape points were slowed down for {summary['slowed_s']:.2f} s: they required more than the "
+            "joint and rate limits allow"
         )
     if summary["null_space_reduced_s"] > 0.0:
         warnings.append(
             f"the null-space motion was reduced for {summary['null_space_reduced_s']:.2f} s to keep the rate limit: "
-            "the cost falls slower there (controller.null_gain)"
+            "the cost decreases more slowly there (controller.null_gain)"
         )
     if summary["clamped_joint_ticks"]:
         off = np.linalg.norm(record["w_estimate"][:, :3] - record["w_target"][:, :3], axis=1).max()
         warnings.append(
-            f"joints were clamped at their limits in {summary['clamped_joint_ticks']} joint-ticks: by the joint angles "
-            f"that the controller knows, the head is off its target by up to {1e3 * off:.3g} mm"
+            f"joints were clamped at their limits in {summary['clamped_joint_ticks']} joint-ticks: according to the "
+            f"controller's joint angles, the head is off its target by up to {1e3 * off:.3g} mm"
         )
-    astray = np.linalg.norm(record["w"][:, :3] - record["w_estimate"][:, :3], axis=1).max()
-    if astray > ASTRAY and run.controller.schedule.state_source not in {ss.MEASURED, ss.GIVEN}:
+    estimate_error = np.linalg.norm(record["w"][:, :3] - record["w_estimate"][:, :3], axis=1).max()
+    if estimate_error > ESTIMATE_ERROR and run.controller.schedule.state_source not in {ss.MEASURED, ss.GIVEN}:
         warnings.append(
-            f"the head is up to {1e3 * astray:.3g} mm from where the controller takes it to be: servos sag under their "
-            "loads and wheels slip (controller.state: measured sees both)"
+            f"the controller's estimate of the head position is off by up to {1e3 * estimate_error:.3g} mm: servos sag "
+            "under load and wheels slip; use controller.state: measured"
         )
     if summary["tipping"]:
         share = percent(float((record["support_margin"] <= 0.0).mean()))
@@ -262,39 +274,49 @@ def task_warnings(run: SnakeControl, record: Record, summary: dict[str, Any]) ->
     if least > 0.0 and not summary["tipping"] and margin.min() <= least:
         worst = int(margin.argmin())
         warnings.append(
-            f"the support margin falls to {1e3 * margin[worst]:.1f} mm at t = {record.time[worst]:.2f} s, below "
-            f"switching.least_margin_m ({1e3 * least:g} mm): it is tested when a mode is chosen, not within it"
+            f"the support margin drops to {1e3 * margin[worst]:.1f} mm at t = {record.time[worst]:.2f} s, below "
+            f"switching.least_margin_m ({1e3 * least:g} mm): it is checked only when a mode is chosen"
         )
     return warnings + _refusal_warnings(summary["refusals"], run.controller.least_margin)
 
 
 def _refusal_warnings(refusals: list[dict[str, Any]], least_margin: float) -> list[str]:
-    """One line for every mode that was refused, and one for every mode that was taken although it tips."""
+    """Return one line for each refused mode, and one for each mode used although it tips."""
     texts = []
     for mode, taken in dict.fromkeys((refusal["mode"], refusal["taken"]) for refusal in refusals):
         same = [refusal for refusal in refusals if (refusal["mode"], refusal["taken"]) == (mode, taken)]
         margin = same[0]["support_margin_m"]
-        needed = f"a support margin of more than {1e3 * least_margin:g} mm is needed, it has"
+        needed = f"it requires a support margin of more than {1e3 * least_margin:g} mm and has"
         why = "its prediction diverges" if margin is None else f"{needed} {1e3 * margin:.1f} mm"
-        outcome = "taken, as no other stands better," if taken else "refused"
-        times = f" ({len(same)} times in all)" if len(same) > 1 else ""
+        outcome = "used because no other mode is more stable," if taken else "refused"
+        times = f" ({len(same)} times in total)" if len(same) > 1 else ""
         texts.append(f"mode {mode} was {outcome} at t = {same[0]['time_s']:.3f} s{times}: {why}")
     return texts
 
 
-# Objects of a kinematic snake: they have no forces, stay where they are, and follow the gripper while it holds them.
+# Objects of a kinematic snake: they carry no forces, are stationary, and follow the gripper while it holds them.
 
 
-# A grasp frame that is nearer to the axis of its hinge tells no angle: the turning of the gripper does [m].
+# A grasp frame closer than this to the hinge axis defines no angle; the rotation of the gripper is used instead [m].
 ON_AXIS = 0.01
 
 
 @dataclass
 class HeldObject:
-    """Object ``name`` in the gripper from one tick to another.
+    """An object in the gripper from one tick to another.
 
-    ``start``, ``end`` : ticks; ``released`` : its coordinates from ``end`` on; ``tip``, ``q`` : pose of the gripper,
-    rotation and position, and all coordinates at the start
+    Attributes
+    ----------
+    name : str
+        Name of the object.
+    start, end : int, float
+        First and last tick.
+    tip : ((3, 3) ndarray, (3,) ndarray)
+        Rotation and position of the gripper tip at the start.
+    q : ndarray
+        All object coordinates at the start.
+    released : ndarray or None
+        Coordinates of the object from ``end`` on.
     """
 
     name: str
@@ -306,12 +328,18 @@ class HeldObject:
 
 
 class CarriedObjects:
-    """The objects of a run, and when the gripper held which.
+    """Objects of a run, and the intervals in which the gripper held them.
 
     Parameters
     ----------
-    gripper : its tip is ``ahead`` of the controlled point [m]
-    period : control period [s]
+    scenario : Scenario
+        Scenario with objects.
+    gripper : Gripper
+        Gripper of the snake.
+    ahead : float
+        Distance of the gripper tip in front of the controlled point [m].
+    period : float
+        Control period [s].
     """
 
     def __init__(self, scenario: Scenario, gripper: Gripper, ahead: float, period: float) -> None:
@@ -323,7 +351,7 @@ class CarriedObjects:
         first = next(iter(self.objects))
         self.robot = Robot("objects", tuple(links), (), (first, np.zeros(3)), q0=start, frames=tuple(frames))
         self.model, self.q = Model(self.robot), start.copy()
-        # Where the coordinates of each object are.
+        # Slice of the coordinates of each object.
         sizes = [len(body.start()) for body in self.objects.values()]
         ends = np.cumsum(sizes).tolist()
         self._part = {name: slice(end - size, end) for name, size, end in zip(self.objects, sizes, ends, strict=True)}
@@ -333,17 +361,17 @@ class CarriedObjects:
         self._closed = False
 
     def tip(self, w: Array) -> tuple[Array, Array]:
-        """Rotation and position of the gripper's tip at a pose (6,) of the controlled point."""
+        """Return rotation and position of the gripper tip at a pose (6,) of the controlled point."""
         R = attitude(w[None])[0]
         return R, w[:3] + self._ahead * R[:, 0]
 
     def command(self, tick: int, closed: bool, w: Array) -> None:
-        """Close or open the gripper from a tick on, with the controlled point at w (6,).
+        """Close or open the gripper at a tick, with the controlled point at w (6,).
 
         Raises
         ------
         SimulationStopped
-            It closes, and nothing is within capture.
+            If the gripper closes and no object is within capture range.
         """
         if closed == self._closed or not self.graspable:
             self._closed = closed
@@ -356,7 +384,7 @@ class CarriedObjects:
                 present.end = tick + math.ceil(hardened * self.gripper.softening / self._period - 1e-9)
                 self.events.append(gripper_event(present.end * self._period, "releases", present.name))
             return
-        if present is not None:  # it was still softening
+        if present is not None:  # the gripper was still softening
             present.end = np.inf
             self.events.pop()
             return
@@ -367,7 +395,7 @@ class CarriedObjects:
         self.events.append(gripper_event(time, "captures", name, distance))
 
     def release(self, tick: int, w: Array) -> None:
-        """Let go of an object whose time has come, with the controlled point at w (6,)."""
+        """Release objects that are due, with the controlled point at w (6,)."""
         for grasp in self.grasps:
             if grasp.released is None and grasp.end <= tick:
                 part = self._part[grasp.name]
@@ -378,7 +406,7 @@ class CarriedObjects:
         return min((grasp.end - tick for grasp in self.grasps if grasp.released is None), default=math.inf)
 
     def _move_to(self, tick: int, w: Array) -> None:
-        """Move the held object with the gripper, to its position at a tick, and those that were released."""
+        """Set the coordinates of held and released objects at a tick."""
         for grasp in self.grasps:
             if tick >= grasp.end and grasp.released is not None:
                 self.q[self._part[grasp.name]] = grasp.released
@@ -386,7 +414,7 @@ class CarriedObjects:
                 self.q[self._part[grasp.name]] = self._followed(grasp, *self.tip(w))
 
     def _followed(self, grasp: HeldObject, R: Array, p: Array) -> Array:
-        """Coordinates of a held object with the gripper at R, p."""
+        """Return the coordinates of a held object with the gripper at R, p."""
         body, (R0, p0) = self.objects[grasp.name], grasp.tip
         index, at = self.robot.attach(grasp_frame(grasp.name), np.zeros(3))
         B, origin = self.model.body_pose(index, grasp.q)
@@ -398,7 +426,7 @@ class CarriedObjects:
         axis = B @ link.axis
         if body.slide is not None:
             return np.clip(before + axis @ (p - p0), link.lower, link.upper)
-        # In the plane of the hinge: where the grasp frame was seen from the axis, and where it has gone with the tip.
+        # In the plane of the hinge: the grasp frame relative to the axis before, and after moving with the tip.
         was = B @ at - axis * (axis @ B @ at)
         if np.linalg.norm(was) < ON_AXIS:
             return self._turned(grasp, before + axis @ turn_error(R0, R), link)
@@ -407,18 +435,18 @@ class CarriedObjects:
         return self._turned(grasp, before + angle, link)
 
     def _turned(self, grasp: HeldObject, angle: Array, link: Link) -> Array:
-        """An angle without its jumps by whole turns since the last position, within the limits of the hinge."""
+        """Return an angle within the hinge limits, unwrapped relative to the last position."""
         last = self.q[self._part[grasp.name]]
         turns = np.round((last - angle) / (2.0 * np.pi))
         return np.clip(angle + 2.0 * np.pi * turns, link.lower, link.upper)
 
     def state_in_words(self, tick: int) -> str:
-        """Return the state of the gripper at a tick in words, for the page of a pilot."""
+        """Return the state of the gripper at a tick as text for the pilot's page."""
         present = next((grasp for grasp in reversed(self.grasps) if grasp.start <= tick <= grasp.end), None)
-        return in_words(self._state(present, tick), None if present is None else present.name)
+        return state_text(self._state(present, tick), None if present is None else present.name)
 
     def positions(self, tick: int, w: Array) -> dict[str, float]:
-        """Return the coordinates of the objects by name, with the controlled point at w (6,) at this tick."""
+        """Return the coordinates of the objects, with the controlled point at w (6,) at this tick."""
         self._move_to(tick, w)
         return dict(zip(self.robot.position_names, self.q.tolist(), strict=True))
 
@@ -430,7 +458,7 @@ class CarriedObjects:
         return HARDENED if (tick - grasp.start) * self._period >= self.gripper.hardening else HARDENING
 
     def add_to(self, record: Record, w: Array, ticks: NDArray[np.int64]) -> None:
-        """Coordinates of objects as the signal ``q``, and what the gripper did, at poses (T, 6) and ticks (T,)."""
+        """Add object coordinates (signal ``q``) and gripper signals, at poses (T, 6) and ticks (T,)."""
         self.q, rows = self.robot.initial.copy(), []
         state, distance = np.zeros(len(ticks), dtype=np.int64), np.zeros(len(ticks))
         for row, tick in enumerate(ticks.tolist()):
@@ -446,8 +474,8 @@ class CarriedObjects:
         if self.graspable:
             add_gripper(record, state, distance, self.events)
 
-    def beside(self, scene: Scene) -> Scene:
-        """The scene with the objects in it."""
+    def scene_with_objects(self, scene: Scene) -> Scene:
+        """Return the scene including the objects."""
         own = robot_scene(self.robot, (), {})
         assert own is not None
         shifted = len(scene.bodies)
@@ -455,31 +483,31 @@ class CarriedObjects:
         return replace(scene, bodies=(*scene.bodies, *bodies))
 
 
-# Run of the kinematic snake: control periods in compiled code, mode switches between them in Python.
+# Run of the kinematic snake: compiled control periods, with mode switches between them in Python.
 
 
-CHUNK = 500  # ticks between two checks for signals and updates of the bar: about 25 ms, at worst ten times as long
+CHUNK = 500  # ticks between checks for signals and progress updates: about 25 ms, at most ten times as long
 
 
 class SnakeRun(SnakeControl):
-    """The control of a snake whose joints follow their rates exactly, and whose base moves as its wheels roll."""
+    """Control of a snake whose joints follow their rates exactly and whose base moves as its wheels roll."""
 
     objects: CarriedObjects | None = None
 
     def load_kernels(self) -> None:
-        """Compile or load the kernels: that is no simulation time."""
+        """Compile or load the kernels, so that this is not counted as simulation time."""
         law, schedule, trial = self.controller.law, self.controller.schedule, copy_of(self.state)
         trace = new_trace(self.model, 1)
         run_ticks(self.model, law, schedule, trial, self.block.velocity, 0, 1, 1, 1, self.ws, trace)
         record_row(self.model, law, trial, self.ws, 0, trace)
 
     def advance(self) -> None:
-        """Run the control periods up to the next one in which something may change: one, of a source that knows one.
+        """Run the control periods up to the next possible change; one period if the source supplies single commands.
 
         Raises
         ------
         SimulationStopped
-            The state is no longer finite, or the source failed.
+            If the state is no longer finite, or the source failed.
         """
         self.begin_period()
         periods = min(self.periods(), CHUNK)
@@ -508,17 +536,22 @@ class SnakeRun(SnakeControl):
         self.end_period(blocked)
 
 
-# The record of a run of the kinematic snake: signals, summary, warnings.
+# Record of a run of the kinematic snake: signals, summary, warnings.
 
 
 def make_record(run: SnakeRun, scenario: Scenario, wall: float, pictured: bool = True) -> Record:
-    """Signals, units, summary and provenance of a run, finished or not.
+    """Return the record of a complete or incomplete run.
 
     Parameters
     ----------
-    run : after its last tick; the state at the end becomes the last sample.
-    wall : time that the ticks took [s].
-    pictured : with the scene and the poses of its bodies.
+    run : SnakeRun
+        Run after its last tick; its final state becomes the last sample.
+    scenario : Scenario
+        Scenario of the run.
+    wall : float
+        Wall-clock time of the ticks [s].
+    pictured : bool, optional
+        If False, omit the scene and the poses of its bodies.
     """
     description, state, law = run.description, run.state, run.controller.law
     model, period, ticks = run.model, run.controller.schedule.period, run.tick
@@ -542,7 +575,7 @@ def make_record(run: SnakeRun, scenario: Scenario, wall: float, pictured: bool =
         run.objects.add_to(record, trace.w, np.rint(time / period).astype(np.int64))
     if pictured:
         scene = snake_scene(description)
-        record.scene = scene if run.objects is None else run.objects.beside(scene)
+        record.scene = scene if run.objects is None else run.objects.scene_with_objects(scene)
         add_body_poses(record)
     summary = {
         "scenario": scenario.name,
@@ -563,15 +596,15 @@ def make_record(run: SnakeRun, scenario: Scenario, wall: float, pictured: bool =
 
 
 def _passed_limits(run: SnakeRun, record: Record) -> list[str]:
-    """Warn of the joint that passes its limit furthest: this level has no stops, as the dynamic one has."""
+    """Warn of the joint that exceeds its limit most: unlike the dynamic level, this level has no joint stops."""
     d = run.description
     beyond = np.maximum(record["phi"] - d.upper, d.lower - record["phi"]).max(axis=0)
     worst = int(beyond.argmax())
     if beyond[worst] <= 1e-9:  # rounding
         return []
     return [
-        f"{d.joint_names[worst]} passes its limit by {beyond[worst]:.3f} rad; a real one would stop "
-        "(controller.limit_policy: allocate)"
+        f"{d.joint_names[worst]} exceeds its limit by {beyond[worst]:.3f} rad; a real joint would stop there; "
+        "use controller.limit_policy: allocate"
     ]
 
 
@@ -579,24 +612,32 @@ log = logging.getLogger(__name__)
 
 
 def prepare(scenario: Scenario, source: CommandSource | None = None) -> SnakeRun:
-    """Build robot and controller and the initial state, and read the first commands.
+    """Build robot, controller and initial state, and read the first commands.
 
-    ``source`` replaces the commands and paths of the scenario.
+    Parameters
+    ----------
+    scenario : Scenario
+        Scenario with a kinematic plant.
+    source : CommandSource, optional
+        Source that replaces the commands and paths of the scenario.
 
     Raises
     ------
     ModelError
-        The robot cannot be controlled as configured, the scenario has what this engine does not know, or a command
-        asks for a mode that does not exist.
+        If the robot cannot be controlled as configured, the scenario uses unsupported sections, or a command requests
+        an unknown mode.
     ScenarioError
-        The recording rate does not divide the control rate, or the record would be too large.
+        If the recording rate does not divide the control rate, or the record would be too large.
     """
     if scenario.controller is None or member("controller", scenario.controller.type).ENGINE != "kinematic":
-        raise ModelError(f"plant {scenario.plant.type!r} (kinematic) needs controller.type: task_space")
+        raise ModelError(f"plant {scenario.plant.type!r} (kinematic) requires controller.type: task_space")
     if scenario.config.contacts.points:
-        raise ModelError(f"plant {scenario.plant.type!r} (kinematic) takes no contacts.points: it stands on its wheels")
+        raise ModelError(f"contacts.points is not supported by the kinematic plant {scenario.plant.type!r}; remove it")
     if scenario.config.loads:
-        raise ModelError(f"plant {scenario.plant.type!r} (kinematic) takes no loads: it has no forces", keys=("loads",))
+        raise ModelError(
+            f"loads is not supported by the kinematic plant {scenario.plant.type!r}, which has no forces; remove it",
+            keys=("loads",),
+        )
     description = build.machine(scenario)
     assert isinstance(description, SnakeDescription)
     controller = build.controller(scenario, description)
@@ -614,7 +655,7 @@ def prepare(scenario: Scenario, source: CommandSource | None = None) -> SnakeRun
 
 
 def check(scenario: Scenario, started: Callable[[Start], None]) -> Start:
-    """See :func:`dynsim.engine.check`: the controlled point at t = 0; a snake has no contact points."""
+    """Check the scenario, see :func:`dynsim.engine.check`; a snake has no contact points."""
     start = Start(prepare(scenario).state.w_target[:3].copy(), {}, warnings=without_effect(scenario))
     started(start)
     return start
@@ -627,10 +668,10 @@ def simulate(
     *,
     pictured: bool = True,
 ) -> Record:
-    """See :func:`dynsim.engine.simulate`; also raises what :func:`prepare` raises.
+    """Simulate the scenario, see :func:`dynsim.engine.simulate`; also raises the errors of :func:`prepare`.
 
-    A live ``source`` (joystick) replaces the commands and paths of the scenario. It is asked in every control period,
-    with what the robot has done; to run in real time it waits in ``read`` until the period has come.
+    A live ``source`` (joystick) replaces the commands and paths of the scenario. It is read in every control period and
+    receives the state of the robot. To run in real time, its ``read`` waits until the period is due.
     """
     run = prepare(scenario, source)
     with kernels_logged(log, "kinematic snakes"):
@@ -662,10 +703,10 @@ def simulate(
 
 
 def _check_wall(run: SnakeRun, spent: float, limit: float | None) -> None:
-    """SimulationStopped when the wall limit [s] is over."""
+    """Raise SimulationStopped if the wall-clock limit [s] is exceeded."""
     if limit is not None and spent > limit:
         raise SimulationStopped(
-            f"stopped at t = {run.time:g} s: the wall limit, integrator.wall_limit_s = {limit:g} s, is over, "
+            f"stopped at t = {run.time:g} s: the wall-clock limit, integrator.wall_limit_s = {limit:g} s, is exceeded "
             f"in mode {run.mode}",
             time=run.time,
             state=run.postures(),

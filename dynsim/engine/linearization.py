@@ -1,11 +1,12 @@
-"""Linearisation of the coupled system about a state, with its contact modes kept fixed.
+"""Linearization of the coupled system about a state, with fixed contact modes.
 
     δẋ = A δx + B δu,   δy = C δx + D δu,   x = (q, v, i)
 
-Bodies, motors with their controller, loads and active constraints are one right-hand side; contact modes stay those of
-the instant, so the equations hold until the next event. A sampled controller is taken as the continuous one of its law:
-its loop is closed, and what sampling adds is left out. Constraints are part of A at the level of accelerations: each
-row that is held adds two eigenvalues at zero, for motions that violate it, which the simulation does not make.
+Bodies, motors with their controller, loads and active constraints form one right-hand side. Contact modes are fixed at
+the present ones, so the equations are valid until the next event. A sampled controller is replaced by the continuous
+controller with the same law: its loop is closed, and sampling effects are neglected. Constraints enter A at the
+acceleration level: each active row adds two zero eigenvalues, for motions that violate the constraint and do not occur
+in the simulation.
 """
 
 from __future__ import annotations
@@ -32,10 +33,10 @@ from dynsim.integrators import run as ki
 from dynsim.integrators.run import fill_output
 
 Array = NDArray[np.float64]
-# Steps of the differences [rad, m, rad/s, A, …]: from least rounding error to below the speeds that smooth friction.
+# Difference steps [rad, m, rad/s, A, …]: from minimum rounding error to below the speeds that smooth friction.
 STEPS = tuple(1e-2 / 3.0**k for k in range(9))
 # Rows whose largest entry is below this count as zero [SI units].
-NOTHING = 1e-6
+ZERO_ROW = 1e-6
 MODES = {ka.OPEN: "open", ka.SLIDING: "sliding", ka.STICKING: "sticking"}
 INPUTS = ("command", "reference", "reference_rate", "force", "torque")
 OUTPUTS = (
@@ -47,16 +48,31 @@ _AXES = "xyz"
 
 @dataclass(frozen=True)
 class Linearization:
-    """Linear equations about a state; ``A, B, C, D = linearization`` takes the matrices.
+    """Linear equations about a state; unpack with ``A, B, C, D = linearization``.
 
     Attributes
     ----------
-    A, B, C, D : (x, x), (x, u), (y, x), (y, u)
-    states, inputs, outputs : names of rows and columns
-    time : [s]
-    x, xdot : (x,) the state, at the end of a step, and its rate, which is zero only in an equilibrium
-    modes : of each contact point: open, sliding or sticking; under the bilateral law all slide
-    error : of the least exact entry, in parts of the largest one of its row; estimated, to a factor of about ten
+    A : (x, x) ndarray
+        State matrix.
+    B : (x, u) ndarray
+        Input matrix.
+    C : (y, x) ndarray
+        Output matrix.
+    D : (y, u) ndarray
+        Feedthrough matrix.
+    states, inputs, outputs : tuple of str
+        Names of rows and columns.
+    time : float
+        Time of the linearization [s].
+    x : (x,) ndarray
+        State at the end of a step.
+    xdot : (x,) ndarray
+        Its rate, zero only in an equilibrium.
+    modes : dict of str to str
+        Mode of each contact point: open, sliding or sticking; under the bilateral law all slide.
+    error : float
+        Estimated error of the least accurate entry, relative to the largest entry of its row; accurate to a factor of
+        about ten.
     """
 
     A: Array
@@ -77,10 +93,10 @@ class Linearization:
 
 
 def linearized(prepared: Prepared, inputs: Sequence[str], outputs: Sequence[str]) -> Linearization:
-    """Linearize a run at the state and time that it stands at, see :meth:`dynsim.Simulation.linearize`."""
+    """Linearize a run at its present state and time, see :meth:`dynsim.Simulation.linearize`."""
     frozen = _Frozen(prepared)
-    entries = _chosen("input", inputs, frozen.inputs())
-    columns = _chosen("output", outputs, frozen.outputs())
+    entries = _selected("input", inputs, frozen.inputs())
+    columns = _selected("output", outputs, frozen.outputs())
     read = np.array(list(columns.values()), dtype=int)
     n, x = len(frozen.x), frozen.x
     by_x, error_x = _jacobian(lambda d: frozen.rate_and_output(x + d, read), n)
@@ -113,7 +129,7 @@ def _along(entry: Callable[[float, NDArray[Any]], Array], read: NDArray[Any], am
 
 
 class _Frozen:
-    """The right-hand side of a run at its instant, with the modes of its contacts, and its outputs."""
+    """Right-hand side of a run at one instant, with fixed contact modes, and its outputs."""
 
     def __init__(self, prepared: Prepared) -> None:
         self._prepared = prepared
@@ -121,7 +137,7 @@ class _Frozen:
         self.time = float(run.clock[ki.TIME])
         self._system, self._workspace, self._y = copied(prepared.system), copied(prepared.workspace), run.y.copy()
         self._tracked = run.layout.tracked
-        # Commands that are held from tick to tick would leave the loop open; those that callers give are held.
+        # Commands held from tick to tick would leave the loop open; commands that the caller set stay held.
         table = self._system.drives.table
         table[table[:, ka.SAMPLED] == ka.AT_TICKS, ka.SAMPLED] = ka.CONTINUOUS
         self.x = self._y[: self._tracked].copy()
@@ -132,7 +148,7 @@ class _Frozen:
         self._references = self._latest.motors[:, [ka.Q_REF, ka.V_REF]].copy()
 
     def rate_and_output(self, x: Array, read: NDArray[Any], system: Any = None) -> Array:
-        """dx/dt, then the recorded columns and states that ``read`` names."""
+        """Return dx/dt, followed by the states and recorded columns with the indices ``read``."""
         dy = self._evaluate(x, self._system if system is None else system)
         if not len(read):
             return dy
@@ -144,13 +160,13 @@ class _Frozen:
     def _evaluate(self, x: Array, system: Any) -> Array:
         y, dy = self._y.copy(), np.zeros(len(self._y))
         y[: self._tracked] = x
-        # Signs of friction, anchors and counts belong to the instant.
+        # Friction signs, anchors and counters must not change between evaluations.
         self._latest = copied(self._workspace)
         derivative(system, self.time, y, self._latest, dy)
         return dy[: self._tracked]
 
     def inputs(self) -> dict[str, dict[str, Callable[[float, NDArray[Any]], Array]]]:
-        """What can be moved, by family and label: functions of the amount and of what is read."""
+        """Return all inputs by family and label, as functions of the change and of the outputs to read."""
         joints = [motor.joint for motor in self._prepared.model.robot.motors]
         bodies = self._prepared.model.robot.bodies
         first = len(self._prepared.loads) - len(bodies)
@@ -197,7 +213,7 @@ class _Frozen:
         }
 
     def outputs(self) -> dict[str, dict[str, int]]:
-        """What can be read, by family and label: places among the states and the recorded columns behind them."""
+        """Return all outputs by family and label, as indices into the states followed by the recorded columns."""
         run, robot = self._prepared.run, self._prepared.model.robot
         columns, beyond = run.columns, run.layout.tracked
         motors = [motor.joint for motor in robot.motors]
@@ -225,8 +241,8 @@ class _Frozen:
         }
 
 
-def _chosen(kind: str, names: Sequence[str], families: dict[str, dict[str, Any]]) -> dict[str, Any]:
-    """The entries that names stand for: all of a family, all of a body or point in it, or one."""
+def _selected(kind: str, names: Sequence[str], families: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """Return the entries that match the names: a whole family, all entries of a body or point, or a single entry."""
     if isinstance(names, str):
         names = (names,)
     chosen: dict[str, Any] = {}
@@ -238,18 +254,18 @@ def _chosen(kind: str, names: Sequence[str], families: dict[str, dict[str, Any]]
             near = difflib.get_close_matches(str(name), every, 1)
             hint = f"; did you mean {near[0]!r}?" if near else ""
             raise ScenarioError(
-                f"no {kind} {brief(name)}{hint}; name a family ({', '.join(families)}) or one of it, such as "
+                f"unknown {kind} {brief(name)}{hint}; use a family ({', '.join(families)}) or a member, such as "
                 f"{next(iter(every))!r}"
             )
     return chosen
 
 
 def _jacobian(function: Callable[[Array], Array], size: int) -> tuple[Array, float]:
-    """Derivative of a function at zero, (m, size), and how far two estimates of its entries differ.
+    """Return the derivative of a function at zero, (m, size), and the largest difference between two estimates.
 
-    Central differences of sixth order at several steps; of each entry the estimate that differs least from those of the
-    steps before and after, much as Ridders does. (:mod:`scipy.differentiate` goes on halving until an entry agrees in
-    relative terms, which one that is zero never does, and ends in its rounding.)
+    Sixth-order central differences at several steps. Each entry uses the estimate that differs least from the estimates
+    of the adjacent steps, similar to Ridders' method. (:mod:`scipy.differentiate` halves until an entry agrees in
+    relative terms, which an entry of zero never does, and ends in rounding errors.)
     """
     estimates = []
     for step in STEPS:
@@ -260,9 +276,9 @@ def _jacobian(function: Callable[[Array], Array], size: int) -> tuple[Array, flo
         estimates.append(np.stack(columns, axis=1))
     every = np.stack(estimates)
     changes = np.abs(np.diff(every, axis=0))
-    # One change may be small by chance.
+    # A single change may be small by chance.
     changes = np.maximum(changes[:-1], changes[1:])
     best = changes.argmin(axis=0)[None]
     slope, change = (np.take_along_axis(table, best, axis=0)[0] for table in (every[1:-1], changes))
-    largest = np.abs(slope).max(axis=1, initial=NOTHING, keepdims=True)
+    largest = np.abs(slope).max(axis=1, initial=ZERO_ROW, keepdims=True)
     return slope, float((change / largest).max(initial=0.0))

@@ -1,14 +1,15 @@
-"""Operator of a stepped simulation: commanded velocities of hand and base become references at every tick.
+"""Operator of a stepped simulation: velocity commands for hand and base become references at every tick.
 
-The hand's target p_d moves with the commanded velocity v, in axes of the world; on a mobile base it moves with that,
-and v is in the base's axes. Each tick of length h takes the joint references at constant rates to q_d⁺, which puts the
-hand at p_d + h v (damped Gauss–Newton, :func:`dynsim.dynamics.inverse_kinematics.follow_path`):
+The hand's target p_d moves with the commanded velocity v in world axes. On a mobile base it moves with the base, and v
+is in base axes. Each tick of length h moves the joint references at constant rates to q_d⁺, which puts the hand at p_d
++ h v (damped Gauss–Newton, :func:`dynsim.dynamics.inverse_kinematics.follow_path`):
 
     q_d(t) = q_d + (q_d⁺ − q_d) (t − t_k)/h
 
-v and the velocities of the base change from tick to tick by no more than their acceleration limits times h, also where
-joint limits restrict the hand (:mod:`dynsim.engine.operator`). Wheels get the rates (V ∓ ω T/2)/r, at which they
-roll without slip.
+v and the base velocities change from tick to tick by at most their acceleration limits times h, even if joint limits
+restrict the hand (:class:`HandGovernor`). Wheels get the rates (V ∓ ω T/2)/r, at which they roll without slip.
+
+The last part are the sensors of a sampled controller: sampling, noise, resolution, delay and hold.
 """
 
 from __future__ import annotations
@@ -35,37 +36,44 @@ from dynsim.model.description import Robot
 from dynsim.record import Record
 from dynsim.scenario.schema import Encoders
 
-# Reference governor of the hand: limits its commanded velocity so that the joints can always stop in time.
+# Reference governor of the hand: limits the commanded velocity so that the joints can always stop in time.
 
 
 HALVINGS = 6
-"""Bisections of λ; each computes one stopping path."""
+"""Bisections of the velocity; each computes one stopping path."""
 ROUNDING = 1e-9
-"""Tolerance of joint rates and accelerations, relative to their limits."""
+"""Tolerance of joint rates and accelerations, relative to their limits; tolerance of sample arrival times [s]."""
 _GOVERNOR_STATE = ("target", "velocity", "joints", "rates", "hindrance", "_path")
 
 
 @dataclass(frozen=True)
 class StoppingPath:
-    """Hand velocities [m/s], hand targets [m] and joint positions of each tick, (T, 3), (T, 3) and (T, c)."""
+    """Hand velocities [m/s], hand targets [m] and joint positions at each tick, (T, 3), (T, 3) and (T, c)."""
 
     velocity: Array
     targets: Array
     joints: Array
 
     def remainder(self) -> StoppingPath:
-        """What is left of it after a tick."""
+        """Return the path after its first tick."""
         return StoppingPath(self.velocity[1:], self.targets[1:], self.joints[1:])
 
 
 class HandGovernor:
-    """Takes a hand along velocities, as far as it can stop in time.
+    """Moves the hand with commanded velocities from which it can stop in time.
 
     Attributes
     ----------
-    target : (3,) of the hand [m]; velocity : (3,) [m/s]; joints : (c,) that have it there [rad or m]
-    rates : (c,) of the joints in the last tick [rad/s or m/s]
-    hindrance : why the hand is slower than it was asked to be; empty where it is not
+    target : (3,) ndarray
+        Target of the hand [m].
+    velocity : (3,) ndarray
+        Velocity of the hand [m/s].
+    joints : (c,) ndarray
+        Joint positions that put the hand at the target [rad or m].
+    rates : (c,) ndarray
+        Joint rates in the last tick [rad/s or m/s].
+    hindrance : str
+        Reason why the hand is slower than commanded; empty if it is not.
     """
 
     def __init__(self, model: Model, options: TeleopOptions, q: Array, axes: Array) -> None:
@@ -83,53 +91,56 @@ class HandGovernor:
         self._path = StoppingPath(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, len(self.joints))))
 
     def begin(self, q: Array, v: Array) -> None:
-        """Begin with the rates that the joints have at coordinates q, (nq,), with rates v, (n,), instead of at rest."""
+        """Start with the joint rates of the state q, (nq,), and v, (n,), instead of at rest."""
         columns = [self._model.joint_names.index(joint) for joint in self._options.joints]
         self.rates = v[columns].copy()
         jacobian = self._model.point_jacobian(*self._model.robot.hand, q)[:, columns]
         self.velocity = self._axes.T @ jacobian @ self.rates
 
     def state(self) -> dict[str, Any]:
-        """What the future depends on: values that are replaced, and never written to."""
+        """Return the state: values that are replaced and never modified."""
         return {name: getattr(self, name) for name in _GOVERNOR_STATE}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go back to a state of this governor."""
+        """Restore a state of this governor."""
         for name, value in state.items():
             setattr(self, name, value)
 
-    def go(self, wish: Array) -> None:
-        """A tick towards a velocity (3,) [m/s] that differs from the last by no more than a h."""
+    def step(self, commanded: Array) -> None:
+        """Advance one tick towards a velocity (3,) [m/s] that differs from the last by at most a h."""
         self.hindrance = ""
-        if not (wish.any() or self.velocity.any()):
+        if not (commanded.any() or self.velocity.any()):
             self.rates = np.zeros_like(self.rates)
             return
         slower = self._path.velocity[0] if len(self._path.velocity) else np.zeros(3)
-        path, why = self._path_to_rest(wish)
+        path, why = self._path_to_rest(commanded)
         if path is None:
             self.hindrance = why
-            path = self._bisected(slower, wish)
+            path = self._bisected(slower, commanded)
         self._take(self._path if path is None else path)
 
-    def _bisected(self, slower: Array, wish: Array) -> StoppingPath | None:
-        """The way from the fastest admissible velocity between those two; None where it is the slower one."""
+    def _bisected(self, slower: Array, commanded: Array) -> StoppingPath | None:
+        """Return the stopping path of the fastest admissible velocity between two velocities; None if that is the
+        slower one.
+        """
         low, high, best = 0.0, 1.0, None
         at_rest, least = not self.velocity.any(), self._options.hand_acceleration / self._options.rate
         for _ in range(HALVINGS):
             part = 0.5 * (low + high)
-            velocity = slower + part * (wish - slower)
+            velocity = slower + part * (commanded - slower)
             path, _ = self._path_to_rest(velocity)
             creeps = at_rest or float(np.linalg.norm(velocity)) < least
-            if path is None or (creeps and not self._gets_easier(velocity)):
+            if path is None or (creeps and not self._slows_down(velocity)):
                 high = part
             else:
                 low, best = part, path
         return best
 
-    def _gets_easier(self, velocity: Array) -> bool:
-        """Joints are slower in the second tick than in the first, as on the way out of a singular posture.
+    def _slows_down(self, velocity: Array) -> bool:
+        """Return whether joints are slower in the second tick than in the first, as on the way out of a singular
+        posture.
 
-        A hand creeps only then. To an edge it would creep by jerks, and so near that it would creep back, too.
+        Only then may the hand creep. Otherwise it would creep jerkily to the edge of the workspace, and back again.
         """
         joints, _ = self._followed(np.array([velocity, velocity]))
         if joints is None:
@@ -138,7 +149,7 @@ class HandGovernor:
         return bool(second < first)
 
     def _take(self, path: StoppingPath) -> None:
-        """The first tick of a way, or rest where none is left."""
+        """Apply the first tick of a path, or stop if the path is empty."""
         if not len(path.velocity):
             self.velocity, self.rates = np.zeros(3), np.zeros_like(self.rates)
             return
@@ -147,7 +158,7 @@ class HandGovernor:
         self._path = path.remainder()
 
     def _path_to_rest(self, velocity: Array) -> tuple[StoppingPath | None, str]:
-        """The way to rest that begins with a velocity, or None and what is against it."""
+        """Return the path to rest that starts with a velocity, or None and the reason."""
         options = self._options
         speed, lost = float(np.linalg.norm(velocity)), options.hand_acceleration / options.rate
         if speed == 0.0:
@@ -167,12 +178,12 @@ class HandGovernor:
         return (None, why) if why else (StoppingPath(velocities, targets, joints), "")
 
     def _first(self, broken: NDArray[np.bool_], reason: str) -> str:
-        """The joint that is the first to break a limit."""
+        """Describe the joint that breaks a limit first."""
         ticks, joints = np.nonzero(broken)
         return f"{self._options.joints[joints[0]]} {reason}" if len(ticks) else ""
 
     def _followed(self, velocities: Array) -> tuple[Array | None, Array]:
-        """Joints (T, c) with the hand where velocities (T, 3) take it, None out of reach; and the targets (T, 3)."""
+        """Return joint positions (T, c) along velocities (T, 3), None if out of reach, and the targets (T, 3)."""
         options = self._options
         targets = self.target + np.cumsum(velocities @ self._axes.T, axis=0) / options.rate
         q, joints, count = self._q.copy(), np.zeros((len(targets), len(self.joints))), len(targets)
@@ -194,9 +205,9 @@ class HandGovernor:
 
 
 Array = NDArray[np.float64]
-# A state at a tick may be a rounding before it [ticks].
+# A state at a tick may be earlier than the tick by rounding [ticks].
 TICK_SLACK = 1e-9
-# Part of the commanded way that may be lost without a warning: limits of joints make starts a little slower.
+# Fraction of the commanded distance that may be lost without a warning: joint limits slow down starts slightly.
 MISSED = 0.01
 _STATE = ("ticks", "_moving", "_angles", "_base_velocity", "_free", "_commanded", "_missed")
 
@@ -237,20 +248,20 @@ class Referenced(Protocol):
 
 
 class OperatorPath:
-    """Where the hand was asked to be: straight lines between the ticks."""
+    """Commanded path of the hand: straight lines between the ticks."""
 
     def __init__(self, rate: float, start: Array, time: float = 0.0) -> None:
         self.rate, self.time = rate, time
         self.points = [start.copy()]
 
     def position(self, t: NDArray[np.float64]) -> Array:
-        """At times t [s], (T,) → (T, 3) [m]."""
+        """Return positions at times t [s], (T,) → (T, 3) [m]."""
         points, ticks = np.array(self.points), self.time + np.arange(len(self.points)) / self.rate
         return np.stack([np.interp(t, ticks, column) for column in points.T], axis=1)
 
 
 class Operator:
-    """Called at the ticks of a simulation, from the scenario's start or from a state, whose posture it takes over."""
+    """Tick callback of a simulation; starts from the scenario's start or from the posture of a state."""
 
     def __init__(
         self, model: Model, options: TeleopOptions, source: VelocitySource | None = None, state: State | None = None
@@ -259,10 +270,10 @@ class Operator:
         q, time = (robot.initial, 0.0) if state is None else (np.ravel(state.q), state.time)
         self.rate, self.period = options.rate, 1.0 / options.rate
         self.options, self.source = options, options.script if source is None else source
-        # At a state references are still those of the scenario's start: the first tick writes them.
+        # When starting from a state, references are still at the scenario's start: the first tick writes them.
         self.ticks, self._moving = math.floor(time * self.rate + TICK_SLACK), state is not None
         self._model, self._start = model, np.array(model.point_position(*robot.hand, q), dtype=np.float64)
-        # On a base that drives the target is in the axes of the base, where it has no path in the world.
+        # On a moving base the target is in base axes and has no path in the world.
         self.path = OperatorPath(options.rate, self._start, time) if robot.base is None and options.joints else None
         self._angles, axes = np.zeros(2), np.eye(3)
         self._base_velocity = np.zeros(VELOCITIES)[BASE]
@@ -273,15 +284,15 @@ class Operator:
             c, s = math.cos(heading), math.sin(heading)
             axes = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         self._hand = HandGovernor(model, options, q, axes) if options.joints else None
-        # What the hand would do without limits of its joints and its reach: its velocity, and the way that this is [m].
+        # Velocity of the hand without joint and reach limits, and the commanded distance [m].
         self._free, self._commanded = np.zeros(3), 0.0
-        # How much of the way it has not gone, and since when, by what was in the way.
+        # Distance lost [m] and time of the first loss [s], by reason.
         self._missed: dict[str, tuple[float, float]] = {}
         if state is not None:
-            self._go_on(q, np.ravel(state.v))
+            self._continue_motion(q, np.ravel(state.v))
 
-    def _go_on(self, q: Array, v: Array) -> None:
-        """Let references begin with the rates that joints and wheels have, (n,): at rest their drives would brake."""
+    def _continue_motion(self, q: Array, v: Array) -> None:
+        """Start references with the present joint and wheel rates, (n,); at zero rates the drives would brake."""
         if self._hand is not None:
             self._hand.begin(q, v)
             self._free = self._hand.velocity.copy()
@@ -292,33 +303,32 @@ class Operator:
 
     @property
     def target(self) -> Array:
-        """Where the hand is to be, (3,) [m]."""
+        """Target of the hand, (3,) [m]."""
         return self._start if self._hand is None else self._hand.target
 
     @property
     def hindrance(self) -> str:
-        """Why the hand is slower than it was asked to be; empty where it is not."""
+        """Reason why the hand is slower than commanded; empty if it is not."""
         return "" if self._hand is None else self._hand.hindrance
 
-    def remembered(self) -> dict[str, Any]:
-        """What the future depends on: values that are replaced, and never written to."""
+    def saved_state(self) -> dict[str, Any]:
+        """Return the state: values that are replaced and never modified."""
         points = None if self.path is None else list(self.path.points)
         hand = None if self._hand is None else self._hand.state()
         return {name: getattr(self, name) for name in _STATE} | {"points": points, "hand": hand}
 
     def add_to(self, record: Record) -> None:
-        """Add a warning if the hand has not moved as far as it was commanded; the remainder is in the references."""
+        """Add a warning if the hand has moved less than commanded; its actual motion is in the references."""
         missed = sum(distance for distance, _ in self._missed.values())
         if missed > MISSED * self._commanded:
             reason, (_, since) = max(self._missed.items(), key=lambda item: item[1][0])
             record.summary["warnings"].append(
-                f"operator: {missed:.3g} m of the {self._commanded:.3g} m that the hand was commanded to go were not "
-                f"carried out, mostly from t = {since:.4g} s on ({reason}); its target waited, and its errors are "
-                "against that"
+                f"operator: the hand did not execute {missed:.3g} m of the commanded {self._commanded:.3g} m, mostly "
+                f"from t = {since:.4g} s on ({reason}); its target waited, and errors refer to the waiting target"
             )
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go back to a state of this operator."""
+        """Restore a state of this operator."""
         for name in _STATE:
             setattr(self, name, state[name])
         if self.path is not None:
@@ -327,7 +337,7 @@ class Operator:
             self._hand.restore(state["hand"])
 
     def __call__(self, simulation: Referenced) -> None:
-        """Rewrite the references for the time up to the next tick."""
+        """Rewrite the references for the interval up to the next tick."""
         wanted = self.source.read(self.ticks)
         self.ticks += 1
         lines = self._joint_lines(wanted[HAND]) | self._wheel_lines(wanted[BASE])
@@ -337,55 +347,54 @@ class Operator:
         self._moving = moving
 
     def _joint_lines(self, wanted: Array) -> dict[str, tuple[float, float]]:
-        """Position and rate of each joint that follows the hand."""
+        """Return position and rate of each joint that follows the hand."""
         hand, options = self._hand, self.options
         if hand is None:
             return {}
         begin, change = hand.joints, options.hand_acceleration / options.rate
-        hand.go(_eased(hand.velocity, wanted, change))
-        self._free = _eased(self._free, wanted, change)
+        hand.step(_limited_change(hand.velocity, wanted, change))
+        self._free = _limited_change(self._free, wanted, change)
         self._count(hand)
         if self.path is not None:
             self.path.points.append(hand.target.copy())
         return dict(zip(options.joints, zip(begin.tolist(), hand.rates.tolist(), strict=True), strict=True))
 
     def _count(self, hand: HandGovernor) -> None:
-        """Add a tick to the commanded way, and to what of it was not gone."""
+        """Add a tick to the commanded distance and to the lost distance."""
         self._commanded += float(np.linalg.norm(self._free)) / self.rate
         missed = float(np.linalg.norm(self._free - hand.velocity)) / self.rate
         if missed > 0.0:
-            # Without a hindrance it is still catching up after the last one.
+            # Without a hindrance the hand is still catching up after the last one.
             reason = hand.hindrance or next(reversed(self._missed), "limits")
             before, since = self._missed.get(reason, (0.0, (self.ticks - 1) / self.rate))
-            # The latest last.
+            # Keep the latest reason last.
             others = {key: value for key, value in self._missed.items() if key != reason}
             self._missed = others | {reason: (before + missed, since)}
 
     def _wheel_lines(self, wanted: Array) -> dict[str, tuple[float, float]]:
-        """Position and rate of each wheel of the base."""
+        """Return position and rate of each wheel of the base."""
         base = self._model.robot.base
         if base is None or not set(base.wheels) <= {motor.joint for motor in self._model.robot.motors}:
             return {}
         most = np.array(self.options.base_acceleration) / self.options.rate
         before = self._base_velocity
-        self._base_velocity = np.array([_eased(before[k : k + 1], wanted[k : k + 1], most[k])[0] for k in range(2)])
+        self._base_velocity = np.array(
+            [_limited_change(before[k : k + 1], wanted[k : k + 1], most[k])[0] for k in range(2)]
+        )
         begin, rates = self._angles.copy(), wheel_angles(base, self._base_velocity[None])[0]
         self._angles = begin + rates / self.options.rate
         return dict(zip(base.wheels, zip(begin.tolist(), rates.tolist(), strict=True), strict=True))
 
 
-def _eased(velocity: Array, wanted: Array, allowed: float) -> Array:
-    """A velocity that has come as near to another as the change that is allowed takes it."""
+def _limited_change(velocity: Array, wanted: Array, allowed: float) -> Array:
+    """Return a velocity moved towards another by at most the allowed change."""
     change = wanted - velocity
     size = float(np.linalg.norm(change))
-    # What is reached is exact: a robot that is to rest rests.
+    # Exact at the end: a robot that has to stop must have zero velocity.
     return wanted.copy() if size <= allowed else velocity + allowed / size * change
 
 
 # Sensors of a sampled controller: sampling, noise, resolution, delay and hold.
-
-
-# A sample that arrives this little after a tick is available at that tick [s].
 
 
 class Stateful(Protocol):
@@ -398,17 +407,24 @@ class Stateful(Protocol):
 
 
 class SampledSensor:
-    """Called when a sample is due; :meth:`value` is the last one that has arrived.
+    """Sensor callback, called when a sample is due; :meth:`value` returns the last sample that has arrived.
 
-    A sample of x is x + σ ξ with ξ standard normal, rounded to the resolution ρ where there is one: ρ round(x/ρ).
+    A sample of x is x + σ ξ with ξ standard normal, rounded to the resolution ρ if it is positive: ρ round(x/ρ).
 
     Parameters
     ----------
-    read : the true value of a state, (k,)
-    period : of the samples [s]
-    delay : from a sample to its arrival [s]
-    noise, resolution : (k,) standard deviations σ, and ρ, 0 for none
-    seed : of the noise
+    read : callable
+        Returns the true value (k,) of a state.
+    period : float
+        Sampling period [s].
+    delay : float
+        Delay between a sample and its arrival [s].
+    noise : (k,) ndarray
+        Standard deviations σ.
+    resolution : (k,) ndarray
+        Resolutions ρ; 0 for no rounding.
+    seed : list of int
+        Seed of the noise.
     """
 
     def __init__(
@@ -433,42 +449,50 @@ class SampledSensor:
         x = self._read(state) + self._noise * self._random.standard_normal(len(self._noise))
         rounded = self._resolution > 0.0
         x[rounded] = self._resolution[rounded] * np.rint(x[rounded] / self._resolution[rounded])
-        # The first is known from the start.
+        # The first sample is available from the start.
         delay = self._delay if self._samples else 0.0
         self._samples.append((state.time + delay, x))
 
     def value(self, time: float) -> Array:
-        """The last sample that has arrived at a time [s], (k,)."""
+        """Return the last sample that has arrived at a time [s], (k,)."""
         while len(self._samples) > 1 and self._samples[1][0] <= time + ROUNDING:
             self._before = self._samples.popleft()[1]
         return self._samples[0][1]
 
     def rate(self, time: float) -> Array:
-        """By what the last two samples that have arrived differ, over the period, (k,); zero before there are two."""
+        """Return the difference of the last two samples over the period, (k,); zero with fewer than two samples."""
         value = self.value(time)
         return np.zeros_like(value) if self._before is None else (value - self._before) / self.period
 
-    def remembered(self) -> dict[str, Any]:
-        """What the future depends on."""
+    def saved_state(self) -> dict[str, Any]:
+        """Return the state of the sensor."""
         samples = list(self._samples)
         return {"samples": samples, "before": self._before, "random": self._random.bit_generator.state}
 
     def restore(self, kept: dict[str, Any]) -> None:
-        """Go back to what :meth:`remembered` gave."""
+        """Restore the result of :meth:`saved_state`."""
         self._samples, self._before = deque(kept["samples"]), kept["before"]
         self._random.bit_generator.state = kept["random"]
 
 
 class EncodedCommands:
-    """A sampled controller that sees its joints through encoders: at its ticks it takes all commands by what they tell.
+    """Sampled controller that reads its joints through encoders and computes all commands at its ticks.
 
-    q̂ is the last sample that has arrived and v̂ the difference to the one before it over their period, as servo drives
-    make it: resolution ρ and period T of the encoders give steps of ρ/T in v̂.
+    q̂ is the last sample that has arrived. v̂ is its difference to the previous sample over their period, as in servo
+    drives: resolution ρ and period T of the encoders give steps of ρ/T in v̂.
 
     Parameters
     ----------
-    take : takes the commands at measured positions and rates of the motors' joints, (na,) [rad or m, rad/s or m/s]
-    period : of the controller [s]
+    encoders : Encoders
+        Encoder configuration.
+    seed : int
+        Seed of the noise.
+    robot : Robot
+        Robot with motors.
+    period : float
+        Controller period [s].
+    take : callable
+        Computes the commands from measured positions and rates of the motors' joints, (na,) [rad or m, rad/s or m/s].
     """
 
     def __init__(
@@ -494,26 +518,26 @@ class EncodedCommands:
         self._measured: list[tuple[float, Array]] = []
 
     def __call__(self, simulation: Stateful) -> None:
-        """A tick of the controller."""
+        """Run one controller tick."""
         time = simulation.state.time
         measured = self.sensor.value(time)
         self._measured.append((time, measured))
         self._take(measured, self.sensor.rate(time))
 
-    def remembered(self) -> dict[str, Any]:
-        """What the future depends on, and what was told."""
-        return {"sensor": self.sensor.remembered(), "measured": list(self._measured)}
+    def saved_state(self) -> dict[str, Any]:
+        """Return the state of the sensor and the measurements so far."""
+        return {"sensor": self.sensor.saved_state(), "measured": list(self._measured)}
 
     def restore(self, kept: dict[str, Any]) -> None:
-        """Go back to what :meth:`remembered` gave."""
+        """Restore the result of :meth:`saved_state`."""
         self.sensor.restore(kept["sensor"])
         self._measured = list(kept["measured"])
 
     def add_to(self, record: Record) -> None:
-        """What the controller was told, held from tick to tick."""
+        """Add the measured joint positions, held from tick to tick."""
         times = np.array([time for time, _ in self._measured]) - ROUNDING
         rows = np.searchsorted(times, record.time, side="right") - 1
-        # A run may have stopped before its first tick.
+        # The run may have stopped before its first tick.
         readings = np.reshape([positions for _, positions in self._measured], (len(times), len(self._joints)))
-        text = "joints as the controller's encoders tell them"
+        text = "joint positions measured by the controller's encoders"
         record.add("q_measured", readings[rows], self._unit, labels=self._joints, description=text)

@@ -1,4 +1,4 @@
-"""Size check of a record, and exceptions of incomplete runs, common to both engines."""
+"""Size check of a record, and exceptions of incomplete runs, for both engines."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from dynsim.scenario import Scenario
 
 
 def check_size(scenario: Scenario, rows: int, columns: int) -> None:
-    """Refuse a record of more than ``record.size_limit_GB``.
+    """Raise an error if a record is larger than ``record.size_limit_GB``.
 
     Raises
     ------
     ScenarioError
-        With the recording rate that would fit.
+        If the record is too large; the message contains the recording rate that would fit.
     """
     rate, limit = scenario.record.rate_hz, scenario.record.size_limit_GB
     size = 8e-9 * rows * columns
@@ -27,21 +27,21 @@ def check_size(scenario: Scenario, rows: int, columns: int) -> None:
 
 
 def interrupted(scenario: Scenario, time: float, state: dict[str, Any]) -> SimulationInterrupted:
-    """The stop of a run that Ctrl-C has ended at a time [s]."""
+    """Return the exception for a run that Ctrl-C ended at a time [s]."""
     return SimulationInterrupted(
         f"interrupted at t = {time:.3f} s of {scenario.duration_s:g} s", time=time, state=state
     )
 
 
 def mark_stopped(stop: SimulationStopped, record: Record) -> None:
-    """Mark the record as incomplete, and say why in its summary and provenance."""
+    """Mark the record as incomplete and add the reason to its summary and provenance."""
     record.complete = False
     record.summary["warnings"].append(f"incomplete: {stop}")
     record.provenance["stopped"] = {"time_s": stop.time, "reason": str(stop), "kind": stop.kind, "state": stop.state}
 
 
 def raise_stopped(stop: SimulationStopped, record: Record) -> NoReturn:
-    """Mark the record as incomplete, unless it is, and raise ``stop`` with it."""
+    """Mark the record as incomplete, unless it is already marked, and raise ``stop`` with it."""
     if "stopped" not in record.provenance:
         mark_stopped(stop, record)
     stop.record = record

@@ -1,4 +1,4 @@
-"""Preparation of a dynamics run: the scenario compiled to kernel arrays, and the checks before the first step."""
+"""Preparation of a dynamics run: choice of the integration method, kernel arrays, and checks before the first step."""
 
 from __future__ import annotations
 
@@ -61,59 +61,60 @@ from dynsim.system.memo import Memo, recall, remembering
 if TYPE_CHECKING:
     from dynsim.engine.snake_control import Phase
 
-# Choice of the integration method (``method: auto``) from the fastest rate of the system at its start.
+# Choice of the integration method (``method: auto``) from the fastest rate of the system at the start.
 
 
 AUTO = "auto"
 PACE = 0.02
-"""Smallest step that the accuracy of an arm's motion is assumed to need [s]."""
+"""Smallest step assumed necessary for an accurate arm motion [s]."""
 TOUCHING = 1e-6
-"""A contact with a gap below this is closed at the start [m]."""
+"""A contact with a smaller gap is closed at the start [m]."""
 SMALL = 36
-"""Joints up to which Jacobians of RADAU5 cost less than half of its steps."""
+"""Number of joints up to which the Jacobians of RADAU5 cost less than half of its steps."""
 UNDAMPED, UNDAMPED_RTOL, LEAST_RTOL = (0.03, 0.1), 3e-9, 1e-12
-"""Where nothing damps the errors of steps, the tolerance of steps is this one, but within these shares of rtol; shares
-are taken down to the last number."""
+"""Step tolerance if nothing damps the errors of steps: UNDAMPED_RTOL, but within these fractions of rtol; fractions are
+applied down to LEAST_RTOL."""
 
 DENSE = 300
-"""Size of matrices up to which all eigenvalues are found at once; of larger ones only the largest."""
+"""Matrix size up to which all eigenvalues are computed; for larger matrices only the largest."""
 
 
 class Choice(NamedTuple):
-    """A method, and why."""
+    """An integration method and the reason for its choice."""
 
     method: str
     reason: str
     sharper: float = 1.0
-    """Tolerances of the steps as a share of the scenario's."""
+    """Step tolerances as a fraction of the scenario tolerances."""
 
 
 def choose(
     options: Integrator, model: Model, contacts: Sequence[Contact], control: JointControl, drives: ka.DriveArrays
 ) -> Choice:
-    """The method that ``integrator.method`` names, or for ``auto`` the one that suits the system."""
+    """Return the method in ``integrator.method``, or for ``auto`` a method that suits the system."""
     if options.method != AUTO:
-        return Choice(options.method, "named in the scenario")
+        return Choice(options.method, "set in the scenario")
     pace = min(PACE, control.sample_time or PACE, options.step_max_s or PACE)
     rate = fastest_rate(model, contacts, drives)
     reason = f"fastest rate {rate:.3g} 1/s, steps of {1e3 * pace:.3g} ms"
-    if rate * pace > worth_it(model.n):
-        return Choice("radau5", f"{reason}: an implicit method is not held by it")
+    if rate * pace > implicit_threshold(model.n):
+        return Choice("radau5", f"{reason}: an implicit method is not limited by this rate")
     if rate == 0.0:
         sharper = min(max(UNDAMPED_RTOL / options.rtol, UNDAMPED[0]), UNDAMPED[1])
         sharper = sharper if options.rtol * sharper >= LEAST_RTOL else 1.0
-        reason = f"no drive and no loss damps errors: {sharper:.2g} of the tolerances keeps the energy"
+        reason = f"no drive and no loss damps errors: {sharper:.2g} times the tolerances conserves the energy"
         if model.n <= SMALL and any(contact.friction_at_rest > 0.0 for contact in contacts):
-            return Choice("radau5", f"{reason}; the implicit method follows friction of slow slip", sharper)
+            return Choice("radau5", f"{reason}; the implicit method resolves friction at slow slip", sharper)
         return Choice("dopri5", reason, sharper)
-    return Choice("dopri5", f"{reason}: an explicit method takes them")
+    return Choice("dopri5", f"{reason}: an explicit method can use such steps")
 
 
-def worth_it(n: int) -> float:
-    """h |λ| above which a step of RADAU5 costs less than the steps of DOPRI5 that it replaces.
+def implicit_threshold(n: int) -> float:
+    """Return h |λ| above which a RADAU5 step costs less than the DOPRI5 steps that it replaces.
 
-    Those take six right-hand sides for each 3.3/|λ|. It takes about twenty, and at every eleventh step a Jacobian of
-    2 n columns and factors of n × n matrices: n³ multiplications in the time of 100 n right-hand sides of a link.
+    DOPRI5 evaluates six right-hand sides for each 3.3/|λ|. RADAU5 evaluates about twenty, and at every eleventh step a
+    Jacobian of 2 n columns and factors of n × n matrices: n³ multiplications take as long as 100 n right-hand sides of
+    a link.
     """
     return (20.0 + (2.0 * n + 0.03 * n**2) / 11.0) * 3.3 / 6.0
 
@@ -121,8 +122,8 @@ def worth_it(n: int) -> float:
 class DriveSlopes(NamedTuple):
     """Derivatives of joint torques τ and current rates di/dt by q, v and i, at rest.
 
-    Shapes: torques (n, n), (n, n) and (n, circuits); rates of currents (circuits, n), (circuits, n) and (circuits,
-    circuits). Commands that are held do not follow the state.
+    Shapes: torques (n, n), (n, n) and (n, circuits); current rates (circuits, n), (circuits, n) and (circuits,
+    circuits). Held commands do not depend on the state.
     """
 
     torque_q: Array
@@ -134,7 +135,7 @@ class DriveSlopes(NamedTuple):
 
 
 def drive_slopes(model: Model, drives: ka.DriveArrays) -> DriveSlopes:
-    """Return the derivatives of what drives and the damping of joints do."""
+    """Return the derivatives of the torques and currents of drives and joint damping."""
     n, circuits = model.n, int(model.robot.circuits)
     torque_q, torque_v, torque_i = np.zeros((n, n)), -np.diag(model.damping), np.zeros((n, circuits))
     rate_q, rate_v, rate_i = np.zeros((circuits, n)), np.zeros((circuits, n)), np.zeros((circuits, circuits))
@@ -151,7 +152,7 @@ def drive_slopes(model: Model, drives: ka.DriveArrays) -> DriveSlopes:
 
 
 def fastest_rate(model: Model, contacts: Sequence[Contact], drives: ka.DriveArrays) -> float:
-    """Largest |λ| of drives and losses at the start, at rest [1/s]."""
+    """Return the largest |λ| of drives and losses at the start, at rest [1/s]."""
     n, q = model.n, model.robot.initial
     torque_q, torque_v, torque_i, rate_q, rate_v, rate_i = drive_slopes(model, drives)
     if not (torque_q.any() or torque_v.any() or torque_i.any()):
@@ -176,32 +177,32 @@ def fastest_rate(model: Model, contacts: Sequence[Contact], drives: ka.DriveArra
 def _spectral_radius(A: Array) -> float:
     if len(A) <= DENSE:
         return float(np.abs(np.linalg.eigvals(A)).max())
-    from scipy.sparse.linalg import eigs  # here, because short chains do without
+    from scipy.sparse.linalg import eigs  # imported here because short chains do not need it
 
     start = np.random.default_rng(0).normal(size=len(A))
     return float(np.abs(eigs(A, k=1, v0=start, tol=1e-2, return_eigenvectors=False)[0]))
 
 
 def _held(model: Model, contacts: Sequence[Contact], q: Array) -> Array:
-    """Rows of what does not move at the start, (p, n): contacts that touch, along their normals, and couplings."""
+    """Return the rows of constraints active at the start, (p, n): normals of touching contacts, and couplings."""
     gaps, rates = gaps_and_rates(model, contacts, q)
     return np.vstack([rates[np.abs(gaps) < TOUCHING], model.coupling_rows])
 
 
 log = logging.getLogger(__name__)
 
-# A run is refused if its estimated time exceeds the wall limit by this factor: estimates of small systems are too long
-# by up to that factor.
-CLEARLY = 10.0
+# A run is refused if its estimated time exceeds the wall-clock limit by this factor: the estimates for small systems
+# are too long by up to this factor.
+WORK_MARGIN = 10.0
 # Maximum number of explicit steps that the electrical poles may require: a quarter of an hour for ten joints.
 STEPS_LIMIT = 2e8
-# A run whose last MOST_TRIALS steps advanced by no more than this makes no progress, unless it is short [s]: it has met
-# events that are closer together than the steps of any stiff robot.
-STANDS = 1e-5
-# Slip slower than this has no defined direction, however tight the tolerances: the rate at which friction turns slip is
-# proportional to its inverse, which limits the steps; ten milliseconds of such slip are a nanometre [m/s].
+# A run whose last MOST_TRIALS steps advanced by no more than this makes no progress, unless it is short [s]: its events
+# are closer together than the steps of any stiff robot.
+STALLED_S = 1e-5
+# Slower slip has no defined direction, however tight the tolerances: the rate at which friction turns slip is inversely
+# proportional to it and limits the steps; ten milliseconds of such slip are a nanometre [m/s].
 SLOWEST = 1e-7
-# More steps than any run takes.
+# More steps than any run needs.
 _EVERY_STEP = 1 << 62
 
 
@@ -220,7 +221,7 @@ class Prepared:
     choice: Choice
     balance: Balance | None = None
     dry: Sequence[DryFriction] = ()
-    # Contacts on their surfaces that are left out because of brakes: name and time since when [s].
+    # Contacts on their surfaces that are left out because of brakes: name and start time [s].
     behind_brakes: Mapping[str, float] = field(default_factory=dict)
 
     @property
@@ -229,7 +230,7 @@ class Prepared:
         system, stepped = self.system, self.run.method == ki.TIME_STEPPING
         parts = [self.choice.method]
         if self.contacts or self.stops:
-            parts.append("contacts that are glued" if system.unilateral is None else "contacts that open and close")
+            parts.append("bilateral contacts" if system.unilateral is None else "unilateral contacts")
         extras = {
             "spheres, boxes or height fields": system.shapes is not None and not stepped,
             "the dense system": system.dense is not None,
@@ -247,17 +248,26 @@ def prepare(
     motors: Sequence[Drive] | None = None,
     starts: bool = True,
 ) -> Prepared:
-    """Compile a scenario; references that take long report to ``progress``.
+    """Compile a scenario to kernel arrays; slow preparation of references reports to ``progress``.
 
     A caller that changes tables of a run must prepare it within a separate memo.
 
     Parameters
     ----------
-    pushable : add an external wrench on every body, zero at first, after the loads of the scenario
-    times : sample times [s]; default: the sample times of the whole record
-    end : end of the run [s]; default: ``duration_s`` of the scenario
-    motors : motors to use instead of the motors of the plant
-    starts : False for a run from a state: the caller checks its posture instead of the initial posture of the scenario
+    scenario : Scenario
+        Scenario with a dynamics plant.
+    progress : Progress, optional
+        Progress callback.
+    pushable : bool, optional
+        If True, add an external wrench on every body, initially zero, after the loads of the scenario.
+    times : (T,) ndarray, optional
+        Sample times [s]; default: the sample times of the whole record.
+    end : float, optional
+        End of the run [s]; default: ``duration_s`` of the scenario.
+    motors : sequence of Drive, optional
+        Motors to use instead of the motors of the plant.
+    starts : bool, optional
+        False for a run from a state: the caller checks its posture instead of the scenario's initial posture.
 
     Raises
     ------
@@ -359,7 +369,7 @@ def prepare(
         atol=options.absolute_tolerance * choice.sharper,
         ticks=_ticks(control),
         breaks=_breaks(loads, control, method, options),
-        # Callers that advance a run step by step may leave its end open.
+        # Callers that step a run may leave its end open.
         least_progress=_least_progress(min(scenario.duration_s, end or np.inf)),
         events=guards(robot, contacts if real else (), stops, dry),
         support=compile_support(robot),
@@ -370,15 +380,15 @@ def prepare(
 
 
 def at_start(scenario: Scenario) -> tuple[Robot, list[Contact], JointControl | None]:
-    """The robot in the posture in which its run begins, its contacts, and a snake's control (None: another robot)."""
+    """Return the robot in its start posture, its contacts, and the control of a snake (None for other robots)."""
     described, contacts = build.robot_and_contacts(scenario)
     if type(described) is not Robot:
         # Import the modules of the snake only for a snake.
         from dynsim.compile.snake_tree import SnakeTree
-        from dynsim.engine.snake_control import begun
+        from dynsim.engine.snake_control import snake_start
 
         if isinstance(described, SnakeTree):
-            robot, control = begun(scenario, described, follow_lines)
+            robot, control = snake_start(scenario, described, follow_lines)
             return robot, contacts, control
     return described, contacts, None
 
@@ -390,22 +400,23 @@ def _check_sensors(scenario: Scenario, control: JointControl) -> None:
         return
     if sensors.motion_capture is not None:
         raise ModelError(
-            "sensors.motion_capture tells a snake's controller where its head is; arms have sensors.encoders alone; "
-            "remove it",
+            "sensors.motion_capture is for the snake's controller; remove it (arms use sensors.encoders)",
             keys=("sensors", "motion_capture"),
         )
     if sensors.encoders is None or control.sample_time is not None:
         return
-    why = "it follows the joints continuously; give controller.sample_time_s, or remove the encoders"
+    why = "this controller is continuous; set controller.sample_time_s or remove the encoders"
     raise ModelError(
-        "sensors.encoders are read by a sampled controller: "
-        + ("there is no controller; remove them" if scenario.controller is None else why),
+        "sensors.encoders requires a sampled controller: "
+        + ("this scenario has no controller; remove it" if scenario.controller is None else why),
         keys=("sensors", "encoders"),
     )
 
 
 def follow_lines(scenario: Scenario, q: Array, phases: Sequence[Phase]) -> Array:
-    """Return the coordinates (nq,) that a robot reaches from rest at q when servos follow lines; see :data:`Phase`.
+    """Return the coordinates (nq,) that a robot reaches from rest at q when servos follow linear references.
+
+    ``phases`` is explained at :data:`dynsim.engine.snake_control.Phase`.
 
     Raises
     ------
@@ -431,7 +442,9 @@ def follow_lines(scenario: Scenario, q: Array, phases: Sequence[Phase]) -> Array
             driver.advance(system, prepared.workspace, run, _EVERY_STEP)
             run.count[ki.LOGGED] = 0
         if run.count[ki.STATUS] != ki.FINISHED:
-            raise SimulationStopped("the robot does not come to rest before the run begins: it diverges")
+            raise SimulationStopped(
+                "the robot does not settle before the run starts (it diverges); check the gains and the initial posture"
+            )
     return run.y[block(run.layout, "q")].copy()
 
 
@@ -447,7 +460,7 @@ def _ticks(control: JointControl) -> tuple[np.ndarray, np.ndarray] | None:
 def guards(
     robot: Robot, contacts: Sequence[Contact], stops: Sequence[JointStop], dry: Sequence[DryFriction] = ()
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the events that a run watches for by default, and their actions: base events, then unilateral contacts.
+    """Return the events that a run watches for by default, and their actions: base first, then unilateral contacts.
 
     A mobile base has an event when its margin falls through zero; for contacts, stops and dry friction see
     dynsim.integrators.contacts.events.
@@ -463,23 +476,26 @@ def guards(
     if not rows:
         return None
     event = np.zeros((len(rows), ki.EVENT_SIZE))
-    # Every value counts as positive before the run: an event that begins beyond zero happens at once.
+    # Every value counts as positive before the run: an event that starts beyond zero occurs immediately.
     event[:, ki.SIDE] = 1.0
     return event, np.array(rows)
 
 
 def slow_slip(atol: float) -> float:
-    """Return the speed below which the direction of slip is integration noise and turns as fast as at it [m/s]."""
+    """Return the slip speed below which the slip direction is integration noise [m/s].
+
+    Below this speed, friction turns slip only as fast as at this speed.
+    """
     return max(1000.0 * atol, SLOWEST)
 
 
 def creep(atol: float) -> float:
     """Return the rate below which a joint with dry friction may be at rest [rad/s or m/s].
 
-    A joint that contacts hold, and that has no row, is known to move by its rate only. Until the rate exceeds this
-    limit its friction is the constant friction of rest, not all of it: the energy error is proportional to the limit,
-    two to three times it per turnover when a surface that turns begins to move the joint. At 100 atol, rtol by
-    default, that is a few rtol. The limit is bounded from below by the rate that projections leave in rows that hold.
+    If contacts block a joint that has no row, only its rate shows that it moves. Until the rate exceeds this limit, its
+    friction is the constant friction of rest instead of the full friction. The energy error is proportional to the
+    limit: two to three times the limit per turnover when a turning surface starts to move the joint. At 100 atol, rtol
+    by default, this is a few rtol. The lower bound is the rate that projections leave in active rows.
     """
     return max(100.0 * atol, RATE_TOLERANCE)
 
@@ -487,15 +503,15 @@ def creep(atol: float) -> float:
 def _least_progress(duration: float) -> float:
     """Return the time by which MOST_TRIALS steps must advance [s]."""
     least = ki.PROGRESS * duration
-    return max(least, min(10.0 * least, STANDS))
+    return max(least, min(10.0 * least, STALLED_S))
 
 
 def _longest_step(method: int, *, watched: bool) -> float:
-    """Return the longest step, of implicit methods where forces of contacts, stops or dry friction are watched [s].
+    """Return the longest step [s]; limited for implicit methods if contacts, stops or dry friction are watched.
 
-    While everything rests, nothing limits the steps, and a force could fall below zero and rise again within one of
-    them. Knots of references are as far apart as this. An implicit method stops at their bends, but a force may pass
-    its bound between two of them, which changes the motion.
+    While everything is at rest, nothing limits the steps, and a force could fall below zero and rise again within a
+    step. Knots of references are this far apart. An implicit method stops at their bends, but a force may pass its
+    bound between two of them, which changes the motion.
     """
     table = by_number(method)
     return PACE if table.explicit or (watched and table.adaptive) else np.inf
@@ -504,7 +520,7 @@ def _longest_step(method: int, *, watched: bool) -> float:
 def _breaks(loads: Sequence[Load], control: JointControl, method: int, options: Integrator) -> np.ndarray:
     """Return the times at which loads jump or bend [s]: a step across them could miss a short push completely.
 
-    For an implicit method also the times at which references bend: their knots are closer than its steps are long.
+    For an implicit method, include the times at which references bend: their knots are closer than its steps are long.
     """
     times = [load.knots for load in loads if len(load.coefficients) and (not load.hold or _varies(load))]
     if by_number(method).adaptive and not by_number(method).explicit:
@@ -518,7 +534,7 @@ def _varies(load: Load) -> bool:
 
 
 def _push(body: str) -> Load:
-    """Return a wrench on a body that only the caller writes."""
+    """Return a wrench on a body that only the caller sets."""
     return Load(body, body, np.zeros(3), False, np.zeros(1), np.zeros((0, 6, 4)), False)
 
 
@@ -531,7 +547,7 @@ def sample_times(scenario: Scenario, layout: StateLayout, columns: OutputLayout,
 
 
 def _check_stiffness(method: str, duration: float, robot: Robot) -> None:
-    """Raise an error for an explicit method if the poles R/L of the circuits alone require too many steps."""
+    """Raise an error for an explicit method if the poles R/L of the circuits require too many steps."""
     circuits = [motor for motor in robot.motors if isinstance(motor, Motor)]
     if not METHODS[method].explicit or not circuits:
         return
@@ -540,17 +556,16 @@ def _check_stiffness(method: str, duration: float, robot: Robot) -> None:
     steps = duration * pole / METHODS[method].stability
     if steps > STEPS_LIMIT:
         raise ScenarioError(
-            f"{motor.joint}: R/L = {pole:.2g} 1/s holds integrator.method {method} to about {steps:.1g} steps for "
-            f"{duration:g} s; take integrator.method: auto or radau5, or a larger inductance than "
-            f"{motor.inductance:g} H"
+            f"{motor.joint}: R/L = {pole:.2g} 1/s requires about {steps:.1g} steps of integrator.method {method} for "
+            f"{duration:g} s; use integrator.method: auto or radau5, or an inductance above {motor.inductance:g} H"
         )
 
 
 def right_hand_side(n: int, p: int, *, dense: bool) -> float:
-    """Return the estimated time of a right-hand side of n joints with p rows [s].
+    """Return the estimated time of one right-hand side of n joints with p rows [s].
 
     Measured from 10 to 1000 links with up to 250 contacts, accurate to a factor of two: the sweeps, the p × p system of
-    chains as long as n, its elimination, twice that for dependent rows (p > n always are).
+    chains as long as n, its elimination, twice that for dependent rows (p > n implies dependent rows).
     """
     seconds = 1e-7 * n + 4e-10 * n * p**2 + (4e-10 if p > n else 2e-10) * p**3
     return seconds + (3e-10 * (n + p) ** 3 if dense else 0.0)
@@ -559,14 +574,15 @@ def right_hand_side(n: int, p: int, *, dense: bool) -> float:
 def _check_work(scenario: Scenario, n: int, p: int, method: str) -> None:
     """Raise an error if the estimated time of the integration clearly exceeds ``integrator.wall_limit_s``.
 
-    The estimate is made from the size. While the method is not chosen yet (``auto``), it is for the quicker method.
+    The estimate uses the system size. Before the method is chosen (``auto``), it assumes the faster method.
     """
     options = scenario.integrator
     if options.wall_limit_s is None:
         return
     seconds = right_hand_side(n, p, dense=options.solver == "m_star")
-    # Motors and friction limit the steps of explicit methods to about a millisecond; an implicit method takes steps of
-    # some hundredths of a second, with three iterations, and occasionally a Jacobian by differences and its factors.
+    # Motors and friction limit the steps of explicit methods to about a millisecond. An implicit method takes steps of
+    # some hundredths of a second, with three iterations, and occasionally a finite-difference Jacobian and its
+    # factorization.
     step = options.step_s if options.step_s and method == "time_stepping" else 1e-3
     explicit, implicit = 4.0 * seconds / step, ((2 * n + 14) * seconds + 3e-9 * n**3) / 1e-2
     if method == AUTO:
@@ -574,12 +590,12 @@ def _check_work(scenario: Scenario, n: int, p: int, method: str) -> None:
     else:
         rate = explicit if METHODS[method].explicit or not METHODS[method].adaptive else implicit
     wall = scenario.duration_s * rate
-    if wall > CLEARLY * options.wall_limit_s:
+    if wall > WORK_MARGIN * options.wall_limit_s:
         raise ScenarioError(
             f"{n} joints with {p} contacts: a right-hand side takes about {seconds:.1g} s, so "
-            f"{scenario.duration_s:g} s would integrate for about {wall:.2g} s, the limit "
+            f"{scenario.duration_s:g} s would take about {wall:.2g} s to integrate, the limit "
             f"(integrator.wall_limit_s) is {options.wall_limit_s:g} s; "
-            "take fewer contacts or links, a shorter duration_s, or a higher limit"
+            "use fewer contacts or links, reduce duration_s, or raise the limit"
         )
 
 
@@ -599,7 +615,7 @@ def _control(scenario: Scenario, model: Model, contacts: Sequence[Contact], prog
 
 
 def _check_references(scenario: Scenario, model: Model, contacts: Sequence[Contact], control: JointControl) -> None:
-    """Raise an error if references, followed exactly, would pull a contact point off the surface that holds it."""
+    """Raise an error if exactly followed references would pull a contact point off the surface that holds it."""
     robot, tolerance = model.robot, scenario.config.contacts.reference_tolerance_m
     places = [contact.geometry for contact in contacts]
 
@@ -610,7 +626,7 @@ def _check_references(scenario: Scenario, model: Model, contacts: Sequence[Conta
 
 
 def _check_held(model: Model, contacts: Sequence[Contact], control: JointControl, tolerance: float) -> None:
-    """Check references against contacts that are held, see :func:`_check_references`."""
+    """Check references against bilateral contacts, see :func:`_check_references`."""
     robot = model.robot
     links = {link.name: link for link in robot.links}
     motor_of = {motor.joint: a for a, motor in enumerate(robot.motors)}
@@ -625,8 +641,8 @@ def _check_held(model: Model, contacts: Sequence[Contact], control: JointControl
             if parent is None:
                 break
             body = parent
-        # A joint that does not follow a reference yields, so the references do not determine the position of the point.
-        # If no reference moves, the point stays at its initial position, which has a separate check.
+        # A joint that does not follow a reference yields, so references do not determine the position of the point. If
+        # no reference moves, the point stays at its initial position, which has a separate check.
         follows = all(a >= 0 and control.k_p[a] > 0.0 for a in chain)
         if follows and any(control.reference.spline[a] >= 0 for a in chain):
             followed.setdefault(carrier, []).append((contact, point))
@@ -651,9 +667,9 @@ def _check_held(model: Model, contacts: Sequence[Contact], control: JointControl
     x, y, z = model.point_position(contact.body, contact.point, there)
     others = ", ".join(other for other in worst if other != name)
     raise ModelError(
-        f"contact {name}: the references of the joints take its point {gap_max:+.4g} m off surface "
-        f"{contact.surface_name!r} at t = {time:.3f} s, at ({x:.4g}, {y:.4g}, {z:.4g}) m, and beyond "
-        f"contacts.reference_tolerance_m = {tolerance:g} m from t = {first[name]:.3f} s on"
+        f"contact {name}: the joint references move its point {gap_max:+.4g} m off surface "
+        f"{contact.surface_name!r} at t = {time:.3f} s, at ({x:.4g}, {y:.4g}, {z:.4g}) m; "
+        f"contacts.reference_tolerance_m = {tolerance:g} m is exceeded from t = {first[name]:.3f} s on"
         f"{f' (also {others})' if others else ''}; "
-        "let the joints before the contact hold, change their path, or disable the contact"
+        "keep the joints before the contact fixed, change their path, or disable the contact"
     )

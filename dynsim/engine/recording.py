@@ -1,4 +1,4 @@
-"""The record of a dynamics run, made from the columns that the kernels wrote."""
+"""Record of a dynamics run: its signals from the kernel columns, summary, provenance, and the files of a run."""
 
 from __future__ import annotations
 
@@ -53,39 +53,39 @@ from dynsim.system.memo import recall
 # Summary (``summary.json``) of a dynamics run: energies, tracking errors, contact forces, motor loads, warnings.
 
 
-# Integrals that the integrator carries, in the order of the state (dynsim.dynamics.ledger).
+# Integrals computed by the integrator, in the order of the state (dynsim.dynamics.ledger).
 INTEGRALS = {
     "energy_electrical": "∫ Σ u i dt, net electrical energy",
-    "energy_electrical_drawn": "∫ Σ max(u i, 0) dt, a supply for each motor that takes nothing back",
+    "energy_electrical_drawn": "∫ Σ max(u i, 0) dt, one supply per motor, without recuperation",
     "heat_joule": "∫ Σ R i² dt",
     "loss_gear": "∫ Σ D_m v² dt",
     "loss_joint": "∫ Σ D v² dt",
-    "heat_friction": "energy that contact friction takes",
+    "heat_friction": "energy dissipated by contact friction",
     "work_constraint": "∫ Σ f_n n·v dt, work of the normal forces",
     "work_mechanical": "∫ Σ tau v dt, tau of [WM] eq 25",
-    "energy_electrical_supply": "∫ max(Σ u i, 0) dt, one supply for all motors that takes nothing back",
+    "energy_electrical_supply": "∫ max(Σ u i, 0) dt, one supply for all motors, without recuperation",
 }
 
-# Those that runs under the unilateral law have beside them.
+# Additional integrals of runs with springs or under the unilateral law.
 ELASTIC = {
-    "energy_elastic": "energy that contacts and ties have stored since the start",
-    "loss_damper": "energy that dampers of contacts and ties take, and what ties lose beyond their bounds",
+    "energy_elastic": "energy stored in contacts and ties since the start",
+    "loss_damper": "energy dissipated by dampers of contacts and ties, and by ties beyond their bounds",
 }
-LOSSES = {"loss_impact": "energy that impacts of contacts take", "loss_stop": "energy that impacts at joint stops take"}
+LOSSES = {"loss_impact": "energy lost in contact impacts", "loss_stop": "energy lost in impacts at joint stops"}
 
-SCHEME = "energy that the steps of time stepping take; negative: that they make"
+SCHEME = "energy lost by time stepping; negative: gained"
 
-# Heights below this are not resolved by landings [m]: each is found to AT_ROOT, which leaves the weight times that in
-# the ledger, and here ten of them reach the limit of its residual.
+# Landings do not resolve smaller heights [m]: each is located to AT_ROOT, which leaves the weight times AT_ROOT in the
+# ledger; at this height ten landings reach the limit of the residual.
 RESOLVED_M = 10.0 * ku.AT_ROOT / RESIDUAL_LIMIT
 
-# Pulling forces of unilateral contacts below this part of their largest force are the tolerance of lift-off.
+# Pulling forces of unilateral contacts below this fraction of their largest force are within the lift-off tolerance.
 PULLS = 1e-3
 _LOSS_KEYS = {"impact_loss": "loss_impact", "stop_loss": "loss_stop"}
 
 
 def energy_residual(record: Record) -> NDArray[np.float64]:
-    """Electrical energy, work of constraints and loads minus losses minus the change of stored energy, (T,) [J]."""
+    """Return electrical energy, work of constraints and loads minus losses and change of stored energy, (T,) [J]."""
     residual = record["energy_electrical"] + record["work_constraint"]
     if "work_loads" in record:
         residual = residual + record["work_loads"].sum(axis=1)
@@ -99,11 +99,11 @@ def energy_residual(record: Record) -> NDArray[np.float64]:
 def residual_floor(
     record: Record, robot: Robot, tolerance: float, real: bool = False, lever: tuple[float, float] | None = None
 ) -> float:
-    """Least denominator of the relative residual [J]: ``tolerance`` times the energy that the arm can have about it.
+    """Return the minimum denominator of the relative residual [J]: ``tolerance`` times the energy scale of the arm.
 
-    That is the largest of kinetic energy, magnetic energy, change of potential energy, and gravity's ``lever``. Below
-    it the integration resolves nothing: an arm that hangs at rest would report the ratio of two roundings. Under the
-    unilateral law (``real``) it is at least the whole weight times :data:`RESOLVED_M`.
+    The scale is the largest of kinetic energy, magnetic energy, change of potential energy, and gravity's ``lever``.
+    Smaller energies are not resolved: an arm that hangs at rest would report the ratio of two rounding errors. Under
+    the unilateral law (``real``) the floor is at least the total weight times :data:`RESOLVED_M`.
     """
     leverage, weight = gravity_lever(robot) if lever is None else lever
     stores = [record[name] - (record[name][:1] if name == "energy_potential" else 0.0) for name in STORES]
@@ -112,7 +112,9 @@ def residual_floor(
 
 
 def gravity_lever(robot: Robot) -> tuple[float, float]:
-    """Sum over all bodies of weight times the length of arm from the first joint to their centre [J]; weight [N]."""
+    """Return the sum over all bodies of weight times arm length from the first joint to their centre [J], and the
+    weight [N].
+    """
     reach: dict[str, float] = {}
     lever, mass = 0.0, 0.0
     for link in robot.links:
@@ -126,14 +128,27 @@ def gravity_lever(robot: Robot) -> tuple[float, float]:
 def summarise(
     record: Record, end: Record, scenario: Scenario, prepared: Prepared, wall: float, begun: float = 0.0
 ) -> dict[str, Any]:
-    """The content of ``summary.json`` for a run that has taken ``wall`` [s], and began at ``begun`` [s].
+    """Return the content of ``summary.json``.
 
-    ``end`` : one sample of all integrals, at the time up to which the tallies of ``prepared`` count
+    Parameters
+    ----------
+    record : Record
+        Record of the run.
+    end : Record
+        One sample of all integrals, at the time up to which the tallies of ``prepared`` count.
+    scenario : Scenario
+        Scenario of the run.
+    prepared : Prepared
+        Prepared run after its last step.
+    wall : float
+        Wall-clock time of the integration [s].
+    begun : float, optional
+        Start time of the run [s].
     """
     run, robot, contacts = prepared.run, prepared.model.robot, prepared.contacts
     unilateral = prepared.system.unilateral
     duration = float(end.time[0] - (record.time[0] if len(record) else begun))
-    # Of a ring, the effort is that of the whole run.
+    # If only the last samples are kept, the wall-clock effort still covers the whole run.
     elapsed = float(run.clock[ki.TIME]) - begun
 
     def final(name: str) -> float:
@@ -202,18 +217,18 @@ def summarise(
 
 
 def _base(record: Record, scenario: Scenario, prepared: Prepared) -> dict[str, Any]:
-    """What there is to say of a mobile base, where there is one."""
+    """Return the summary of a mobile base, empty without a base."""
     base, support = prepared.model.robot.base, prepared.run.support
     if base is None:
         return {}
     columns = [record.labels["q"].index(joint) for joint in base.wheels]
-    # Rolling: s = r (φ_l + φ_r)/2, however far apart the samples are.
+    # For rolling wheels s = r (φ_l + φ_r)/2 holds for any sample spacing.
     travel = base.wheel_radius * record["q"][:, columns].mean(axis=1)
     return {"base": base_summary(record, scenario.metrics.settle_s, support.least, travel)}
 
 
 def _loads(end: Record) -> dict[str, Any]:
-    """Work of each external wrench [J], where there are some."""
+    """Return the work of each external wrench [J], empty without loads."""
     if "work_loads" not in end:
         return {}
     return {"loads_work_J": dict(zip(end.labels["work_loads"], end["work_loads"][0].tolist(), strict=True))}
@@ -222,20 +237,20 @@ def _loads(end: Record) -> dict[str, Any]:
 def _contact(
     record: Record, end: Record, k: int, contact: Contact, prepared: Prepared, duration: float, declared: bool
 ) -> dict[str, Any]:
-    """What a contact has done; of a declared point under the unilateral law also how near it came."""
+    """Return the summary of a contact; for a declared point under the unilateral law including its minimum gap."""
     force, run, unilateral = record["contact_normal_force"][:, k], prepared.run, prepared.system.unilateral
     real = {} if unilateral is None else _modes(unilateral, k, duration)
     extremes = run.extremes[k] if run.count[ki.STEPS] else np.zeros(ki.EXTREMES_SIZE)
-    # Under the unilateral law a force ends at zero; less is the tolerance of that event, up to PULLS.
+    # Under the unilateral law a force ends at zero; smaller pulling forces, up to PULLS, are the event tolerance.
     largest = float(max(extremes[ki.FORCE_MAX], force.max(initial=-np.inf)))
     lowest = float(min(extremes[ki.FORCE_MIN], force.min(initial=np.inf)))
     if unilateral is not None and lowest >= -PULLS * max(largest, 0.0):
         lowest = max(lowest, 0.0)
-    # Steps may be longer than the time for which a contact pulls: then samples within them show it.
+    # Steps may be longer than the pulling interval of a contact: then samples within them show it.
     pulling, sampled = float(extremes[ki.PULLING]) / duration if duration > 0.0 else 0.0, int((force < 0.0).sum())
     if sampled > pulling * len(force) + 2.0:
         pulling = sampled / len(force)
-    # Extremes are those of every accepted step, which are closer together than the samples, and of the samples.
+    # Extremes are over the samples and all accepted steps, which are closer together.
     return {
         "name": contact.name,
         "surface": contact.surface_name,
@@ -251,7 +266,7 @@ def _contact(
 
 
 def _modes(unilateral: UnilateralArrays, k: int, duration: float) -> dict[str, Any]:
-    """What a candidate has done under the unilateral law."""
+    """Return the part of a contact's summary that exists only under the unilateral law."""
     tally = unilateral.tally[k]
     fractions = tally[[ku.TIME_STICKING, ku.TIME_SLIDING]] / duration if duration > 0.0 else np.zeros(2)
     sticking, sliding = np.minimum(fractions, 1.0).tolist()
@@ -270,19 +285,19 @@ def _modes(unilateral: UnilateralArrays, k: int, duration: float) -> dict[str, A
 
 
 def _known(key: str, value: float) -> dict[str, float]:
-    """An entry, unless it is not known (see dynsim.engine.ring)."""
+    """Return an entry, empty if its value is unknown (see dynsim.engine.ring)."""
     return {} if np.isnan(value) else {key: float(value)}
 
 
 def _joint_stops(record: Record, prepared: Prepared, duration: float) -> list[dict[str, Any]]:
-    """The joint stops that were touched."""
+    """Return the joint stops that were touched."""
     unilateral = prepared.system.unilateral
     assert unilateral is not None
     units = {link.joint: link.units for link in prepared.model.robot.links}
     stops = []
     for stop, row in zip(prepared.stops, unilateral.stop, strict=True):
         if row[ku.HITS] > 0 or row[ku.CLOSED_TIME] > 0.0:
-            # One column for both stops of a joint, positive at the lower one.
+            # Both stops of a joint share one column, positive at the lower stop.
             force = stop.side * record["stop_force"][:, record.labels["stop_force"].index(stop.joint)]
             stops.append(
                 {
@@ -300,9 +315,9 @@ def _joint_stops(record: Record, prepared: Prepared, duration: float) -> list[di
 
 
 def _time_stepping(run: ki.Run, springs: bool) -> dict[str, Any]:
-    """How well time stepping has solved its contact problems, and how deep points came to lie.
+    """Return statistics of the contact solver and the maximum penetration.
 
-    springs : contacts give way, or there are ties
+    ``springs`` is True with compliant contacts or ties.
     """
     assert run.stepping is not None
     results = run.stepping.statistics
@@ -326,12 +341,12 @@ def _time_stepping(run: ki.Run, springs: bool) -> dict[str, Any]:
 
 
 def motor_loads(record: Record, robot: Robot) -> list[dict[str, Any]]:
-    """Of each motor the root mean square and the largest current and torque at the shaft, ratings, a servo's friction.
+    """Return rms and maximum current and shaft torque of each motor, its ratings, and a servo's friction.
 
-    Over the whole run, by trapezoids between the samples; a rating that is not known is left out.
+    Values are over the whole run, by the trapezoidal rule between samples; unknown ratings are omitted.
     """
     units = {link.joint: "N_m" if link.units[3] == "N m" else "N" for link in robot.links}
-    # Along samples, which lie together then: a third of the time.
+    # Contiguous samples of each motor: a third of the time.
     values = {name: np.ascontiguousarray(record[name].T) for name in ("current", "torque")}
     rms = {name: _rms(record.time, rows).tolist() for name, rows in values.items()}
     most = {
@@ -354,7 +369,7 @@ def motor_loads(record: Record, robot: Robot) -> list[dict[str, Any]]:
 
 
 def _ratings(motor: Drive, torque: str) -> dict[str, float]:
-    """Ratings by key, infinite where they are not known."""
+    """Return ratings by key, infinite if unknown."""
     if isinstance(motor, TorqueSource):
         return {torque: motor.nominal_torque}
     ratings = {
@@ -368,10 +383,10 @@ def _ratings(motor: Drive, torque: str) -> dict[str, float]:
 
 
 def _rms(time: Array, values: Array) -> Array:
-    """Root mean square over time of each row, (k, T) → (k,)."""
+    """Return the root mean square over time of each row, (k, T) → (k,)."""
     if len(time) < 2:
         return np.abs(values).max(axis=1, initial=0.0)
-    # Half of each interval belongs to the sample at either end of it.
+    # Half of each interval belongs to the sample at each end.
     weight = np.zeros(len(time))
     weight[:-1] = np.diff(time)
     weight[1:] += weight[:-1].copy()
@@ -383,12 +398,12 @@ def _rms(time: Array, values: Array) -> Array:
 
 
 LIBRARIES = ("numpy", "scipy", "numba", "h5py")
-# File of a built package that names the commit from which it was built.
+# File of a built package that contains the commit it was built from.
 BUILT_FROM = "commit.txt"
 
 
 def provenance(scenario: Scenario) -> dict[str, Any]:
-    """Everything needed to make the record again."""
+    """Return all information needed to reproduce the record."""
     return {
         "scenario": scenario.resolved,
         "engine": scenario.engine,
@@ -402,7 +417,7 @@ def provenance(scenario: Scenario) -> dict[str, Any]:
 
 @lru_cache
 def _version(library: str) -> str:
-    # Reading the metadata of all of them takes 6 ms, as long as a short run of a sweep.
+    # Reading all metadata takes 6 ms, as long as a short run of a sweep.
     try:
         return metadata.version(library)
     except metadata.PackageNotFoundError:
@@ -411,9 +426,9 @@ def _version(library: str) -> str:
 
 @lru_cache
 def commit() -> str:
-    """Commit of the checkout that runs, or that an installed package was built from; "" where neither is known.
+    """Return the commit of the running checkout or of the installed package; "" if unknown.
 
-    Read from .git, once: starting git would cost more. A package has it from ``.ci/build_hook.py``.
+    Read from .git once, because starting git would take longer. A package gets it from ``.ci/build_hook.py``.
     """
     built = Path(__file__).resolve().parents[1] / BUILT_FROM
     if built.is_file():
@@ -421,7 +436,7 @@ def commit() -> str:
     git = Path(__file__).resolve().parents[2] / ".git"
     try:
         if git.is_file():  # a linked work tree
-            # Of a submodule the path is relative to this file.
+            # In a submodule the path is relative to this file.
             git = git.parent / git.read_text(encoding="utf-8").removeprefix("gitdir:").strip()
         head = (git / "HEAD").read_text(encoding="utf-8").strip()
         if not head.startswith("ref:"):
@@ -437,7 +452,7 @@ def commit() -> str:
         return ""
 
 
-# A last sample within this part of the run before its end counts as at it, see dynsim.engine.trace.even_times.
+# A last sample within this fraction of the run before its end counts as at the end, see dynsim.engine.trace.even_times.
 SAME_END = 1e-9
 
 
@@ -452,13 +467,26 @@ def make_record(
     pictured: bool = True,
     begun: float = 0.0,
 ) -> Record:
-    """Name the columns that the kernels wrote.
+    """Return the record of the columns that the kernels wrote.
 
-    ``pushed`` : which of the bodies' own wrenches, the last of the loads, have been set; None: there are none
-    ``happened`` : events of the run
-    ``base_as_planned`` : whether the wheels of a base follow what ``prepared.control`` says, and from its start
-    ``pictured`` : with the scene, the poses of its bodies, and provenance
-    ``begun`` : time at which the run began [s]; when samples begin later, all but the effort is counted from there
+    Parameters
+    ----------
+    scenario : Scenario
+        Scenario of the run.
+    prepared : Prepared
+        Prepared run after its last step.
+    wall : float
+        Wall-clock time of the integration [s].
+    pushed : sequence of int, optional
+        Indices of the caller's wrenches (the last of the loads) that have been set; default: no such wrenches.
+    happened : sequence of Event, optional
+        Events of the run.
+    base_as_planned : bool, optional
+        False if the wheels of a base did not follow the references of ``prepared.control`` from the start.
+    pictured : bool, optional
+        If False, omit the scene, the poses of its bodies, and provenance.
+    begun : float, optional
+        Start time of the run [s]; if samples start later, everything except the effort counts from the first sample.
     """
     count, times = int(prepared.run.count[ki.SAMPLE]), prepared.run.sample_time
     lost = count > 0 and times[0] > begun
@@ -474,7 +502,7 @@ def make_record(
     angle, rate, acceleration, _ = _joint_units(robot.links)
     with_motor = set(driven)
     *_, force = _joint_units([link for link in robot.links if link.joint in with_motor] or robot.links)
-    # One unit for all: that of the columns that servos replay and figures draw.
+    # One unit for all columns, because servos replay and figures draw them together.
     positions = "joint positions" if robot.base is None else "joint positions; base.x and base.y [m]"
     record.add("q", run.states("q"), angle, labels=robot.position_names, description=positions)
     record.add("v", run.states("v"), rate, labels=joints, description="joint rates")
@@ -492,11 +520,11 @@ def make_record(
         record.add("target_position", target, "m", labels=("x", "y", "z"))
     if prepared.control.orientation is not None:
         turned = hand_turns(model, run.states("q"), prepared.control.orientation)
-        record.add("hand_turn_error", turned, "rad", description="angle between the hand's orientation and its target")
+        record.add("hand_turn_error", turned, "rad", description="angle between hand orientation and target")
     _add_energies(record, prepared, pushed)
     for store, name in zip(_by_column(run.outputs("energy")), STORES, strict=True):
         record.add(name, store, "J", description=f"{name.removeprefix('energy_')} energy")
-    record.add("energy_residual", energy_residual(record), "J", description="what the ledger does not explain")
+    record.add("energy_residual", energy_residual(record), "J", description="residual of the energy balance")
     touch = run.outputs("contact")
     vector, slip = slice(kst.OUT_VECTOR, kst.OUT_VECTOR + 3), slice(kst.OUT_SLIP, kst.OUT_SLIP + 3)
     record.add(
@@ -520,10 +548,10 @@ def make_record(
 
 
 def _end(record: Record, prepared: Prepared, pushed: Sequence[int] | None, begun: float, *, within: bool) -> Record:
-    """All integrals at the end of what the summary is of, as a record of one sample.
+    """Return all integrals at the end of the summarised interval, as a record of one sample.
 
-    That is the whole run, whose tallies count up to its present time, which may be later than the last sample; of a
-    ring that has lost samples (``within``) it is what it has.
+    For a whole run, whose tallies count up to its present time, the end may be later than the last sample. If samples
+    were lost (``within``), it is the last sample.
     """
     run, rows = prepared.run, len(record)
     time, state = float(run.clock[ki.TIME]), run.y
@@ -538,7 +566,7 @@ def _end(record: Record, prepared: Prepared, pushed: Sequence[int] | None, begun
 
 
 def _add_energies(record: Record, prepared: Prepared, pushed: Sequence[int] | None) -> None:
-    """Integrals of powers, and energies of impacts and of the scheme."""
+    """Add integrals of powers, and energies of impacts and of the scheme."""
     run, robot = prepared.run, prepared.model.robot
     for integral, (name, text) in zip(_by_column(run.states("ledger")), INTEGRALS.items(), strict=True):
         record.add(name, integral, "J", description=text)
@@ -558,7 +586,7 @@ def _add_energies(record: Record, prepared: Prepared, pushed: Sequence[int] | No
 
 
 def _add_touch(record: Record, prepared: Prepared) -> None:
-    """Integrals of forces and slip of the contacts."""
+    """Add integrals of forces and slip of the contacts."""
     names, rows = tuple(contact.name for contact in prepared.contacts), len(record)
     integrals = prepared.run.states("contact").reshape(rows, len(names), kst.CONTACT_SIZE)
     record.add("contact_impulse", integrals[:, :, kst.IMPULSE], "N s", labels=names, description="∫ f_n dt")
@@ -566,12 +594,12 @@ def _add_touch(record: Record, prepared: Prepared) -> None:
 
 
 def _by_column(table: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Columns beside each other in memory: the ledger is summed up from them again and again."""
+    """Return the table in column-major order, because the ledger sums up its columns many times."""
     return np.ascontiguousarray(table.T)
 
 
 def _add_unilateral(record: Record, prepared: Prepared) -> None:
-    """Modes of the contacts, forces of joint stops, dry frictions and ties."""
+    """Add modes of the contacts, and forces of joint stops, dry friction and ties."""
     run, robot = prepared.run, prepared.model.robot
     names = tuple(contact.name for contact in prepared.contacts)
     modes = run.outputs("contact")[:, :, kst.OUT_MODE]
@@ -583,7 +611,9 @@ def _add_unilateral(record: Record, prepared: Prepared) -> None:
         for stop, column in zip(prepared.stops, run.outputs("stop").T, strict=True):
             force[:, joints.index(stop.joint)] += stop.side * column
         unit = " or ".join(dict.fromkeys(units[joint] for joint in joints))
-        record.add("stop_force", force, unit, labels=joints, description="of joint stops; positive at a lower limit")
+        record.add(
+            "stop_force", force, unit, labels=joints, description="force of joint stops; positive at a lower limit"
+        )
     if prepared.dry:
         units = {link.joint: link.units[3] for link in robot.links}
         joints = tuple(friction.joint for friction in prepared.dry)
@@ -592,16 +622,18 @@ def _add_unilateral(record: Record, prepared: Prepared) -> None:
     if robot.ties:
         unit = " or ".join(dict.fromkeys("N m" if tie.turns else "N" for tie in robot.ties))
         names = tuple(tie.name for tie in robot.ties)
-        record.add("tie_force", run.outputs("tie"), unit, labels=names, description="on the first body of each tie")
+        record.add(
+            "tie_force", run.outputs("tie"), unit, labels=names, description="force on the first body of each tie"
+        )
 
 
 def _add_touching_points(record: Record, robot: Robot, contacts: Sequence[Contact]) -> None:
-    """Where forces act on spheres and capsules, in single precision as the poses; on points it is where they are."""
+    """Add the points of force application on spheres and capsules, in single precision like the poses."""
     shaped = [contact for contact in contacts if contact.radius > 0.0 or contact.tip is not None]
     if not shaped:
         return
     places = np.empty((len(record), len(shaped), 3), dtype=np.float32)
-    # The last samples of a run that diverged may be beyond all bounds.
+    # The last samples of a diverged run may overflow.
     with np.errstate(over="ignore", invalid="ignore"):
         for k, contact in enumerate(shaped):
             ends = [
@@ -616,13 +648,19 @@ def _add_touching_points(record: Record, robot: Robot, contacts: Sequence[Contac
 
 
 def _add_base(record: Record, prepared: Prepared, base: MobileBase, as_planned: bool) -> None:
-    """Where the base is and should be, and what the ground carries; see dynsim.dynamics.tree.support."""
+    """Add pose, target and ground forces of the base; see dynsim.dynamics.tree.support."""
     robot, run = prepared.model.robot, prepared.run
     pose, speed = base_pose(robot, run.states("q")), run.states("v")[:, list(map(robot.joint_names.index, base.wheels))]
     record.add("base_pose", pose, "m, m, rad", labels=("x", "y", "heading"), description="base in the world")
     target = prepared.control.base_target(robot, record.time) if as_planned else None
     if target is not None:
-        record.add("base_target", target, "m, m, rad", labels=("x", "y", "heading"), description="by the references")
+        record.add(
+            "base_target",
+            target,
+            "m, m, rad",
+            labels=("x", "y", "heading"),
+            description="target pose of the references",
+        )
     sides, support = SUPPORTS[:2], run.outputs("support")
     parts = (slice(ks.LOADS, ks.LOADS + 3), slice(ks.PRESSURE, ks.PRESSURE + 2), slice(ks.TRACTION, ks.TRACTION + 2))
     load, pressure, traction = (support[:, part] for part in parts)
@@ -634,16 +672,16 @@ def _add_base(record: Record, prepared: Prepared, base: MobileBase, as_planned: 
 
 
 def _joint_units(links: Iterable[Link]) -> Sequence[str]:
-    """Units of position, velocity, acceleration and force of joints; "rad or m" when there are both kinds."""
+    """Return the units of position, velocity, acceleration and force of joints; "rad or m" if both kinds exist."""
     units = sorted({link.units for link in links}, reverse=True)
     return [" or ".join(dict.fromkeys(kinds)) for kinds in zip(*units, strict=True)]
 
 
-# Names and writing of the files of a run: record, summary and scenario, replaced together.
+# Files of a run: names, and writing of record, summary and scenario, replaced together.
 
 
 RUN_FILES = ("record.h5", "summary.json", "scenario.yaml")
-# Files that are made from records, and can be made again.
+# Files made from records that can be regenerated.
 FIGURE_FORMATS = ("png", "pdf", "svg")
 VIEW = "view.html"
 FIGURES = (*(f"figures/*.{kind}" for kind in FIGURE_FORMATS), "figures/animation.gif", VIEW)
@@ -653,30 +691,30 @@ COMPARISON_FILES = ("comparison.json", "comparison.csv", *(f"compare_*.{kind}" f
 def save_run(record: Record, folder: Path) -> None:
     """Write ``record.h5``, ``summary.json`` and the resolved ``scenario.yaml`` to a folder: all three or none.
 
-    A process that dies while it exchanges them leaves a file ``INCOMPLETE`` there, which :meth:`Record.load` heeds.
+    A process killed while it replaces them leaves a file ``INCOMPLETE``, for which :meth:`Record.load` checks.
 
     Raises
     ------
     RecordError
-        A file cannot be written; older ones are left as they were.
+        If a file cannot be written; older files remain unchanged.
     """
     contents: dict[str, bytes | memoryview] = {
         "record.h5": record.to_hdf5(),
         "summary.json": json_text(record.summary).encode("utf-8"),
         "scenario.yaml": to_yaml(record.provenance["scenario"]).encode("utf-8"),
     }
-    # Figures of another record must not lie beside this one.
+    # Figures of another record must not remain next to this record.
     discard(folder, FIGURES)
     replace_together(folder, contents)
 
 
 def save_drive(record: Record, folder: Path) -> None:
-    """:func:`save_run` of a live drive; if the record cannot be written, the script that reproduces it is kept.
+    """Write the files of a live drive; if the record cannot be written, keep the script that reproduces it.
 
     Raises
     ------
     RecordError
-        Not all of it could be written; says whether the script was.
+        If not all files could be written; the message states whether the script was saved.
     """
     try:
         save_run(record, folder)
@@ -686,4 +724,4 @@ def save_drive(record: Record, folder: Path) -> None:
             write_text(script, to_yaml(record.provenance["scenario"]))
         except RecordError:
             raise error from None
-        raise RecordError(f"{error}; the script is kept, and makes the record again: dynsim run {script}") from None
+        raise RecordError(f"{error}; the script was saved and reproduces the record: dynsim run {script}") from None

@@ -1,8 +1,8 @@
-"""Tallies of a ring of samples: a run of which only the last samples are kept.
+"""Tallies of a run of which only the last samples are kept in a ring buffer.
 
-The kernels count from the beginning of the run. Within the ring, events are counted; times, fractions and extremes come
-from the samples. Three numbers cannot be known: the losses of single contacts and of single stops, and how far half a
-step would blur the energy. They are not a number (NaN) here, and are left out of summaries.
+The kernels count from the beginning of the run. Within the ring, events are counted; times, fractions and extremes are
+computed from the samples. Three numbers are unknown: the losses of single contacts, the losses of single stops, and the
+energy change if everything happened half a step later. They are NaN here and are omitted from summaries.
 """
 
 from __future__ import annotations
@@ -33,12 +33,14 @@ _MODES = {ka.OPEN: ku.TIME_OPEN, ka.SLIDING: ku.TIME_SLIDING, ka.STICKING: ku.TI
 
 
 def counted_within(prepared: Prepared, happened: Sequence[Event]) -> Prepared:
-    """Tallies and extremes of the samples that ``prepared.run`` has, and of the events from the first of them on.
+    """Return the run with tallies and extremes of its samples, and of the events from the first sample on.
 
     Parameters
     ----------
-    prepared : whose run has the samples of the ring, at least one, and energies that count from the first
-    happened : events within the ring
+    prepared : Prepared
+        Prepared run with at least one sample in the ring; its energies count from the first sample.
+    happened : sequence of Event
+        Events within the ring.
     """
     run, unilateral = prepared.run, prepared.system.unilateral
     touch = run.outputs("contact")
@@ -75,35 +77,37 @@ def counted_within(prepared: Prepared, happened: Sequence[Event]) -> Prepared:
         rigid = np.array([contact.stiffness == 0.0 for contact in prepared.contacts], dtype=bool)
         statistics[kt.PENETRATION] = depths[rigid].max(initial=0.0)
         stepping = stepping._replace(statistics=statistics)
-    # An empty array says that the least loads of a mobile base between the samples are not known.
+    # An empty array means that the minimum loads of a mobile base between the samples are unknown.
     support = run.support._replace(least=np.zeros(0))
     run = run._replace(extremes=extremes, stepping=stepping, support=support)
     return replace(prepared, run=run, system=system)
 
 
 def _extremes(run: ki.Run, force: Array, gaps: Array) -> Array:
-    """Extremes of the samples, (c, EXTREMES_SIZE), by normal forces [N] and gaps of closed contacts [m], (T, c)."""
+    """Return the extremes of the samples, (c, EXTREMES_SIZE), from normal forces [N] and gaps of closed contacts [m],
+    (T, c).
+    """
     extremes = run.extremes.copy()
     extremes[:, ki.FORCE_MIN], extremes[:, ki.FORCE_MAX] = force.min(axis=0), force.max(axis=0)
     extremes[:, ki.DRIFT_MAX] = np.abs(gaps).max(axis=0)
-    # As dynsim.integrators.run has it: linear between two samples.
+    # As in dynsim.integrators.run: linear between two samples.
     low, high = np.minimum(force[1:], force[:-1]), np.maximum(force[1:], force[:-1])
     part = np.where(high <= 0.0, 1.0, low / np.where(low < high, low - high, -1.0))
     extremes[:, ki.PULLING] = np.diff(run.sample_time) @ np.where(low < 0.0, part, 0.0)
-    # What began earlier is no longer told.
+    # Times before the first sample are unknown.
     since = extremes[:, ki.LOCAL_SINCE]
     since[since < run.sample_time[0]] = np.inf
     return extremes
 
 
 def _shares(times: Array) -> NDArray[np.float64]:
-    """The time that each sample stands for [s]: half of each interval next to it."""
+    """Return the time that each sample represents [s]: half of each adjacent interval."""
     halves = 0.5 * np.diff(times)
     return np.append(halves, 0.0) + np.append(0.0, halves)
 
 
 def _struck(prepared: Prepared, event: Event) -> int:
-    """Which stop a joint has hit: events name the joint, and its nearest stop is the one."""
+    """Return the index of the stop that a joint hit: events name the joint, and its nearest stop was hit."""
     run, robot = prepared.run, prepared.model.robot
     row = min(int(np.searchsorted(run.sample_time, event.time)), len(run.sample_time) - 1)
     q = run.states("q")[row, robot.position_index[robot.joint_names.index(event.name)]]

@@ -1,8 +1,9 @@
-"""Simulation under the caller's control: advance, read, rewrite references and wrenches, restore a snapshot.
+"""Simulation of multibody plants: the public stepper :class:`Simulation`, the check of a start, and complete runs.
 
-Steps are those of :func:`dynsim.simulate`, bit for bit, as long as nothing is rewritten: ``advance`` does not cut them.
-The step that passes the requested time is kept, and the state at that time is taken from its dense output. Only when
-something is rewritten, that step is discarded, and a shorter one ends at the requested time.
+As long as the caller rewrites nothing, the steps are bit-identical to :func:`dynsim.simulate`, because ``advance`` does
+not cut them. The step that passes the requested time is kept pending, and the state at that time is interpolated from
+its dense output. If the caller rewrites something, this step is discarded, and a shorter one ends at the requested
+time.
 
 Long because: it is one class, the public stepper, and half of it is its documentation.
 """
@@ -71,45 +72,70 @@ log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 
-# Most steps in one call of compiled code, which ends sooner on request, see dynsim.engine.stopping.
+# Maximum number of steps in one call of compiled code, which can return earlier, see dynsim.engine.stopping.
 _PIECE = 1 << 62
-# Limits on ticks of callers: their number (kinds are bits of an integer), and their period [s].
+# Limits on caller ticks: their number (kinds are bits of an integer), and their period [s].
 MOST_TICKS, SHORTEST_PERIOD = 60, 1e-9
-# Ticks within this of the requested time count as at it, relative to that time.
+# Ticks within this of the requested time count as at that time, relative to it.
 TICK_SLACK = 1e-12
-# End of a run without a given end [s]: finite, and later than any time in use.
+# End of a run without a set end [s]: finite, and later than any time in use.
 _FAR = 1e300
-# A state under time stepping may be a step of this speed below a surface or beyond a stop [m/s or rad/s].
+# A state of a time-stepping run may be a step at this speed below a surface or beyond a stop [m/s or rad/s].
 FASTEST_LANDING = 5.0
 SERVO_MODES = {"position": ka.POSITION_MODE, "velocity": ka.VELOCITY_MODE, "off": ka.OFF}
-# Buffers into which kernels sample; their sizes change. So do the tables of callbacks, to which more may be added.
+# Buffers that kernels write samples to, and tables of callbacks: their sizes change.
 _BUFFERS = {f"run.{field}": field for field in ("sample_time", "sample", "output")}
 _TABLES = {f"run.{field}": field for field in ("tick", "tick_table", "event", "event_table")}
 
 
 class Simulation:
-    """A scenario that is advanced by its caller.
-
-    >>> simulation = dynsim.Simulation(dynsim.load_scenario("elbow_comparison", "two_elbows"))
-    >>> simulation.advance(0.5).q
-    >>> simulation.set_wrench("link_10", force=[0.0, 0.0, -5.0])
-    >>> simulation.advance(1.0)
-    >>> record = simulation.record()
+    """Step a scenario interactively: advance, apply forces, change references, save and restore.
 
     Parameters
     ----------
-    scenario : of a plant with dynamics
-    state : to start from, at its time; default: the scenario's, at t = 0. ``State.of(record)`` is that of a record's
-        last sample. The ledger starts at zero.
-    duration : end of the run [s], ``math.inf`` for none; default: the scenario's. References hold where they end.
-    trace : samples that are kept: all (None), the last so many, or none (0)
-    motors : instead of those of the plant, see :mod:`dynsim.model.description`; records still show the scenario's
-    operator : instead of the script of a scenario that has ``controller.operator``, or of a snake's
+    scenario : Scenario
+        Scenario of a plant with dynamics, see :func:`dynsim.load_scenario`.
+    state : State, optional
+        State to start from, at its time, e.g. ``State.of(record)``; default: the start of the scenario at t = 0. The
+        energy ledger starts at zero.
+    duration : float, optional
+        End of the run [s], ``math.inf`` for no end; default: the end of the scenario. References keep their final
+        values after their end.
+    trace : int, optional
+        Number of last samples to keep; default (None): all samples, 0: none.
+    motors : sequence of Drive, optional
+        Motors to use instead of the motors of the plant, see :mod:`dynsim.model.description`; records still show the
+        motors of the scenario.
+    operator : VelocitySource or CommandSource, optional
+        Command source to use instead of the script of a scenario with ``controller.operator`` or of a snake.
 
     Raises
     ------
-    ModelError, UnreachableReference, ScenarioError
-        See :func:`dynsim.simulate`; a state of another robot, or one whose contact points are off their surfaces.
+    ModelError
+        If the plant is kinematic, the scenario is not physically valid, or the state belongs to another robot or has
+        contact points off their surfaces.
+    UnreachableReference
+        If the hand cannot follow its path.
+    ScenarioError
+        If an argument is invalid, or the record would be too large.
+
+    Notes
+    -----
+    As long as the caller changes nothing, results are bit-identical to :func:`dynsim.simulate`. Every change, such as
+    :meth:`set_wrench`, takes effect at :attr:`time`. Equations: [WM] eqs 25, 42–44, 54–55, see docs/physics.md.
+
+    Examples
+    --------
+    >>> import dynsim
+    >>> simulation = dynsim.Simulation(dynsim.load_scenario("elbow_comparison", "two_elbows"))
+    >>> simulation.advance(0.5).q.shape
+    (10,)
+    >>> simulation.set_wrench("link_10", force=[0.0, 0.0, -5.0])
+    >>> simulation.advance(1.0).time
+    1.0
+    >>> record = simulation.record()
+    >>> record["q"].shape, simulation.finished
+    ((201, 10), False)
     """
 
     def __init__(
@@ -126,18 +152,18 @@ class Simulation:
         if scenario.engine != "dynamics":
             raise ModelError(f"plant {scenario.plant.type!r} is kinematic: only plants with dynamics can be stepped")
         if state is not None and not isinstance(state, State):
-            raise ModelError(f"a simulation starts from a State, such as State.of(record), not from {brief(state)}")
+            raise ModelError(f"state must be a State, e.g. State.of(record), got {brief(state)}")
         if trace is not None and (not isinstance(trace, int) or trace < 0):
-            raise ScenarioError(f"trace is a number of samples, or None for all, not {brief(trace)}")
+            raise ScenarioError(f"trace must be a number of samples, or None for all, got {brief(trace)}")
         start = 0.0 if state is None else float(state.time)
         if not math.isfinite(start):
-            raise ModelError(f"the state to start from has time {start}")
+            raise ModelError(f"state.time must be finite, got {start}")
         end = scenario.duration_s if duration is None else float(duration)
         if not end > start:
-            raise ScenarioError(f"a simulation from t = {start:g} s cannot end at {end:g} s")
+            raise ScenarioError(f"duration must be later than the start at t = {start:g} s, got {end:g} s")
         self._scenario = scenario
         self._end = min(end, _FAR)
-        # Tables that callers may change are nobody else's.
+        # A separate memo: other runs must not share tables that the caller may change.
         with remembering(Memo()):
             self._prepared = prepare(
                 scenario,
@@ -148,16 +174,16 @@ class Simulation:
                 starts=state is None,
             )
         if (unstable := unstable_loop(scenario, self._prepared)) is not None:
-            # Live sessions may never make a record, whose summary has this warning.
+            # Live sessions may never make a record, whose summary contains this warning.
             log.warning("%s: %s", scenario.title, unstable[0])
         self._time, self._begun, self._wall = start, start, 0.0
-        # Of a ring, and of a run that goes on from another, the ledger counts from the first sample on.
+        # With a ring buffer or a start from a state, the ledger counts from the first sample.
         self._relative = trace is not None or state is not None
         self._happened: list[Event] = []
         self._token = object()
-        # What a controller has ended the run by.
+        # Exception with which a controller ended the run.
         self._ended_by: SimulationStopped | None = None
-        # Callbacks that are due at the present time, in the order of their calls; the callback that is called now.
+        # Callbacks due at the present time, in the order of their calls; the callback being called.
         self._due: list[Callable[[Simulation], None]] = []
         self._calling: Callable[[Simulation], None] | None = None
         self._loaded, self._watch = False, stopping.WallWatch(scenario.integrator.wall_limit_s)
@@ -171,7 +197,7 @@ class Simulation:
         self._motors = {motor.joint: a for a, motor in enumerate(robot.motors)}
         first = len(self._prepared.loads) - len(robot.bodies)
         self._pushes = {body: first + k for k, body in enumerate(robot.bodies)}
-        # As planned: a motor whose reference is rewritten now may be given back later.
+        # Planned references and voltages, for motors that are released later.
         self._splines = self._prepared.system.reference.spline.copy()
         self._voltages = self._prepared.system.reference.voltage.copy()
         self._references_end = self._prepared.control.end
@@ -179,58 +205,58 @@ class Simulation:
         self._pushed: set[int] = set()
         times = None
         if state is None and self._end == scenario.duration_s and trace is None:
-            # The very samples of simulate; its limit of size holds here too.
+            # Exactly the samples of simulate, including its size limit.
             times = sample_times(scenario, self._prepared.run.layout, self._prepared.run.columns, len(robot.links))
         self._trace = Trace(start, self._end, scenario.record.rate_hz, trace, times)
         self._sampled = self._prepared.system.drives.table[:, ka.SAMPLED].copy()
         reference = self._prepared.control.reference
-        # As planned: where the base should be is drawn from it, until a wheel is told otherwise.
+        # Planned control, from which the target of the base is computed until a wheel is commanded otherwise.
         self._planned = replace(self._prepared.control, reference=reference._replace(spline=reference.spline.copy()))
         self._base_as_planned = state is None
-        self._said: list[str] = []
-        # Where samples are to end [s]; once a step has passed that, what there was, and the wall time until then [s].
+        self._warnings: list[str] = []
+        # End of the samples [s]; once a step has passed it, the snapshot there and the wall-clock time until then [s].
         self._samples_end: float = math.inf
         self._window: tuple[Snapshot, float] | None = None
         run = self._prepared.run
         if state is not None:
-            self._take(state)
+            self._start_from(state)
         run.clock[[ki.TIME, ki.COUNTED_SINCE]] = start
         run.tick[:, [ki.TICK_NEXT, ki.TICK_PHASE]] = start
         self._refill()
         encoded = self._encoded_commands()
-        self._operator = self._attendant(operator, state)
+        self._operator = self._tick_handler(operator, state)
         if self._operator is not None:
             self.every(self._operator.period, self._operator)
         elif operator is not None:
-            raise ScenarioError("an operator needs a scenario with controller.operator, which says what it moves")
-        self._attendants = [attendant for attendant in (encoded, self._operator) if attendant is not None]
+            raise ScenarioError("operator requires a scenario with controller.operator")
+        self._tick_handlers = [handler for handler in (encoded, self._operator) if handler is not None]
         self._own_calls = tuple(self._calls)
 
-    def _attendant(self, source: Any, state: State | None) -> Operator | SnakePilot | None:
-        """Who rewrites references at the ticks of its own, where the scenario has somebody."""
+    def _tick_handler(self, source: Any, state: State | None) -> Operator | SnakePilot | None:
+        """Return the handler that rewrites references at its ticks, or None without an operator or snake controller."""
         control = self._prepared.control
         if control.teleop is not None:
             return Operator(self.model, control.teleop, source, state)
         if control.task_space is None:
             return None
-        # Imported here: an arm needs nothing of a snake.
+        # Imported here because an arm does not need the snake modules.
         from dynsim.engine.snake_control import control_periods
         from dynsim.engine.snake_pilot import SnakePilot
 
         if state is not None:
             raise ModelError(
-                "a snake with a task-space controller cannot start from a State, which contains neither its target nor "
-                "its gripper; go back to a Simulation.snapshot()"
+                "a snake with a task-space controller cannot start from a State, which lacks its target and gripper; "
+                "restore a Simulation.snapshot()"
             )
         periods = control_periods(self._scenario, control.task_space.schedule.period)
         pilot = SnakePilot(self.model, control.task_space, *periods, source, self._scenario.config.sensors)
         for sensor in pilot.sensors:
-            # Before the controller, where both are due.
+            # Sensors come before the controller if both are due.
             self.every(sensor.period, sensor)
         return pilot
 
     def _encoded_commands(self) -> EncodedCommands | None:
-        """Who takes commands at the ticks of a sampled controller that has encoders."""
+        """Return the handler that computes commands at the ticks of a sampled controller with encoders, or None."""
         sensors, period = self._scenario.config.sensors, self._prepared.control.sample_time
         if sensors is None or sensors.encoders is None or period is None:
             return None
@@ -240,7 +266,7 @@ class Simulation:
         return encoded
 
     def _take_commands(self, position: Array, rate: Array) -> None:
-        """Take the commands of all sampled motors by measured positions and rates of their joints, (na,)."""
+        """Compute the commands of all sampled motors from measured joint positions and rates, (na,)."""
         self._settle_now()
         system, workspace = self._prepared.system, self._prepared.workspace
         driven = system.drives.table[:, ka.DRIVEN]
@@ -250,22 +276,22 @@ class Simulation:
 
     @property
     def scenario(self) -> Scenario:
-        """What is simulated."""
+        """Scenario of the simulation."""
         return self._scenario
 
     @property
     def robot(self) -> Any:
-        """The robot, with the names of its joints, motors and bodies."""
+        """Robot description with the names of joints, motors and bodies."""
         return self._prepared.model.robot
 
     @property
     def model(self) -> Model:
-        """Its rigid-body model; ``armature`` is very large where a brake is closed."""
+        """Rigid-body model of the robot (:class:`dynsim.Model`); ``armature`` is very large at a closed brake."""
         return self._prepared.model
 
     @property
     def touching(self) -> dict[str, Touch]:
-        """What each contact point did at the last sample; empty before the first."""
+        """Force and mode of each contact point at the last sample; empty before the first sample."""
         run = self._prepared.run
         outputs = run.output[: int(run.count[ki.SAMPLE])]
         last = outputs[-1] if len(outputs) else self._trace.last_output()
@@ -284,7 +310,7 @@ class Simulation:
 
     @property
     def tie_force(self) -> dict[str, float]:
-        """Forces on the first bodies of ties in the last step [N or N m]; zero where a tie does not hold."""
+        """Force of each tie on its first body in the last step [N or N m]; zero for a tie that does not hold."""
         unilateral = self._prepared.system.unilateral
         if unilateral is None:
             return {}
@@ -293,19 +319,19 @@ class Simulation:
 
     @property
     def tie_slip(self) -> dict[str, float]:
-        """Ways by which ties have slid beyond their bounds since they began, there and back [m or rad]."""
+        """Total distance that each tie has slid beyond its bound since it began, in both directions [m or rad]."""
         unilateral = self._prepared.system.unilateral
         slips = [] if unilateral is None else unilateral.tie[:, ku.TIE_GIVEN].tolist()
         return dict(zip((tie.name for tie in self.robot.ties), slips, strict=False))
 
     @property
     def operator(self) -> Operator | SnakePilot | None:
-        """Who rewrites references: of hand and base under ``controller.operator``, of a snake under ``task_space``."""
+        """Handler that rewrites references: hand and base (``controller.operator``) or a snake (``task_space``)."""
         return self._operator
 
     @property
     def time(self) -> float:
-        """Time that was last advanced to [s]."""
+        """Present time [s]."""
         return self._time
 
     @property
@@ -320,13 +346,13 @@ class Simulation:
 
     @property
     def state(self) -> State:
-        """The state at :attr:`time`."""
+        """State at :attr:`time`."""
         run = self._prepared.run
         y = run.y.copy()
         if run.count[ki.PENDING] == 1 and self._time > run.clock[ki.TIME]:
             state_within(run, self._time, y)
             if run.layout.extra > 0:
-                # Between the ends of a step it is a polynomial, also of quaternions.
+                # Within a step, quaternions are interpolated by a polynomial.
                 normalise(self._prepared.system.model, y, run.layout.q)
         q, v, current = (y[block(run.layout, name)] for name in ("q", "v", "current"))
         unilateral = self._prepared.system.unilateral
@@ -335,39 +361,61 @@ class Simulation:
         return State(self._time, q, v, current, unilateral.tie[:, ku.TIE_REST].copy())
 
     def advance(self, until: float) -> State:
-        """Integrate up to a time [s], or to the end of the run when that comes first, and return the state there.
+        """Integrate to a time [s] or to the end of the run, whichever is first, and return the state.
 
-        Callbacks of :meth:`every` and :meth:`watch` are called on the way, also those due at ``until``. An error that
-        one raises ends the call; the simulation stands at its time, and can be advanced again: that callback is not
-        called again, and what else is due at that time is called first.
+        Parameters
+        ----------
+        until : float
+            Time to reach [s], not before :attr:`time`.
+
+        Returns
+        -------
+        State
+            State at the time reached.
 
         Raises
         ------
         ScenarioError
-            A time that is past, or not a number.
+            If the time is in the past or not a number, or the call comes from a callback.
         SimulationStopped
-            Divergence, no solution, no progress, or the wall limit; ``error.record`` holds the trace until then.
+            On divergence, no solution, no progress, or the wall-clock limit; ``error.record`` contains the trace so
+            far.
         KeyboardInterrupt
-            Ctrl-C, within a second. The simulation stands at a step on the way, and can be advanced again, unless that
+            On Ctrl-C, within a second. The simulation is at a step on the way and can be advanced again, unless that
             step would have taken longer.
+
+        Notes
+        -----
+        Calls the callbacks of :meth:`every` and :meth:`watch`, including those due at ``until``. An exception from a
+        callback ends the call; the simulation stays at the time of that callback and can be advanced again. The
+        callback is not called a second time, and other callbacks due at that time are called first.
+
+        Examples
+        --------
+        >>> import dynsim
+        >>> simulation = dynsim.Simulation(dynsim.load_scenario("single_pendulum"))
+        >>> simulation.advance(0.25).time
+        0.25
+        >>> simulation.advance(100.0).time, simulation.finished
+        (10.0, True)
         """
         if self._calling is not None:
-            raise ScenarioError("a callback cannot advance the simulation that calls it")
+            raise ScenarioError("a callback cannot advance its simulation; return to the caller of advance first")
         if not isinstance(until, (int, float, np.number)) or not until >= self._time:
             raise ScenarioError(f"cannot advance to t = {brief(until)} s: the simulation is at {self._time:g} s")
         try:
             return self._advanced(min(float(until), self._end))
         except SimulationStopped as stop:
-            if stop.record is None:  # of the controller, as a snake's, whose task has failed
+            if stop.record is None:  # raised by a controller, e.g. if the task of a snake has failed
                 self._ended_by = stop
                 raise_stopped(stop, self.record())
             raise
 
     def _advanced(self, until: float) -> State:
-        # What a snapshot, or an error in a callback, has left over.
+        # Callbacks left over from a snapshot or from an error in a callback.
         self._call_due()
         last = self._references_end
-        # References of the whole run may end a rounding before it, where nothing is to be rewritten.
+        # References of a whole run may end earlier by rounding, and then nothing must be rewritten.
         if not self._frozen and until > last + END_SLACK * max(1.0, abs(last)):
             self._reach(max(last, self._time))
             if not self.finished:
@@ -376,40 +424,80 @@ class Simulation:
         return self.state
 
     def end_samples(self, time: float) -> None:
-        """Let the samples end with one at a time [s], as those of a run that ends there do; the simulation goes on.
+        """End the samples with one at a time [s]; the simulation continues.
 
-        Later records are those of a run that ends there: their events and summary too.
+        Later records are identical to records of a run that ends at this time, including events and summary.
+
+        Parameters
+        ----------
+        time : float
+            Time of the last sample [s], not before :attr:`time`.
 
         Raises
         ------
         ScenarioError
-            A time that is past, or samples that have ended already.
+            If the time is in the past, or the samples have already ended.
+
+        Examples
+        --------
+        >>> import dynsim
+        >>> simulation = dynsim.Simulation(dynsim.load_scenario("single_pendulum"))
+        >>> simulation.end_samples(0.5)
+        >>> state = simulation.advance(1.0)
+        >>> float(simulation.record().time[-1])
+        0.5
         """
         if not time >= self._time:
             raise ScenarioError(f"samples cannot end at t = {brief(time)} s: the simulation is at {self._time:g} s")
         if self._window is not None:
             raise ScenarioError(
-                f"samples have ended at t = {self._samples_end:g} s and cannot go on; restore a snapshot of before"
+                f"samples have already ended at t = {self._samples_end:g} s; restore an earlier snapshot to continue"
             )
         self._samples_end = float(time)
         self._trace.end_at(float(time), self._prepared.run)
 
     def every(self, period: float, call: Callable[[Simulation], None], *, first: float | None = None) -> None:
-        """Call back every ``period`` [s] from ``first`` on (default: now): a sampled controller.
+        """Call a function every ``period`` [s], e.g. a sampled controller.
 
-        Steps end there, and what ``call`` rewrites holds until it is rewritten again. Callbacks that are due at one
-        time are called in this order: those of :meth:`watch`; encoders, controller and operator of the scenario; then
-        the others, as they were added.
+        Parameters
+        ----------
+        period : float
+            Period [s].
+        call : callable
+            Called with the simulation.
+        first : float, optional
+            Time of the first call [s]; default: now.
+
+        Raises
+        ------
+        ScenarioError
+            If the period is too short, the first time is in the past, or there are too many ticks.
+
+        Notes
+        -----
+        Steps end at the ticks, and changes made by ``call`` remain until they are changed again. Callbacks due at the
+        same time are called in this order: callbacks of :meth:`watch`; encoders, controller and operator of the
+        scenario; then the others in the order of their registration.
+
+        Examples
+        --------
+        >>> import dynsim
+        >>> simulation = dynsim.Simulation(dynsim.load_scenario("elbow_comparison", "two_elbows"))
+        >>> calls = []
+        >>> simulation.every(0.1, lambda simulation: calls.append(simulation.time))
+        >>> state = simulation.advance(0.25)
+        >>> len(calls)
+        3
         """
         first = self._time if first is None else float(first)
         if not (period >= SHORTEST_PERIOD and math.isfinite(period) and first >= self._time):
             raise ScenarioError(
-                f"a tick needs a period of at least {SHORTEST_PERIOD:g} s and a first time from now on, "
-                f"not {period!r} and {first!r}"
+                f"period must be at least {SHORTEST_PERIOD:g} s and first must not be in the past, "
+                f"got {period!r} and {first!r}"
             )
         if len(self._calls) == MOST_TICKS:
-            raise ScenarioError(f"a simulation has at most {MOST_TICKS} ticks; call several functions at one")
-        # First, since callbacks on the way may add ticks.
+            raise ScenarioError(f"too many ticks (limit {MOST_TICKS}); call several functions from one tick")
+        # Settle first, because callbacks on the way may add ticks.
         self._settle_now()
         run = self._prepared.run
         tick = np.zeros((1, ki.TICK_SIZE))
@@ -428,28 +516,48 @@ class Simulation:
         call: Callable[[Simulation], None] | None = None,
         stop: bool = False,
     ) -> None:
-        """Locate where a quantity passes a level: an event.
+        """Register an event: locate when a quantity crosses a level.
 
         Parameters
         ----------
-        kind : ``joint_position``, ``joint_rate``, ``motor_current``, ``motor_voltage``, ``contact_force``,
-            ``contact_gap``, ``hand_position`` or ``tip_margin``
-        subject : joint, joint of the motor, contact, x, y, z of the hand, or the mobile base
-        level : [rad, m, rad/s, A, V, N, 1]
-        direction : +1 rising only, −1 falling only, 0 both
-        call : called at the event, may rewrite; ``stop`` ends the run there
+        kind : str
+            ``joint_position``, ``joint_rate``, ``motor_current``, ``motor_voltage``, ``contact_force``,
+            ``contact_gap``, ``hand_position`` or ``tip_margin``.
+        subject : str
+            Name of the joint, joint of the motor, contact, axis of the hand position (x, y, z), or mobile base.
+        level : float, optional
+            Level [rad, m, rad/s, m/s, A, V, N or 1].
+        direction : int, optional
+            +1 for rising, −1 for falling, 0 for both.
+        call : callable, optional
+            Called with the simulation at the event; may change references, forces etc.
+        stop : bool, optional
+            If True, end the run at the event.
 
         Raises
         ------
         ModelError
-            No such kind or subject.
+            If the kind or subject does not exist.
         ScenarioError
-            Under ``integrator.method: time_stepping``, which locates nothing within its steps.
+            With ``integrator.method: time_stepping``, which does not locate events within its steps.
+
+        Notes
+        -----
+        Events are listed in :attr:`happened` and in the record.
+
+        Examples
+        --------
+        >>> import dynsim
+        >>> simulation = dynsim.Simulation(dynsim.load_scenario("single_pendulum"))
+        >>> simulation.watch("joint_position", "joint_1", level=3.0, direction=1)
+        >>> state = simulation.advance(1.0)
+        >>> [(event.kind, event.name) for event in simulation.happened]
+        [('joint_position', 'joint_1')]
         """
         if conflict := WATCHED_EVENTS.conflict(self.scenario.config):
             raise ScenarioError(f"Simulation.watch {WATCHED_EVENTS.message(conflict)}")
         if kind not in GUARDS:
-            raise ModelError(f"no event {brief(kind)}; events: {', '.join(GUARDS)}")
+            raise ModelError(f"unknown event {brief(kind)}; events: {', '.join(GUARDS)}")
         number, family = GUARDS[kind]
         contacts = {contact.name: k for k, contact in enumerate(self._prepared.contacts)}
         base = {} if self.robot.base is None else {self.robot.base.body: 0}
@@ -468,22 +576,83 @@ class Simulation:
         self._restart()
 
     def set_reference(self, joint: str, position: float, rate: float = 0.0) -> None:
-        """From now on the motor of a joint follows q_d(t) = position + rate (t − now) [rad, rad/s; m, m/s].
+        """Set a linear reference for the motor of a joint: q_d(t) = position + rate (t − now).
 
-        Of an open torque ``position`` is the torque [N m]. What ``initial.equilibrium`` has moved the references by is
-        added. Voltages that ``feed_forward`` or ``brace`` has planned for this motor belong to its planned reference:
-        they do not act until :meth:`release`.
+        Parameters
+        ----------
+        joint : str
+            Joint with a motor.
+        position : float
+            Position [rad or m]; for an open torque source its torque [N m].
+        rate : float, optional
+            Rate [rad/s or m/s].
+
+        Raises
+        ------
+        ModelError
+            If the joint has no motor, or a value is not finite.
+
+        Notes
+        -----
+        The reference shift of ``initial.equilibrium`` is added. Voltages planned by ``feed_forward`` or ``brace`` for
+        this motor belong to its planned reference and are switched off until :meth:`release`.
+
+        Examples
+        --------
+        >>> import dynsim
+        >>> simulation = dynsim.Simulation(dynsim.load_scenario("elbow_comparison", "no_elbow"))
+        >>> simulation.set_reference("joint_10", 1.0, rate=0.1)
+        >>> state = simulation.advance(0.5)
         """
         self.set_references({joint: (position, rate)})
 
     def set_references(self, lines: Mapping[str, tuple[float, float]]) -> None:
-        """:meth:`set_reference` of several joints at once: (position, rate) by joint."""
+        """Set linear references for several joints at once, see :meth:`set_reference`.
+
+        Parameters
+        ----------
+        lines : mapping of str to (float, float)
+            Position [rad or m] and rate [rad/s or m/s] for each joint.
+
+        Raises
+        ------
+        ModelError
+            If a joint has no motor, or a value is not finite.
+
+        Examples
+        --------
+        >>> import dynsim
+        >>> simulation = dynsim.Simulation(dynsim.load_scenario("elbow_comparison", "no_elbow"))
+        >>> simulation.set_references({"joint_9": (-0.7, 0.0), "joint_10": (1.0, 0.1)})
+        >>> state = simulation.advance(0.5)
+        """
         if not lines:
             return
         self.set_lines(np.array([self._motor(joint) for joint in lines]), list(lines.values()))
 
     def set_lines(self, motors: NDArray[np.int64], lines: ArrayLike) -> None:
-        """:meth:`set_references` by numbers of motors in ``robot.motors``, (m,): position and rate of each, (m, 2)."""
+        """Set linear references by motor index, see :meth:`set_references`.
+
+        Parameters
+        ----------
+        motors : (m,) ndarray of int
+            Indices of motors in ``robot.motors``.
+        lines : array_like, shape (m, 2)
+            Position [rad or m] and rate [rad/s or m/s] for each motor.
+
+        Raises
+        ------
+        ModelError
+            If a value is not a finite number.
+
+        Examples
+        --------
+        >>> import dynsim
+        >>> import numpy as np
+        >>> simulation = dynsim.Simulation(dynsim.load_scenario("elbow_comparison", "no_elbow"))
+        >>> simulation.set_lines(np.array([8, 9]), [[-0.7, 0.0], [1.0, 0.1]])
+        >>> state = simulation.advance(0.5)
+        """
         values = _finite("reference", lines)
         if (balance := self._prepared.balance) is not None:
             values[:, 0] += balance.shift[motors]
@@ -492,7 +661,7 @@ class Simulation:
         self._leave_plan(self.robot.motors[a].joint for a in motors)
 
     def _follow_lines(self, motors: NDArray[np.int64], values: Array) -> None:
-        """Let motors follow lines from now on, values (motors, 2)."""
+        """Set linear references of motors from now on, values (motors, 2)."""
         self._settle_now()
         drives, reference = self._prepared.system.drives, self._prepared.system.reference
         reference.spline[motors], drives.table[motors, ka.SAMPLED] = ka.REWRITTEN, self._sampled[motors]
@@ -501,12 +670,36 @@ class Simulation:
         self._restart()
 
     def _plan_voltages(self, motors: NDArray[np.int64], share: float) -> None:
-        """Let a share of the planned voltages act on motors: 1 along their planned references, 0 along others."""
+        """Apply a share of the planned voltages to motors: 1 along planned references, 0 along other references."""
         if len(planned := self._voltages):
             self._prepared.system.reference.voltage[:, motors] = share * planned[:, motors]
 
     def set_command(self, joint: str, command: float) -> None:
-        """Hold the command of a motor: the voltage of a motor or servo [V], the torque of an open torque [N m]."""
+        """Set a constant command of a motor, independent of its controller.
+
+        Parameters
+        ----------
+        joint : str
+            Joint with a motor.
+        command : float
+            Voltage of a motor or servo [V], or torque of an open torque source [N m].
+
+        Raises
+        ------
+        ModelError
+            If the joint has no motor, or the command is not finite.
+
+        Notes
+        -----
+        :meth:`release` returns the motor to the controller.
+
+        Examples
+        --------
+        >>> import dynsim
+        >>> simulation = dynsim.Simulation(dynsim.load_scenario("elbow_comparison", "no_elbow"))
+        >>> simulation.set_command("joint_10", 1.5)
+        >>> state = simulation.advance(0.1)
+        """
         a = self._motor(joint)
         value = _finite("command", [command])[0]
         self._settle_now()
@@ -516,48 +709,108 @@ class Simulation:
         self._leave_plan([joint])
 
     def _leave_plan(self, joints: Iterable[str]) -> None:
-        """Remember that a wheel of the base does not do any more what the scenario says."""
+        """Record that a wheel of the base no longer follows the scenario."""
         base = self.robot.base
         if base is not None and any(joint in base.wheels for joint in joints):
             self._base_as_planned = False
 
     def set_mode(self, joint: str, mode: str) -> None:
-        """Let a servo follow positions (``"position"``) or rates (``"velocity"``) of its reference, or switch it off.
+        """Set the mode of a servo.
 
-        ``"off"`` opens its circuit, and the drag of its gear is left. It must have the gain of the mode.
+        Parameters
+        ----------
+        joint : str
+            Joint with a servo.
+        mode : str
+            ``"position"`` or ``"velocity"`` to follow positions or rates of its reference; ``"off"`` opens its circuit,
+            and only the drag of its gear remains.
+
+        Raises
+        ------
+        ModelError
+            If the mode does not exist, the motor is not a servo, or the servo has no gain for the mode.
+
+        Examples
+        --------
+        >>> import dynsim
+        >>> motor = {"plant.chain.0.motor": {"type": "mx_106"}}
+        >>> simulation = dynsim.Simulation(dynsim.load_scenario("single_pendulum", overrides=motor))
+        >>> simulation.set_mode("joint_1", "off")
+        >>> state = simulation.advance(0.1)
         """
         a = self._motor(joint)
         number = _index(SERVO_MODES, mode, "mode")
         drives = self._prepared.system.drives
         if drives.table[a, ka.DRIVE_KIND] != ka.POSITION_SERVO:
-            raise ModelError(f"the motor of {joint} is no servo and has no modes")
+            raise ModelError(f"the motor of {joint} is not a servo; only servos have modes")
         gain = {ka.POSITION_MODE: ka.K_P, ka.VELOCITY_MODE: ka.K_V}.get(number)
         if gain is not None and drives.motor[a, gain] == 0.0:
-            raise ModelError(f"the servo of {joint} has no gain in mode {mode}")
+            raise ModelError(f"the servo of {joint} has no gain for mode {mode}")
         self._settle_now()
         drives.table[a, ka.SERVO_MODE] = number
         self._restart()
 
     def set_supply(self, voltage: float) -> None:
-        """From now on the supply of all motors limits their voltages to this one [V], whatever limits they had."""
+        """Limit the voltage of all motors [V] from now on, replacing their own limits.
+
+        Parameters
+        ----------
+        voltage : float
+            Supply voltage [V], not negative.
+
+        Raises
+        ------
+        ModelError
+            If the voltage is negative or not finite.
+
+        Examples
+        --------
+        >>> import dynsim
+        >>> simulation = dynsim.Simulation(dynsim.load_scenario("elbow_comparison", "no_elbow"))
+        >>> simulation.set_supply(12.0)
+        >>> state = simulation.advance(0.1)
+        """
         value = _finite("supply", [voltage])[0]
         if value < 0.0:
-            raise ModelError(f"a supply of {voltage:g} V; it must not be negative")
+            raise ModelError(f"voltage must not be negative, got {voltage:g} V")
         self._settle_now()
         self._prepared.system.drives.motor[:, ka.U_MAX] = value
         self._restart()
 
     def set_brake(self, joint: str, closed: bool) -> None:
-        """Close or open the brake that every joint is thought to have: it holds the joint where it is.
+        """Lock or release a joint with an ideal brake.
 
-        A joint that turns is brought to rest by an impulse, Δv = −M⁻¹ e v_j / (eᵀ M⁻¹ e) with e the joint's unit vector
-        and M with rotors, and joint losses of the ledger take the kinetic energy, ½ v_j² / (eᵀ M⁻¹ e). Contacts and
-        couplings answer with impulses of their own: what these take is impact loss under the unilateral law, joint loss
-        under the bilateral one. A contact that braked joints alone would move along its normal is left out meanwhile.
+        Parameters
+        ----------
+        joint : str
+            Any joint that is not coupled to another.
+        closed : bool
+            True to lock the joint at its present position, False to release it.
+
+        Raises
+        ------
+        ModelError
+            If the joint does not exist or is coupled to another.
+
+        Notes
+        -----
+        A moving joint is stopped by an impulse, Δv = −M⁻¹ e v_j / (eᵀ M⁻¹ e), with the unit vector e of the joint and M
+        including rotors. Its kinetic energy, ½ v_j² / (eᵀ M⁻¹ e), counts as joint loss in the ledger. Contacts and
+        couplings react with separate impulses: their energy counts as impact loss under the unilateral law and as joint
+        loss under the bilateral law. A contact that only braked joints would move along its normal is left out
+        meanwhile.
+
+        Examples
+        --------
+        >>> import dynsim
+        >>> simulation = dynsim.Simulation(dynsim.load_scenario("elbow_comparison", "no_elbow"))
+        >>> simulation.set_brake("joint_2", closed=True)
+        >>> bool(abs(simulation.advance(0.1).v[1]) < 1e-6)
+        True
         """
         j = _index(self._joints, joint, "joint")
         if any(joint in (coupling.joint, coupling.leader) for coupling in self.robot.couplings):
-            raise ModelError(f"{joint}: a joint that is coupled to another has no brake of its own")
+            raise ModelError(f"{joint} is coupled to another joint and cannot be braked; only uncoupled joints can")
         model = self._prepared.model
         armature = model.arrays.body[:, ka.ARMATURE]
         if closed == (armature[j] == ka.BRAKED):
@@ -591,35 +844,52 @@ class Simulation:
         stiffness: float | None = None,
         damping: float | None = None,
     ) -> None:
-        """Let a tie begin or end, or change its spring and damper; what is not given stays as it is.
-
-        A tie that begins has no force where its bodies are then, unless the scenario states its rest. What is added to
-        a spring is not deflected yet, x_0 moves so that the force stays, as in a gripper that hardens in the shape
-        that it has; what is taken from a spring takes its force with it. Both take energy from the spring, which
-        counts as lost in its damper, and so does all of it when a tie ends.
-
-        >>> simulation.set_tie("grip", holds=True)
+        """Start or end a tie, or change its spring and damper; omitted values remain unchanged.
 
         Parameters
         ----------
-        name : a key of the scenario's ``ties``
-        stiffness, damping : [N/m, N s/m; N m/rad, N m s/rad]
+        name : str
+            Key of the scenario's ``ties``.
+        holds : bool, optional
+            True to start the tie, False to end it.
+        stiffness : float, optional
+            Stiffness [N/m or N m/rad].
+        damping : float, optional
+            Damping [N s/m or N m s/rad].
 
         Raises
         ------
         ModelError
-            No such tie, a negative value, or neither a stiffness nor a damping.
+            If the tie does not exist, a value is negative, or both stiffness and damping would be zero.
+
+        Notes
+        -----
+        A tie that starts has no force at the present position of its bodies, unless the scenario sets its rest value.
+        Added stiffness starts undeflected: x_0 moves so that the force stays the same, as in a gripper that hardens in
+        its present shape. Removed stiffness takes its share of the force with it. Both take energy from the spring,
+        which counts as lost in its damper; when a tie ends, all its energy does.
+
+        Examples
+        --------
+        >>> import dynsim
+        >>> tie = {"type": "linear", "body": "link_5", "other": "world", "axis": [0, 0, 1], "damping_N_s_per_m": 5.0}
+        >>> changes = {"ties": {"string": tie}, "integrator.method": "time_stepping"}
+        >>> simulation = dynsim.Simulation(dynsim.load_scenario("falling_arm", overrides=changes))
+        >>> simulation.set_tie("string", stiffness=100.0)
+        >>> state = simulation.advance(0.05)
+        >>> list(simulation.tie_force)
+        ['string']
         """
         ties = {tie.name: k for k, tie in enumerate(self.robot.ties)}
         k = _index(ties, name, "tie")
         asked = {"stiffness": stiffness, "damping": damping}
         values = {key: _finite(key, [value])[0] for key, value in asked.items() if value is not None}
         unilateral = self._prepared.system.unilateral
-        assert unilateral is not None  # ties need that law
+        assert unilateral is not None  # ties require this law
         before, c = unilateral.tie[k, [ku.TIE_STIFFNESS, ku.TIE_DAMPING]]
         after = values.get("stiffness", float(before))
         if min(values.values(), default=0.0) < 0.0 or not after + values.get("damping", float(c)) > 0.0:
-            raise ModelError(f"tie {name}: needs a stiffness or a damping, neither negative")
+            raise ModelError(f"tie {name}: stiffness or damping must be positive, and neither negative")
         self._settle_now()
         prepared, tie = self._prepared, self.robot.ties[k]
         assert prepared.system.unilateral is not None
@@ -627,7 +897,7 @@ class Simulation:
         y, layout = prepared.run.y, prepared.run.layout
         q, stored = y[block(layout, "q")], float(row[ku.TIE_STORED])
         if table[ku.TIE_HOLDS] == 1 and after != before:
-            # A one-sided tie without contact has no force that could be kept.
+            # A one-sided tie without contact has no force to keep.
             if after > before and (stored > 0.0 or not tie.pushes):
                 x = deflection(prepared.model, prepared.system.unilateral, k, q)
                 row[ku.TIE_REST] += x * (1.0 - before / after)
@@ -635,11 +905,11 @@ class Simulation:
         row[ku.TIE_STIFFNESS], row[ku.TIE_DAMPING] = after, values.get("damping", float(c))
         if holds is not None and holds != (table[ku.TIE_KIND] >= 0):
             table[ku.TIE_KIND] = (kc.ONE_WAY if tie.pushes else kc.BOX) if holds else -1
-            if holds and table[ku.TIE_HOLDS] == 1:  # it has ended and begins anew, without a step between
+            if holds and table[ku.TIE_HOLDS] == 1:  # the tie ended and starts again, without a step in between
                 row[[ku.TIE_STORED, ku.TIE_GIVEN, ku.TIE_FORCE, ku.TIE_TURNED]] = 0.0
             row[ku.TIE_REST] = tie.rest
             if holds and math.isnan(tie.rest):
-                # Not by the first step, whose geometry is that of its middle.
+                # Set here, because the geometry of the first step is that at its midpoint.
                 rest_here(prepared.model, prepared.system.unilateral, k, q)
         lost = stored - row[ku.TIE_STORED]
         y[layout.elastic + kst.STORED] -= lost
@@ -647,7 +917,26 @@ class Simulation:
         self._restart()
 
     def release(self, joint: str) -> None:
-        """Give a motor back to the controller and references of the scenario."""
+        """Return a motor to the controller and references of the scenario.
+
+        Parameters
+        ----------
+        joint : str
+            Joint with a motor.
+
+        Raises
+        ------
+        ModelError
+            If the joint has no motor.
+
+        Examples
+        --------
+        >>> import dynsim
+        >>> simulation = dynsim.Simulation(dynsim.load_scenario("elbow_comparison", "no_elbow"))
+        >>> simulation.set_command("joint_10", 0.0)
+        >>> state = simulation.advance(0.1)
+        >>> simulation.release("joint_10")
+        """
         a = self._motor(joint)
         self._settle_now()
         self._prepared.system.reference.spline[a] = self._splines[a]
@@ -666,17 +955,39 @@ class Simulation:
         point: ArrayLike = (0.0, 0.0, 0.0),
         in_body: bool = False,
     ) -> None:
-        """From now on a force [N] and a torque [N m] act on a point of a body, instead of what was set before.
+        """Apply a constant force and torque to a body from now on.
+
+        Replaces a wrench set earlier on the same body.
 
         Parameters
         ----------
-        point : in the body's frame [m]
-        in_body : components are in the axes of the body, else of the world
+        body : str
+            Name of a body of the robot.
+        force : array_like, shape (3,), optional
+            Force [N]; default: zero.
+        torque : array_like, shape (3,), optional
+            Torque [N m]; default: zero.
+        point : array_like, shape (3,), optional
+            Point of application in the body's frame [m]; default: the origin.
+        in_body : bool, optional
+            If True, `force` and `torque` are in body axes; default: world axes.
+
+        Raises
+        ------
+        ModelError
+            If `body` does not exist, or a value is not three finite numbers.
+
+        Examples
+        --------
+        >>> import dynsim
+        >>> simulation = dynsim.Simulation(dynsim.load_scenario("elbow_comparison", "two_elbows"))
+        >>> simulation.set_wrench("link_10", force=[0.0, 0.0, -2.0])
+        >>> state = simulation.advance(0.1)
         """
         k = _index(self._pushes, body, "body")
         values = _finite("wrench", [*np.ravel(point), *np.ravel(force), *np.ravel(torque)])
         if len(values) != 9:
-            raise ModelError("point, force and torque have three components each")
+            raise ModelError("point, force and torque must have three components each")
         self._settle_now()
         loads = self._prepared.system.loads
         offset = loads.table[k, kl.DATA]
@@ -689,91 +1000,141 @@ class Simulation:
     def linearize(
         self, inputs: Sequence[str] = ("command",), outputs: Sequence[str] = ("hand_position",)
     ) -> Linearization:
-        """Linear equations of the whole system about the present state: δẋ = A δx + B δu, δy = C δx + D δu.
-
-        x is q, v and the currents of motors with a circuit; contacts, stops and couplings are held as they are now, and
-        the controller is part of the system. A sampled one counts as continuous: its period, and the delay, resolution
-        and rates of encoders, are left out. Commands that the caller holds, and the references of an operator or of a
-        snake's controller, stay as they are. The simulation stays as it is.
-
-        >>> A, B, C, D = simulation.linearize(inputs=["reference"], outputs=["hand_position", "contact_normal_force"])
+        """Linearize the complete system about the present state: δẋ = A δx + B δu, δy = C δx + D δu.
 
         Parameters
         ----------
-        inputs : ``command`` of motors, beyond what the controller asks for [V; N m of an open torque], ``reference``
-            [rad or m], ``reference_rate``, ``force`` [N] and ``torque`` [N m] on bodies, in the axes of the wrench
-            that is set; a family of them, or one: ``"command.joint_3"``, ``"force.link_10.z"``
-        outputs : ``q``, ``v``, ``current``, ``vdot``, ``voltage``, ``motor_torque``, ``hand_position``,
-            ``contact_normal_force``, ``contact_force``, ``contact_gap``, likewise
+        inputs : sequence of str, optional
+            ``command`` of motors, in addition to the controller's command [V; N m for an open torque source],
+            ``reference`` [rad or m], ``reference_rate``, ``force`` [N] and ``torque`` [N m] on bodies, in the axes of
+            the present wrench; a whole family or a member: ``"command.joint_3"``, ``"force.link_10.z"``.
+        outputs : sequence of str, optional
+            ``q``, ``v``, ``current``, ``vdot``, ``voltage``, ``motor_torque``, ``hand_position``,
+            ``contact_normal_force``, ``contact_force``, ``contact_gap``, or their members.
+
+        Returns
+        -------
+        Linearization
+            Matrices A, B, C, D with the names of states, inputs and outputs.
 
         Raises
         ------
         ScenarioError
-            No such input or output, or ``integrator.method: time_stepping``, which knows no modes between its steps.
+            If an input or output does not exist, or with ``integrator.method: time_stepping``, which has no modes
+            between its steps.
+
+        Notes
+        -----
+        x contains q, v and the currents of motors with a circuit. Contacts, stops and couplings keep their present
+        modes, and the controller is part of the system. A sampled controller counts as continuous: its period, and
+        delay, resolution and rates of encoders, are neglected. Commands set by the caller, and the references of an
+        operator or of a snake's controller, stay constant. The simulation is not changed. Derivatives are central
+        differences of sixth order.
+
+        Examples
+        --------
+        >>> import dynsim
+        >>> simulation = dynsim.Simulation(dynsim.load_scenario("elbow_comparison", "two_elbows"))
+        >>> A, B, C, D = simulation.linearize(inputs=["reference"], outputs=["hand_position", "contact_normal_force"])
+        >>> A.shape, B.shape, C.shape
+        ((30, 30), (30, 10), (5, 30))
         """
         if conflict := LINEARIZATION.conflict(self.scenario.config):
             raise ScenarioError(f"Simulation.linearize {LINEARIZATION.message(conflict)}")
-        before = self._kept()
+        before = self._saved()
         try:
             self._settle_now(calling=False)
             if self._prepared.run.count[ki.STARTED] == 0:
-                # Modes of contacts are chosen where a step starts; none is taken.
+                # Contact modes are chosen at the start of a step; no step is taken here.
                 driver.advance(self._prepared.system, self._prepared.workspace, self._prepared.run, 0)
             return linearized(self._prepared, inputs, outputs)
         finally:
-            self._go_back(before)
+            self._restore_arrays(before)
 
     def snapshot(self) -> Snapshot:
-        """Return everything that :meth:`restore` needs to continue from here.
+        """Save the complete simulation state for :meth:`restore`.
 
-        A callback may take a snapshot too. It contains the changes that the callback has made before, but not its later
-        ones, and :meth:`restore` does not call that callback again. Other callbacks that are due at this time and have
-        not been called yet are called by the next :meth:`advance`. Variables of callbacks are not in the snapshot.
+        Returns
+        -------
+        Snapshot
+            State that only this simulation can restore.
 
         Raises
         ------
         ScenarioError
-            Within the tick of the scenario's own operator, of which half would be lost.
+            Within the tick of the scenario's operator, half of which would be lost.
+
+        Notes
+        -----
+        A callback may take a snapshot. The snapshot contains the changes that the callback has made so far, but not its
+        later ones, and :meth:`restore` does not call that callback again. Other callbacks due at this time are called
+        by the next :meth:`advance`. Variables of callbacks are not part of the snapshot.
+
+        Examples
+        --------
+        >>> import dynsim
+        >>> simulation = dynsim.Simulation(dynsim.load_scenario("single_pendulum"))
+        >>> snapshot = simulation.snapshot()
+        >>> first = simulation.advance(0.5).q
+        >>> simulation.restore(snapshot)
+        >>> bool((simulation.advance(0.5).q == first).all())
+        True
         """
         if any(self._calling is call for call in self._own_calls):
             raise ScenarioError(
-                "an operator, or the source of its commands, cannot take a snapshot of the simulation that asks it: "
-                "only callbacks of Simulation.every can, or the caller between two calls of advance"
+                "an operator or its command source cannot take a snapshot of its simulation; take it in a callback of "
+                "Simulation.every, or between two calls of advance"
             )
-        return self._kept()
+        return self._saved()
 
-    def _kept(self) -> Snapshot:
-        """Return the snapshot; one from the middle of an operator's tick is only good to go back to at once."""
+    def _saved(self) -> Snapshot:
+        """Return the snapshot; one taken within an operator's tick may only be restored immediately."""
         arrays = {name: array.copy() for name, array in self._arrays().items()}
-        attendants = [attendant.remembered() for attendant in self._attendants]
+        tick_handlers = [handler.saved_state() for handler in self._tick_handlers]
         trace, happened, pushed = self._trace.snapshot(), tuple(self._happened), frozenset(self._pushed)
         shown = (pushed, self._base_as_planned, self._prepared.behind_brakes)
         due, window = tuple(self._due), (self._samples_end, self._window)
-        return Snapshot(self._token, arrays, self._time, trace, happened, *shown, self._frozen, attendants, due, window)
+        return Snapshot(
+            self._token, arrays, self._time, trace, happened, *shown, self._frozen, tick_handlers, due, window
+        )
 
     def restore(self, snapshot: Snapshot) -> None:
-        """Go back to a snapshot of this simulation: the same future, bit for bit.
+        """Restore a snapshot of this simulation; it then continues bit-identically.
+
+        Parameters
+        ----------
+        snapshot : Snapshot
+            Result of :meth:`snapshot`.
 
         Raises
         ------
         ScenarioError
-            Events or ticks were added since, or the snapshot is of another simulation; within a callback.
+            If events or ticks were added since, the snapshot belongs to another simulation, or the call comes from a
+            callback.
+
+        Examples
+        --------
+        >>> import dynsim
+        >>> simulation = dynsim.Simulation(dynsim.load_scenario("single_pendulum"))
+        >>> snapshot = simulation.snapshot()
+        >>> state = simulation.advance(0.5)
+        >>> simulation.restore(snapshot)
+        >>> simulation.time
+        0.0
         """
         if self._calling is not None:
-            raise ScenarioError(
-                "a callback cannot restore the simulation that calls it; restore it after advance has returned"
-            )
+            raise ScenarioError("a callback cannot restore its simulation; restore it after advance has returned")
         if not isinstance(snapshot, Snapshot):
-            raise ScenarioError(f"a simulation is restored from its snapshot, not from {brief(snapshot)}")
+            raise ScenarioError(f"snapshot must be a Snapshot of this simulation, got {brief(snapshot)}")
         own = self._arrays()
         sizes = ({k: a.shape for k, a in arrays.items() if k not in _BUFFERS} for arrays in (own, snapshot.arrays))
         if snapshot.owner is not self._token or next(sizes) != next(sizes):
-            raise ScenarioError("the snapshot is of another simulation, or ticks or events were added since")
-        self._go_back(snapshot)
+            raise ScenarioError("the snapshot belongs to another simulation, or ticks or events were added since")
+        self._restore_arrays(snapshot)
         self._ended_by = None
 
-    def _go_back(self, snapshot: Snapshot) -> None:
-        """Take everything from a snapshot that fits."""
+    def _restore_arrays(self, snapshot: Snapshot) -> None:
+        """Restore all arrays and values from a snapshot that fits."""
         self._swap(**{field: snapshot.arrays[name].copy() for name, field in (_BUFFERS | _TABLES).items()})
         for name, array in self._arrays().items():
             array[...] = snapshot.arrays[name]
@@ -781,37 +1142,55 @@ class Simulation:
         self._time, self._frozen, self._happened = snapshot.time, snapshot.frozen, list(snapshot.happened)
         self._pushed, self._base_as_planned = set(snapshot.pushed), snapshot.base_as_planned
         self._prepared = replace(self._prepared, behind_brakes=snapshot.behind_brakes)
-        for attendant, kept in zip(self._attendants, snapshot.attendants, strict=True):
-            attendant.restore(kept)
+        for handler, kept in zip(self._tick_handlers, snapshot.tick_handlers, strict=True):
+            handler.restore(kept)
         self._due = list(snapshot.due)
         self._samples_end, self._window = snapshot.window
 
     def record(self, scenario: Scenario | None = None, *, pictured: bool = True) -> Record:
-        """Record of the trace so far, with a summary of the run up to now; of a ring, of its samples alone.
-
-        ``complete`` is True for a run that has come to its end.
+        """Return the record of the trace so far, with a summary of the run up to now.
 
         Parameters
         ----------
-        scenario : that the record is said to be of, where it was found on the way; default: what is simulated
-        pictured : with scene and poses of bodies
+        scenario : Scenario, optional
+            Scenario to name in the record if it was built during the run; default: the scenario of the simulation.
+        pictured : bool, optional
+            If False, omit the scene and the poses of bodies.
+
+        Returns
+        -------
+        Record
+            Signals, events and summary; ``complete`` is True if the run has reached its end.
+
+        Notes
+        -----
+        With a limited ``trace``, the summary covers the kept samples only.
+
+        Examples
+        --------
+        >>> import dynsim
+        >>> simulation = dynsim.Simulation(dynsim.load_scenario("elbow_comparison", "two_elbows"))
+        >>> state = simulation.advance(0.5)
+        >>> record = simulation.record()
+        >>> float(record.time[-1]), record.complete
+        (0.5, False)
         """
         wall = self._wall
         if self._window is None and self.finished:
             record = self._record_now(scenario, pictured, wall)
         else:
-            # Samples, tallies and events are to be of one time, and that may lie in the step that is kept back: end the
-            # step here, begin the next one, and take that back.
-            before = self._kept()
+            # Samples, tallies and events must refer to the same time, which may lie in the pending step: end the step
+            # here, start the next one, and undo this afterwards.
+            before = self._saved()
             try:
                 if self._window is not None:
                     there, wall = self._window
-                    self._go_back(there)
+                    self._restore_arrays(there)
                 else:
                     self._end_here()
                 record = self._record_now(scenario, pictured, wall)
             finally:
-                self._go_back(before)
+                self._restore_arrays(before)
         record.complete = self.finished
         if self._failed():
             mark_stopped(stopped(self._scenario, self._prepared), record)
@@ -820,7 +1199,7 @@ class Simulation:
         return record
 
     def _end_here(self) -> None:
-        """End a step at the present time, and record the sample there; to be taken back."""
+        """End a step at the present time, and record the sample there; the caller undoes this."""
         self._settle_now(calling=False)
         if not self._loaded:
             return
@@ -829,39 +1208,41 @@ class Simulation:
             self._refill()
             run = self._prepared.run
         row, now = int(run.count[ki.SAMPLE]), float(run.clock[ki.TIME])
-        # Time stepping has recorded it.
+        # Time stepping has already recorded it.
         late = run.stepping is None and abs(run.sample_time[row] - now) <= TICK_SLACK * max(1.0, abs(now))
         if late:
-            # A step that ends a rounding before a sample leaves it to the next one. At a start, the sample at this time
-            # is written again, whatever is there.
+            # A step that ends before a sample by rounding leaves it to the next step. At a start, the sample at this
+            # time is written again, whatever its content.
             run.count[ki.SAMPLE], run.count[ki.STARTED], run.sample[row] = row + 1, 0, np.nan
         self._kernel(self._prepared.system, self._prepared.workspace, run, 0)
         if late and np.isnan(run.sample[row]).any():
-            # There is no start from here.
+            # No start is possible from here.
             run.count[ki.SAMPLE] = row
 
     def _keep_window(self, until: float) -> None:
-        """Keep what there is at the end of the samples, before the pending step passes it on the way to a time."""
+        """Save the state at the end of the samples, before the pending step passes it on the way to a time."""
         run, end = self._prepared.run, self._samples_end
         passes = run.count[ki.PENDING] == 1 and run.clock[ki.TIME] + run.clock[ki.STEP] > end
         if self._window is not None or not (passes and until > end):
             return
-        before = self._kept()
+        before = self._saved()
         try:
             self._time = end
             self._end_here()
-            window = self._kept(), self._wall
+            window = self._saved(), self._wall
         finally:
-            self._go_back(before)
+            self._restore_arrays(before)
         self._window = window
 
-    def _hold(self, until: float) -> float:
-        """Time beyond which a step on the way to another time is kept back: buffer or samples end there [s]."""
+    def _hold_time(self, until: float) -> float:
+        """Return the time beyond which a step on the way to another time must wait: end of the buffer or of the samples
+        [s].
+        """
         last, end = float(self._prepared.run.sample_time[-1]), self._samples_end
         return min(last, end) if self._window is None and until > end else last
 
     def _record_now(self, scenario: Scenario | None, pictured: bool, wall: float) -> Record:
-        """Record of the arrays as they are, whose run has taken so much wall time [s]."""
+        """Return the record of the present arrays of a run that took ``wall`` [s]."""
         run = self._prepared.run
         times, states, outputs = self._trace.rows(run)
         y = run.y
@@ -886,16 +1267,16 @@ class Simulation:
             pictured=pictured,
             begun=self._begun,
         )
-        record.summary["warnings"] += self._said
-        for attendant in self._attendants:
-            attendant.add_to(record)
+        record.summary["warnings"] += self._warnings
+        for handler in self._tick_handlers:
+            handler.add_to(record)
         return record
 
     def _motor(self, joint: str) -> int:
         return _index(self._motors, joint, "motor")
 
-    def _take(self, state: State) -> None:
-        """Start at a given state."""
+    def _start_from(self, state: State) -> None:
+        """Start from a state."""
         run, model = self._prepared.run, self._prepared.model
         at_start = run.y[block(run.layout, "q")].copy()
         for name in ("q", "v", "current"):
@@ -903,7 +1284,8 @@ class Simulation:
             values = _finite(name, np.ravel(getattr(state, name)))
             circuits = self._prepared.system.drives.table[:, ka.CIRCUIT] >= 0
             if name == "current" and len(values) == len(circuits):
-                # Records have a current for each motor; those without a circuit follow from the rest.
+                # Records have a current for each motor; currents of motors without a circuit follow from the other
+                # values.
                 values = values[circuits]
             if values.shape != run.y[part].shape:
                 raise ModelError(
@@ -914,27 +1296,27 @@ class Simulation:
         check_couplings(model.robot, q)
         beyond = START_TOLERANCE
         if run.method == ki.TIME_STEPPING:
-            # What has landed is below its surface, or beyond its stop, by up to a step of its speed.
+            # Landed points are below their surface, and joints beyond their stop, by up to a step at their speed.
             beyond = max(beyond, float(run.clock[ki.STEP]) * FASTEST_LANDING)
         if self._prepared.system.unilateral is not None:
             joint_stops(model.robot, q, beyond)
         check_start(self._scenario, model, self._prepared.contacts, q, beyond)
         if (unilateral := self._prepared.system.unilateral) is not None and model.robot.ties:
-            self._take_ties(unilateral, at_start, state.tie_rest)
+            self._restore_ties(unilateral, at_start, state.tie_rest)
 
-    def _take_ties(self, unilateral: UnilateralArrays, at_start: Array, rests: Array | None) -> None:
-        """Let ties go on from where they have slid to; at_start: coordinates of the scenario's start, (nq,)."""
+    def _restore_ties(self, unilateral: UnilateralArrays, at_start: Array, rests: Array | None) -> None:
+        """Continue ties from the point they have slid to; at_start: coordinates of the scenario's start, (nq,)."""
         model, ties = self._prepared.model, self._prepared.model.robot.ties
         if rests is not None and np.shape(rests) != (len(ties),):
             raise ModelError(f"the state has {np.size(rests)} values of tie_rest, {model.robot.name} has {len(ties)}")
         set_rests(model, unilateral, at_start, rests)
         slid = [tie.name for tie in ties if may_have_slid(tie)]
         if rests is None and slid:
-            self._said.append(
-                f"{first_few(slid)}: the state does not say how far ties have slid beyond their bounds (tie_rest); "
-                "they start as if they never had; go on from Simulation.state, or from a snapshot"
+            self._warnings.append(
+                f"{first_few(slid)}: the state does not contain how far ties have slid beyond their bounds (tie_rest); "
+                "they start without slip; start from Simulation.state or from a snapshot"
             )
-            log.warning("%s: %s", self._scenario.title, self._said[-1])
+            log.warning("%s: %s", self._scenario.title, self._warnings[-1])
 
     def _reach(self, asked: float) -> None:
         """Integrate until the step that would pass a time is pending, or ends there."""
@@ -942,7 +1324,7 @@ class Simulation:
         while not self.finished and self._time < until:
             self._keep_window(until)
             run = self._prepared.run
-            # A tick that differs from the time asked for by roundings is not left for later.
+            # Include a tick that differs from the requested time by rounding.
             slack = TICK_SLACK * max(1.0, abs(asked))
             near = run.tick[:, ki.TICK_NEXT] if len(self._calls) else np.zeros(0)
             near = near[np.abs(near - asked) <= slack]
@@ -960,33 +1342,34 @@ class Simulation:
         self._time = until if not self.finished else float(self._prepared.run.clock[ki.TIME])
 
     def _piece(self, until: float) -> None:
-        """One compiled piece, and what it wants its caller to look at."""
+        """Run one piece of compiled code, and the callbacks that are due after it."""
         run = self._prepared.run
         if run.count[ki.PENDING] == 1:
             self._refill(run.clock[ki.TIME] + run.clock[ki.STEP])
             run = self._prepared.run
-        run.clock[ki.HOLD] = min(until, self._hold(until))
+        run.clock[ki.HOLD] = min(until, self._hold_time(until))
         begun = clock.perf_counter()
-        raised = self._attended(_PIECE, interruption.check)
+        raised = self._run_piece(_PIECE, interruption.check)
         self._wall += clock.perf_counter() - begun
-        self._take_due(raised)
+        self._collect_due(raised)
         self._call_due()
         if raised is not None:
             self._time = max(self._time, float(self._prepared.run.clock[ki.TIME]))
             raise raised
 
-    def _attended(self, limit: int, look: Callable[[], None]) -> BaseException | None:
-        """One compiled piece; what ``look`` has raised meanwhile, or a signal."""
+    def _run_piece(self, limit: int, look: Callable[[], None]) -> BaseException | None:
+        """Run one piece of compiled code and return the exception raised meanwhile by ``look`` or by a signal."""
         if not self._loaded:
             stopping.load(self._prepared)
             self._loaded = True
         self._prepared, raised = stopping.advance(self._prepared, limit, self._watch, look, self._kernel)
         return raised
 
-    def _take_due(self, raised: BaseException | None) -> None:
-        """Empty the log of the kernels, and note the callbacks that are due at the present end of the run.
+    def _collect_due(self, raised: BaseException | None) -> None:
+        """Empty the log of the kernels, and collect the callbacks due at the present end of the run.
 
-        All before the first call, so that a snapshot in a callback has all events and due callbacks of this time.
+        All are collected before the first call, so that a snapshot in a callback has all events and due callbacks of
+        this time.
         """
         run = self._prepared.run
         for time, e in take_log(run):
@@ -1000,7 +1383,7 @@ class Simulation:
         if not self._failed():
             self._due += [call for k, call in enumerate(self._calls) if ticked & (ki.CALLER << k)]
         elif raised is None:
-            self._due.append(Simulation._say_stopped)
+            self._due.append(Simulation._raise_stopped)
         if self._due:
             self._time = float(run.clock[ki.TIME])
 
@@ -1013,28 +1396,27 @@ class Simulation:
             finally:
                 self._calling = None
 
-    def _say_stopped(self) -> None:
+    def _raise_stopped(self) -> None:
         raise_stopped(stopped(self._scenario, self._prepared), self.record())
 
     def _failed(self) -> bool:
-        """True for a run that has ended, and not where it was to end."""
+        """Return whether the run has ended before its regular end."""
         return (
             bool(self._prepared.run.count[ki.STATUS] not in (ki.RUNNING, ki.FINISHED, ki.STOPPED)) or self._overturned()
         )
 
     def _overturned(self) -> bool:
-        """True when the base has tipped and its scenario says that runs stop there."""
+        """Return whether the base has tipped and the scenario ends the run there."""
         base = self.robot.base
         if base is None or not base.stop_on_overturn or self._prepared.run.count[ki.STATUS] != ki.STOPPED:
             return False
         return any(event.kind == TIP_OVER for event in self._happened)
 
     def _settle_now(self, *, calling: bool = True) -> None:
-        """End a step at the present time, when it lies within one.
+        """End a step at the present time if it lies within one.
 
-        Parameters
-        ----------
-        calling : with callbacks at events that only the shorter steps find, at their times; False: it is undone
+        ``calling`` is True to call callbacks at events that only the shorter steps detect, at their times; with False
+        the caller undoes this.
         """
         run, now = self._prepared.run, self._time
         if run.count[ki.PENDING] == 0 or self.finished:
@@ -1042,8 +1424,8 @@ class Simulation:
         run.count[[ki.PENDING, ki.SEARCHING, ki.FIRED]] = 0
         step = run.clock[ki.STEP] = max(run.clock[ki.PROPOSED], run.clock[ki.STEP])
         if now > run.clock[ki.TIME]:
-            self._go_to(now, calling)
-            # Where a piece was left alone there are copies.
+            self._integrate_to(now, calling)
+            # An abandoned piece leaves copies.
             run = self._prepared.run
             if self.finished:
                 self._time = float(run.clock[ki.TIME])
@@ -1051,8 +1433,8 @@ class Simulation:
             self._time = run.clock[ki.TIME] = now
             run.clock[ki.STEP] = max(run.clock[ki.STEP], step)
 
-    def _go_to(self, until: float, calling: bool) -> None:
-        """Integrate until a time as if the run ended there, or until it ends before."""
+    def _integrate_to(self, until: float, calling: bool) -> None:
+        """Integrate to a time as if the run ended there, or until it ends earlier."""
         reached = False
         while not (reached or self.finished):
             self._keep_window(until)
@@ -1060,31 +1442,31 @@ class Simulation:
             if run.count[ki.PENDING] == 1:
                 self._refill(run.clock[ki.TIME] + run.clock[ki.STEP])
                 run = self._prepared.run
-            run.clock[ki.HOLD], run.clock[ki.END] = self._hold(until), until
-            # What comes to its end here is half of something: signals that wait go on waiting.
-            raised = self._attended(_PIECE, lambda: None)
-            # Callbacks, and their snapshots, know nothing of this end.
+            run.clock[ki.HOLD], run.clock[ki.END] = self._hold_time(until), until
+            # The end here is only part of an operation: pending signals keep waiting.
+            raised = self._run_piece(_PIECE, lambda: None)
+            # Callbacks and their snapshots must not see this end.
             run = self._prepared.run
             run.clock[ki.END] = self._end
             reached = bool(run.count[ki.STATUS] == ki.FINISHED)
             if reached:
                 run.count[ki.STATUS] = ki.RUNNING
-            self._take_due(raised)
+            self._collect_due(raised)
             if calling:
                 self._call_due()
             elif self._failed() and raised is None:
-                self._say_stopped()
+                self._raise_stopped()
             if raised is not None:
                 self._time = float(run.clock[ki.TIME])
                 raise raised
 
     def _restart(self) -> None:
-        """Derivatives have jumped: the next step starts anew from the present state, with the step size that it had."""
+        """Restart the integration at the present state with the same step size, because derivatives have jumped."""
         self._prepared.run.count[ki.STARTED] = 0
 
     def _freeze(self) -> None:
-        """Let moving references hold where they end."""
-        # First: a snapshot in a callback on the way is of before.
+        """Keep moving references at their final values."""
+        # Settle first: a snapshot in a callback on the way must not be frozen.
         self._settle_now()
         self._frozen = True
         for joint, a in self._motors.items():
@@ -1092,14 +1474,14 @@ class Simulation:
                 self._hold_at_end(joint)
 
     def _hold_at_end(self, joint: str) -> None:
-        """Let the reference of a joint hold where its spline ends."""
+        """Keep the reference of a joint at the final value of its spline."""
         reference = self._prepared.system.reference
         powers = reference.grid[1] ** np.arange(6)
         end = float(reference.coefficients[-1, self._splines[self._motors[joint]]] @ powers)
         self._follow_lines(np.array([self._motors[joint]]), np.array([[end, 0.0]]))
 
     def _refill(self, until: float = -np.inf) -> None:
-        """Move what was sampled to the trace, and give the buffer the times from there on, at least up to ``until``."""
+        """Move samples to the trace, and fill the buffer with the next sample times, at least up to ``until``."""
         run = self._prepared.run
         times = self._trace.move(run, until)
         if len(times) != len(run.sample_time):
@@ -1113,18 +1495,18 @@ class Simulation:
         run.count[ki.SAMPLE] = 0
 
     def _swap(self, **arrays: Any) -> None:
-        """Take other arrays for some of those of the run."""
+        """Replace some arrays of the run."""
         self._prepared = replace(self._prepared, run=self._prepared.run._replace(**arrays))
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
-        """All arrays of the run and its tables, by name: everything that changes is in them."""
+        """Return all arrays of the run and its tables with their names: the complete changing state."""
         prepared = self._prepared
         parts = {"run": prepared.run, "workspace": prepared.workspace, "system": prepared.system}
         return {name: array for owner, part in parts.items() for name, array in _arrays_in(part, owner)}
 
 
 def _arrays_in(value: Any, name: str) -> Iterator[tuple[str, NDArray[Any]]]:
-    """The arrays in named tuples and those within, with dotted names."""
+    """Yield the arrays in nested named tuples, with dotted names."""
     if isinstance(value, np.ndarray):
         yield name, value
     elif hasattr(value, "_asdict"):
@@ -1134,7 +1516,7 @@ def _arrays_in(value: Any, name: str) -> Iterator[tuple[str, NDArray[Any]]]:
 
 def _index(choices: dict[str, int], name: str, family: str) -> int:
     if name not in choices:
-        raise ModelError(f"no {family} {brief(name)}; those are: {', '.join(choices) or 'none'}")
+        raise ModelError(f"unknown {family} {brief(name)}; choices: {', '.join(choices) or 'none'}")
     return choices[name]
 
 
@@ -1142,27 +1524,27 @@ def _finite(quantity: str, values: ArrayLike) -> Array:
     try:
         array = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError):
-        raise ModelError(f"{quantity} {brief(values)} must be numbers") from None
+        raise ModelError(f"{quantity} must be numeric, got {brief(values)}") from None
     if not np.isfinite(array).all():
-        raise ModelError(f"{quantity} {array.tolist()} must be finite")
+        raise ModelError(f"{quantity} must be finite, got {array.tolist()}")
     return array
 
 
-# Start of a dynamics run: initial posture, gaps and tip margin, and the checks before the first step.
+# Start of a dynamics run: initial posture, gaps, tip margin, and the checks before the first step.
 
 
-# A joint that the solution of the posture moves by less than this counts as unmoved [rad or m].
+# A joint that the posture solution moves by less than this counts as unmoved [rad or m].
 MOVED = 1e-12
 
 
 def check(scenario: Scenario, started: Callable[[Start], None]) -> Start:
-    """See :func:`dynsim.engine.check`."""
+    """Check the scenario, see :func:`dynsim.engine.check`."""
     start = start_of(scenario)
     started(start)
     prepared = prepare(scenario)
     control, model = prepared.control, prepared.model
     if prepared.balance is not None:
-        # Compliant contacts are pressed in, which moves joints.
+        # Pressing compliant contacts moves joints.
         points, gaps = _touching(model, prepared.contacts)
         hand = model.point_position(*model.robot.hand, model.robot.initial)
         said = [*start.warnings, *prepared.balance.warnings]
@@ -1177,7 +1559,7 @@ def check(scenario: Scenario, started: Callable[[Start], None]) -> Start:
 
 
 def commanded_by_python(scenario: Scenario, control: JointControl) -> bool:
-    """Return whether Python code gives commands at ticks: an operator, the controller of a snake, or encoders."""
+    """Return whether Python code sets commands at ticks: an operator, a snake's controller, or encoders."""
     sensors = scenario.config.sensors
     encoded = sensors is not None and sensors.encoders is not None
     return encoded or control.teleop is not None or control.task_space is not None
@@ -1186,18 +1568,18 @@ def commanded_by_python(scenario: Scenario, control: JointControl) -> bool:
 def _begin(scenario: Scenario, prepared: Prepared) -> None:
     """Choose contact modes and find forces at t = 0, as a run does before its first step.
 
-    Not if Python code gives the first commands.
+    Skipped if Python code sets the first commands.
 
     Raises
     ------
     SimulationStopped
-        If forces do not exist, or cannot last.
+        If forces do not exist or cannot last.
     """
     if not prepared.contacts or commanded_by_python(scenario, prepared.control):
         return
     stopping.load(prepared)
     work = partial(driver.advance, prepared.system, prepared.workspace, prepared.run, 0)
-    _, raised = stopping.attend(work, lambda: None, interruption.check)
+    _, raised = stopping.run_in_thread(work, lambda: None, interruption.check)
     if raised is not None:
         raise raised
     if prepared.run.count[ki.STATUS] not in (ki.RUNNING, ki.FINISHED):
@@ -1205,14 +1587,14 @@ def _begin(scenario: Scenario, prepared: Prepared) -> None:
 
 
 def start_of(scenario: Scenario) -> Start:
-    """Posture, gaps and margin at t = 0, whether they are allowed or not."""
+    """Return posture, gaps and margins at t = 0, whether they are valid or not."""
     described, contacts, piloted = at_start(scenario)
     model = recall("model", lambda: Model(described), described)
     robot = model.robot
     q, (points, gaps) = robot.initial, _touching(model, contacts)
     declared = scenario.config.contacts.points
     movable = declared.keys() - {contact.name for contact in contacts if contact.left_out}
-    if piloted is not None:  # a snake, whose joints `initial` does not place
+    if piloted is not None:  # `initial` does not place the joints of a snake
         movable = set()
     aloft = [name for name, gap in gaps.items() if name in movable and abs(gap) > build.START_TOLERANCE]
     solved = {}
@@ -1235,29 +1617,29 @@ def start_of(scenario: Scenario) -> Start:
 
 
 def _touching(model: Model, contacts: Sequence[Contact]) -> tuple[dict[str, Array], dict[str, float]]:
-    """Positions (3,) of contact points at the start, and their gaps [m]."""
+    """Return the positions (3,) of contact points at the start, and their gaps [m]."""
     points, gaps, q = dict[str, Array](), dict[str, float](), model.robot.initial
     for contact in contacts:
         try:
             gaps[contact.name] = gap_at(model, contact, q)
-        except ModelError:  # an unknown body, of which the check of contacts gives the line
+        except ModelError:  # an unknown body; the contact check reports it with its line
             continue
         points[contact.name] = model.point_position(contact.body, contact.point, q)
     return points, gaps
 
 
 def _below(scenario: Scenario, robot: Robot) -> list[str]:
-    """A sentence for each surface that bodies begin below."""
+    """Return a warning for each surface that bodies start below."""
     sunk = by_surface(sinking(robot, build.surfaces(scenario), robot.initial[None]))
     return [
         f"{', '.join(s.body for s in below)}: below {surface} at the start, by up to "
-        f"{1e3 * max(s.depth for s in below):.3g} mm; surfaces hold only the points of contacts"
+        f"{1e3 * max(s.depth for s in below):.3g} mm; only contact points interact with surfaces"
         for surface, below in sunk.items()
     ]
 
 
 def _margins(scenario: Scenario, model: Model, contacts: Sequence[Contact]) -> tuple[float | None, float | None]:
-    """Tip margin of a mobile base at rest, alone and with its braces; None where there is none."""
+    """Return the tip margin of a mobile base at rest, alone and with its braces; None if undefined."""
     robot, q = model.robot, model.robot.initial
     if robot.base is None:
         return None, None
@@ -1271,25 +1653,25 @@ def _margins(scenario: Scenario, model: Model, contacts: Sequence[Contact]) -> t
     return alone, static_margin(model, q, [*forces, *balance.forces]) if balance.forces else None
 
 
-# Engine of the multibody plants: integrates the coupled system and makes the record of the run.
+# Complete runs: integrate the coupled system and make the record.
 
 
-# More steps than any run takes.
+# More steps than any run needs.
 _ALL = 1 << 62
-# Ticks between two checks for Ctrl-C, at which the progress bar is updated.
+# Ticks between checks for Ctrl-C and progress updates.
 TICKS = 10
 
 
 def simulate(scenario: Scenario, progress: Progress | None = None, *, pictured: bool = True) -> Record:
-    """See :func:`dynsim.engine.simulate`."""
+    """Simulate the scenario, see :func:`dynsim.engine.simulate`."""
     if scenario.controller is not None and scenario.controller.type == "task_space":
-        # Not prepared twice: that raises the head of a snake.
+        # Do not prepare twice: preparation raises the head of a snake.
         return _stepped(scenario, progress, pictured)
     prepared = prepare(scenario, progress)
     if commanded_by_python(scenario, prepared.control):
         return _stepped(scenario, progress, pictured)
     size = prepared.model.n, len(prepared.contacts), len(prepared.stops)
-    # Loading or compiling the kernels is no integration time.
+    # Load or compile the kernels here, so that it does not count as integration time.
     recall("kernels", partial(stopping.load, prepared), prepared.choice.method, *size)
     if (unstable := unstable_loop(scenario, prepared)) is not None:
         log.warning("%s: %s", scenario.title, unstable[0])
@@ -1330,14 +1712,14 @@ def simulate(scenario: Scenario, progress: Progress | None = None, *, pictured: 
 
 
 def _stepped(scenario: Scenario, progress: Progress | None, pictured: bool) -> Record:
-    """A run with ticks of an operator, a snake's script or encoders: by the public stepper, bit for bit its record."""
+    """Simulate with ticks of an operator, a snake's script or encoders, bit-identical to the public stepper."""
     from dynsim.engine.simulation import Simulation
 
-    # Without an end, as a session: a step that ends at a tick and one at the end of a run need not be the same.
+    # No end, as in a session: a step that ends at a tick and one at the end of a run may differ.
     simulation = Simulation(scenario, duration=math.inf)
     simulation.end_samples(scenario.duration_s)
     prepared, operator, k = simulation._prepared, simulation.operator, 0
-    # It has times of its own; a record that is too large is refused before it begins.
+    # The stepper has separate sample times; this call refuses a record that is too large.
     sample_times(scenario, prepared.run.layout, prepared.run.columns, len(prepared.model.robot.links))
     rate = operator.rate if operator is not None else 1.0 / (prepared.control.sample_time or 1.0)
     stop: SimulationStopped | None = None

@@ -1,4 +1,5 @@
-"""A run of the snake's task-space control, kinematic or dynamic: commands, modes, estimated states, recorded rows.
+"""Task-space control of a snake run, kinematic or dynamic: wheel lifting, mode changes, commands, states, recorded
+rows.
 
 The control law: :mod:`dynsim.snake.controller`.
 """
@@ -49,7 +50,7 @@ from dynsim.snake.ticks import (
 )
 from dynsim.system.memo import recall
 
-# Lifting of a dynamic snake's wheel pairs, as joint angles, and its start: a preliminary run that raises the head.
+# Lifting of a dynamic snake's wheel pairs as joint angles, and its start: a preliminary run that raises the head.
 
 
 # Angles by which the head starts below its posture, for its pitch joints in order from the base [rad] (assumed).
@@ -63,7 +64,7 @@ STEADY_TICKS = 4
 class WheelLifter:
     """Heights of the wheel pairs over time, and the resulting angles of the pitch joints on their axles.
 
-    What is to be put down goes down before the next is lifted.
+    Pairs are put down before other pairs are lifted.
     """
 
     def __init__(self, robot: SnakeTree, grounded: Array) -> None:
@@ -77,15 +78,15 @@ class WheelLifter:
         self._stiffness = np.array([servo.k_p * servo.torque_constant / servo.resistance for servo in chosen])
 
     def state(self) -> tuple[Array, Array, Array]:
-        """What the future depends on."""
+        """Return the state of the lifter."""
         return self._grounded.copy(), self._up.copy(), self._down.copy()
 
     def restore(self, state: tuple[Array, Array, Array]) -> None:
-        """Go back to a state of this lifter."""
+        """Restore a state of this lifter."""
         self._grounded, self._up, self._down = (part.copy() for part in state)
 
     def change(self, time: float, grounded: Array) -> None:
-        """From a time [s] on these pairs, (pairs,) 1 or 0, are to be on the ground."""
+        """Set the grounded pairs, (pairs,) 1 or 0, from a time [s] on."""
         blend = self._robot.lifts.blend_s
         put_down = (grounded == 1) & (self._grounded == 0)
         lifted = (grounded == 0) & (self._grounded == 1)
@@ -97,30 +98,32 @@ class WheelLifter:
         self._grounded = grounded.copy()
 
     def moving(self, time: float) -> bool:
-        """Whether a height changes after a time [s]."""
+        """Return whether a height changes after a time [s]."""
         rising = np.isfinite(self._up) & (time < self._up + self._robot.lifts.blend_s)
         return bool((rising | (np.isfinite(self._down) & (time < self._down))).any())
 
     def heights(self, time: float) -> Array:
-        """Of the pairs at a time [s], (pairs,) [m]."""
+        """Return the heights of the pairs at a time [s], (pairs,) [m]."""
         return height_of(np.array(time), self._up, self._down, self._robot.lifts)
 
     def angles(self, time: float, yaw: Array) -> Array:
-        """What is added to the pitch joints on the axles at a time [s] and yaw angles, both (pairs − 1,) [rad]."""
+        """Return the angles added to the pitch joints on the axles at a time [s] and yaw angles, both (pairs − 1,)
+        [rad].
+        """
         return angles_of_heights(self._robot, self.heights(time), yaw, self._stiffness)
 
 
 def angles_of_heights(robot: SnakeTree, height: Array, yaw: Array, stiffness: Array) -> Array:
-    """Angles that bring pairs to heights (pairs,) [m], with what servos give way.
+    """Return the pitch angles that bring pairs to heights (pairs,) [m], including the sag of the servos.
 
-    ``stiffness`` : (pairs − 1,) of these servos [N m/rad]
+    ``stiffness`` has shape (pairs − 1,) [N m/rad].
     """
     if not height.any():
         return np.zeros(len(yaw))
     hinge = np.asarray(robot.base_part.fold(yaw[None], height[None]).hinge[0])
     if not robot.sag_compensation:
         return hinge
-    # Moments of what is higher than s, averaged over s from zero to the clearance: they change without a jump.
+    # Moments of the pairs higher than s, averaged over s from zero to the clearance, so that they change continuously.
     share, below = height / (1e-3 * robot.lifts.clearance_mm), 0.0
     for level in np.unique(share[share > 0.0]).tolist():
         hinge = hinge + (level - below) * lifted_moments(robot, share >= level) / stiffness
@@ -129,29 +132,30 @@ def angles_of_heights(robot: SnakeTree, height: Array, yaw: Array, stiffness: Ar
 
 
 def command_angles(robot: SnakeTree, phi: Array, added: Array) -> dict[str, float]:
-    """What each joint servo is told: phi (n_phi,) and what lifting adds (pairs − 1,) [rad]."""
+    """Return the command of each joint servo: phi (n_phi,) plus the lifting angles (pairs − 1,) [rad]."""
     angles = dict(zip(robot.description.joint_names, phi.tolist(), strict=True))
     for joint, angle in zip(robot.lifting_joints, added.tolist(), strict=True):
         angles[joint] = angles.get(joint, 0.0) + angle
     return angles
 
 
-# Until when [s] servos follow lines, position and rate by joint.
+# End time [s] of a phase, and its servo references: position and rate by joint.
 Phase = tuple[float, Mapping[str, tuple[float, float]]]
-# Coordinates that a scenario comes to from others, whose servos go through phases: dynsim.engine.prepare.follow_lines.
+# Returns the final coordinates of a scenario started at given coordinates, with servo phases:
+# dynsim.engine.prepare.follow_lines.
 Follow = Callable[[Scenario, Array, Sequence[Phase]], Array]
 
 
-def begun(scenario: Scenario, robot: SnakeTree, follow: Follow) -> tuple[SnakeTree, JointControl]:
-    """The robot as a run begins, and what its servos hold until the controller, if there is one, tells them otherwise.
+def snake_start(scenario: Scenario, robot: SnakeTree, follow: Follow) -> tuple[SnakeTree, JointControl]:
+    """Return the robot at the start of a run, and its initial servo references until a controller changes them.
 
-    ``follow`` : simulates the raising of the head
+    ``follow`` simulates the raising of the head.
 
     Raises
     ------
     ModelError
-        See :func:`dynsim.scenario.build.controller`; the control period is not a multiple of the step; or a mode lifts
-        wheel pair 1.
+        See :func:`dynsim.scenario.build.controller`; also if the control period is not a multiple of the step, or a
+        mode lifts wheel pair 1.
     """
     d, config = robot.description, scenario.config
     controller = None if scenario.controller is None else build.controller(scenario, d)
@@ -178,18 +182,18 @@ def begun(scenario: Scenario, robot: SnakeTree, follow: Follow) -> tuple[SnakeTr
 
 
 def _check_step(integrator: Integrator, period: float) -> None:
-    """ModelError unless the control period [s] is a multiple of the step of time stepping."""
+    """Raise ModelError unless the control period [s] is a multiple of the time-stepping step."""
     step = integrator.step_s
     if integrator.method == "time_stepping" and step and abs(period / step - round(period / step)) > 1e-9:
         raise ModelError(
             f"integrator.step_s = {step:g} s does not divide controller.period_s = {period:g} s; "
-            f"{period / math.ceil(period / step):g} does",
+            f"use {period / math.ceil(period / step):g}",
             keys=("integrator", "step_s"),
         )
 
 
 def _check_modes(modes: ModeTable) -> None:
-    """ModelError where a mode lifts wheel pair 1: the head is on its body, and no joint raises it."""
+    """Raise ModelError if a mode lifts wheel pair 1: it carries the head, and no joint raises it."""
     lifting = [str(number) for number, row in zip(modes.numbers, modes.grounded, strict=True) if row[0] == 0]
     if lifting:
         raise ModelError(
@@ -201,9 +205,9 @@ def _check_modes(modes: ModeTable) -> None:
 
 
 def _alone(scenario: Scenario) -> Scenario:
-    """The scenario of the preliminary run: the robot and its payloads on the ground.
+    """Return the scenario of the preliminary run: the robot and its payloads on the ground.
 
-    Objects, ties and other surfaces are placed for the raised head. A plate just ahead of it would push against the
+    Objects, ties and other surfaces are placed for the raised head. A plate just in front of it would push against the
     lowered head and throw the robot back; a tied object would be dragged along.
     """
     config = scenario.config
@@ -211,7 +215,7 @@ def _alone(scenario: Scenario) -> Scenario:
     points = {
         name: point
         for name, point in config.contacts.points.items()
-        # Wheels of an object are named object.wheel.
+        # Wheels of an object are called object.wheel.
         if point.surface == GROUND and point.body.partition(".")[0] not in config.objects
     }
     changes = {
@@ -228,7 +232,7 @@ def _alone(scenario: Scenario) -> Scenario:
 
 
 def _raised(alone: Scenario, height: Array, added: Array, follow: Follow) -> Array:
-    """Coordinates (nq,) of the robot alone after its head was raised into the initial posture."""
+    """Return the coordinates (nq,) of the robot alone after its head was raised into the initial posture."""
     robot = build.robot(alone)
     assert isinstance(robot, SnakeTree)
     d = robot.description
@@ -249,32 +253,40 @@ def _raised(alone: Scenario, height: Array, added: Array, follow: Follow) -> Arr
 
 
 class Refusal(NamedTuple):
-    """A mode that was requested, or was a candidate, and in which the robot would tip."""
+    """A requested or candidate mode in which the robot would tip."""
 
     tick: int
     row: int
-    margin: float  # its support margin [m]
-    taken: bool  # all the same, because the present mode would tip more
+    margin: float  # support margin of the mode [m]
+    taken: bool  # used anyway, because the present mode would tip more
 
 
 @dataclass
 class ModeSwitcher:
     """Fixing and switching states: follows requests, and picks a mode at every switching time t_k = t_0 + k dT.
 
-    Every change of mode is tested by simulating the mode for one period with the present command. It tips when its
-    support margin is anywhere not above ``least_margin``; such a mode is not taken and the present one stays. Only
-    if the present mode tips as well, the mode of largest support margin is taken; the fixing mode is a candidate too.
+    Every mode change is tested by simulating the mode for one period with the present command. The robot tips if the
+    support margin is not above ``least_margin`` at any time; such a mode is refused and the present mode stays. Only if
+    the present mode tips as well, the mode with the largest support margin is used; the fixing mode is also a
+    candidate.
 
     Attributes
     ----------
-    policy : "fixed" ignores requests to switch; "cyclic" takes the next of ``order`` ([T]'s heuristic); "predictive"
-        takes the one with the lowest cost after a simulated period.
-    modes : table of the modes; ``fixing_row``, ``order`` and ``row`` are rows of it.
-    period_ticks : dT in control periods.
-    predict : predict(row) -> (cost after dT, smallest support margin on the way [m]).
-    row : present mode.
-    switches : changes of mode.
-    refusals : modes that would tip, in the order they were met.
+    policy : str
+        "fixed" ignores requests to switch; "cyclic" uses the next mode of ``order`` ([T]'s heuristic); "predictive"
+        uses the mode with the lowest cost after a simulated period.
+    modes : ModeTable
+        Table of the modes; ``fixing_row``, ``order`` and ``row`` are rows of it.
+    period_ticks : int
+        dT in control periods.
+    predict : callable
+        predict(row) -> (cost after dT, smallest support margin until then [m]).
+    row : int
+        Present mode.
+    switches : int
+        Number of mode changes.
+    refusals : list of Refusal
+        Modes that would tip, in the order of their tests.
     """
 
     policy: Policy
@@ -295,9 +307,9 @@ class ModeSwitcher:
         self.row = self.fixing_row
 
     def at_tick(self, tick: int, request: int) -> int:
-        """Row of the mode from this tick on; ``request`` is a mode number, NO_REQUEST, SWITCHING or FIXING.
+        """Return the row of the mode from this tick on; ``request`` is a mode number, NO_REQUEST, SWITCHING or FIXING.
 
-        A request for one mode ends the switching state, whether the mode is taken or refused.
+        A request for a single mode ends the switching state, whether the mode is used or refused.
         """
         row = self.row
         if request > 0 or request == FIXING:
@@ -313,7 +325,7 @@ class ModeSwitcher:
         return row
 
     def next_event(self) -> int | None:
-        """Tick of the next switching time, None in the fixing state."""
+        """Return the tick of the next switching time, None in the fixing state."""
         return self.next_switch if self.switching else None
 
     def _asked(self, tick: int, row: int) -> int:
@@ -344,9 +356,9 @@ class ModeSwitcher:
         return self._least_tipping(tick, tipping)
 
     def _least_tipping(self, tick: int, tipping: dict[int, float]) -> int:
-        """Every candidate would tip: the present mode if it stands, else the one of all that stands best.
+        """Return the present mode if it is stable, otherwise the candidate with the largest margin; all candidates tip.
 
-        The fixing mode is among those: it need not be in the order.
+        The fixing mode is also a candidate: it need not be in the order.
         """
         rows = (self.row, self.fixing_row, *tipping)
         margins = {row: tipping[row] if row in tipping else self.predict(row)[1] for row in rows}
@@ -359,8 +371,8 @@ class ModeSwitcher:
         self.refusals += [Refusal(tick, row, margin, row == taken) for row, margin in tipping.items()]
 
 
-# Why the target waited, in the order of the counters of dynsim.snake.ticks.SnakeState; the last is the rest: after
-# an obstacle, until switching has brought the joints below switching.release_fraction of their limits.
+# Reasons why the target waited, in the order of the counters of dynsim.snake.ticks.SnakeState. The last is for the wait
+# after an obstacle, until switching has brought the joints below switching.release_fraction of their limits.
 OBSTACLES = ("joint limit", "rate limit", "singular posture", "attitude at beta = 90 deg", "release of the joints")
 
 
@@ -370,14 +382,24 @@ def _no_commands() -> CommandBlock:
 
 @dataclass
 class SnakeControl:
-    """The robot, its controller, the commands known now, the state, and what was recorded.
+    """Robot, controller, known commands, state and recorded samples.
 
     Attributes
     ----------
-    ticks : control periods of the whole run; stride : of those that are recorded
-    block : commands from tick ``block_start`` on; gripper : (ticks,) as far as they were read
-    blocked : the last command was not carried out
-    recovering : switching modes until the base joints are released; switch_due : and begins to at the next tick
+    ticks : int
+        Control periods of the whole run.
+    stride : int
+        Control periods between recorded samples.
+    block : CommandBlock
+        Commands from tick ``block_start`` on.
+    gripper : (ticks,) ndarray of int
+        Gripper commands read so far.
+    blocked : bool
+        True if the last command was not executed.
+    recovering : bool
+        True while modes are switched until the base joints are released.
+    switch_due : bool
+        True if this switching starts at the next tick.
     """
 
     description: SnakeDescription
@@ -415,12 +437,12 @@ class SnakeControl:
 
     @property
     def tick(self) -> int:
-        """Control periods so far."""
+        """Number of completed control periods."""
         return int(self.state.counts[ss.TICKS])
 
     @property
     def time(self) -> float:
-        """[s]."""
+        """Time of the present tick [s]."""
         return self.tick * self.controller.schedule.period
 
     @property
@@ -429,27 +451,28 @@ class SnakeControl:
         return self.controller.modes.numbers[self.state.counts[ss.MODE]]
 
     def postures(self) -> dict[str, list[float]]:
-        """Base, joints and wheels by name, for a message."""
+        """Return base, joint and wheel positions for a message."""
         return {"base_pose": self.state.base.tolist(), "phi": self.state.phi.tolist(), "rho": self.state.rho.tolist()}
 
     def posture(self) -> tuple[Array, Array, Array]:
-        """Pose of the controlled point (6,), base pose (3,) and joints (n_phi,) as an operator sees them."""
+        """Return the pose of the controlled point (6,), base pose (3,) and joints (n_phi,) as shown to an operator."""
         state, w = self.state, np.zeros(6)
         pose_of_point(self.model, state.base, state.phi, self.ws.work.frame, w)
         return w, state.base.copy(), state.phi.copy()
 
     def read_commands(self, waiting: bool) -> None:
-        """Ask the source for the commands from the present tick on; it answers as far as it knows them.
+        """Read commands from the source: a block from the present tick on.
 
-        Velocities that had to wait in the block before this one and were not carried out there are dropped: a script
-        is one block and loses none, a joystick says anew what it wants.
+        Velocities of the previous block that had to wait and were not executed are dropped: a script is a single block
+        and loses none, a joystick sends its current command again.
 
         Raises
         ------
         SimulationStopped
-            The source failed, or gave what is no command, after the run had begun: there is something to keep.
+            If the source failed or returned an invalid command after the run had started, so that there are results to
+            keep.
         ModelError
-            The same before the first period.
+            If this happens before the first period.
         """
         state, period, first = self.state, self.controller.schedule.period, self.tick
         w, base, phi = self.posture()
@@ -468,7 +491,7 @@ class SnakeControl:
         except (SimulationStopped, ScenarioError):
             raise
         except Exception as error:
-            # What is no fault of the source's code is said as it is.
+            # Show a ModelError unchanged; wrap other exceptions with the source's class name.
             reason = str(error) if isinstance(error, ModelError) else f"{type(self.source).__name__} failed: {error!r}"
             text = f"command source at t = {feedback.time:g} s: {reason}"
             if first == 0:
@@ -479,30 +502,31 @@ class SnakeControl:
         state.counts[ss.CARRIED_OUT], state.progress[ss.DONE] = 0, 0.0
 
     def _checked(self, block: CommandBlock, left: int) -> CommandBlock:
-        """The commands as arrays; raises ModelError for what the controller cannot be asked."""
+        """Return the commands as arrays; raise ModelError for commands that the controller cannot execute."""
         block = CommandBlock(reals(block.velocity), integers(block.request), integers(block.gripper))
         known = len(block.request)
         if not 1 <= known <= left or block.velocity.shape != (known, 6) or block.gripper.shape != (known,):
             raise ModelError(
-                f"velocity {block.velocity.shape}, request {block.request.shape}, gripper {block.gripper.shape}; give "
-                f"(T, 6), (T,), (T,) with T from 1 to {left}"
+                f"shapes must be (T, 6), (T,), (T,) with T from 1 to {left}; got velocity {block.velocity.shape}, "
+                f"request {block.request.shape}, gripper {block.gripper.shape}"
             )
         if not np.isfinite(block.velocity).all():
             row, column = np.argwhere(~np.isfinite(block.velocity))[0]
             raise ModelError(
-                f"the velocity of {COORDINATES[column]} in period {row} of {known} is {block.velocity[row, column]}"
+                f"the velocity of {COORDINATES[column]} in period {row} of {known} must be finite, "
+                f"got {block.velocity[row, column]}"
             )
         for number in set(block.request.tolist()) - {NO_REQUEST, SWITCHING, FIXING}:
             self.controller.modes.row(number, "controller.commands: mode")
         return block
 
     def begin_period(self) -> None:
-        """Take commands and mode of the period that begins.
+        """Set commands and mode for the period that starts.
 
         Raises
         ------
         SimulationStopped
-            The source failed.
+            If the source failed.
         """
         state, switcher, now = self.state, self.switcher, self.tick
         if self.switch_due:
@@ -511,13 +535,13 @@ class SnakeControl:
         if now == self.block_start + len(self.block.request):
             self.read_commands(waiting=self.blocked or self.recovering)
         request = int(self.block.request[now - self.block_start])
-        # At the ends of switching periods only, so that every recovery has at least one.
+        # Only at the end of switching periods, so that every recovery has at least one.
         if self.recovering and now >= (switcher.next_event() or 0) and self._is_released():
             self.recovering, request = False, FIXING
         state.counts[ss.MODE] = switcher.at_tick(now, request)
 
     def periods(self) -> int:
-        """Periods from the present one on in which commands and mode cannot change, at least one."""
+        """Return the number of periods from the present one in which commands and mode cannot change, at least one."""
         now = self.tick
         ahead = self.block.request[now - self.block_start :]
         later = 1 + np.flatnonzero(ahead[1:] != NO_REQUEST)
@@ -527,31 +551,33 @@ class SnakeControl:
         return int(min(ends)) - now
 
     def end_period(self, blocked: bool) -> None:
-        """Take over whether the last period was blocked: switching may have to begin."""
+        """Record whether the last period was blocked, and start switching if necessary."""
         self.blocked = blocked
         if blocked and not self.recovering and self.controller.when_blocked and not self.switcher.switching:
             self.recovering = self.switch_due = True
 
     def diverged(self) -> SimulationStopped:
-        """What to raise when the state is no longer finite."""
+        """Return the exception for a state that is no longer finite."""
         return SimulationStopped(
-            f"the state is no longer finite at t = {self.time:g} s: a singular posture, or a gain too high "
+            f"the state is no longer finite at t = {self.time:g} s: singular posture, or gain too high "
             "for the control period",
             time=self.time,
             state=self.postures(),
         )
 
     def _is_released(self) -> bool:
-        """True when every base joint is well within its limit again ([T] IV.C.5: until the robot becomes operable)."""
+        """Return whether every base joint is well within its limit again ([T] IV.C.5: until the robot becomes
+        operable).
+        """
         base = slice(self.model.head_joints, None)
         limit = self.controller.release_fraction * self.model.upper[base]
         return bool(np.all(np.abs(self.state.phi[base]) < limit))
 
     def _predict(self, row: int) -> tuple[float, float]:
-        """Cost after one switching period in a mode with the present command held, and the smallest support margin."""
+        """Return the cost after one switching period in a mode at constant command, and the smallest support margin."""
         ticks, law, real = self.controller.prediction_ticks, self.controller.law, self.controller.schedule
         schedule = self.controller.prediction
-        waits = (real.null_start_tick - self.tick) * real.period  # until the null space comes on [s]
+        waits = (real.null_start_tick - self.tick) * real.period  # time until the null-space motion starts [s]
         schedule = schedule._replace(null_start_tick=round(waits / schedule.period))
         trial, trace = copy_of(self.state), new_trace(self.model, ticks + 1)
         row_of_block = min(int(trial.counts[ss.CARRIED_OUT]), len(self.block.velocity) - 1)
@@ -559,7 +585,7 @@ class SnakeControl:
         trial.counts[[ss.MODE, ss.TICKS, ss.CARRIED_OUT]], trial.progress[ss.DONE] = (row, 0, 0), 0.0
         done, _ = run_ticks(self.model, law, schedule, trial, lasting, ticks, 1, 1, 1, self.ws, trace)
         if done < 0:
-            return np.inf, -np.inf  # no longer finite: no mode to take
+            return np.inf, -np.inf  # not finite: this mode cannot be used
         if done < ticks:  # blocked: the target waits for the rest of the period
             run_ticks(self.model, law, schedule, trial, lasting, ticks - done, 0, 0, 1, self.ws, trace)
         record_row(self.model, law, trial, self.ws, ticks, trace)
@@ -567,17 +593,17 @@ class SnakeControl:
 
 
 def copy_of(state: SnakeState) -> SnakeState:
-    """The state with arrays of its own."""
+    """Return a copy of the state with separate arrays."""
     return SnakeState(*(array.copy() for array in state))
 
 
 def control_periods(scenario: Scenario, period: float) -> tuple[int, int]:
-    """Control periods [s] of a run, and how many of them go by between two samples of its record.
+    """Return the number of control periods of a run, and the number between two samples of its record.
 
     Raises
     ------
     ScenarioError
-        The run is shorter than a period, or the recording rate does not divide the control rate.
+        If the run is shorter than a period, or the recording rate does not divide the control rate.
     """
     ticks = round(scenario.duration_s / period)
     if ticks < 1:
@@ -588,6 +614,6 @@ def control_periods(scenario: Scenario, period: float) -> tuple[int, int]:
     if abs(stride - exact) > 1e-6 * exact:
         raise ScenarioError(
             f"record.rate_hz = {rate_hz:g} does not divide the control rate of {1 / period:g} Hz "
-            f"(controller.period_s); {1 / (period * stride):g} does"
+            f"(controller.period_s); use {1 / (period * stride):g}"
         )
     return ticks, stride

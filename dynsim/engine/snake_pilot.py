@@ -1,8 +1,8 @@
-"""The task-space control of the dynamic snake: at every tick, references for the servos of joints and wheels.
+"""Task-space control of the dynamic snake: at every tick, references for the servos of joints and wheels.
 
-Order within a tick t_k: sensors, controller, modes and lifts, references. The servos of joints follow the integrated
-command, q_d(t) = φ + u (t − t_k), with commanded angles φ and rates u, whatever the joints do ([T] IV.C); those of
-wheels follow rates. The state that the controller uses:
+Order within a tick t_k: sensors, controller, modes and lifts, references. Joint servos follow the integrated command,
+q_d(t) = φ + u (t − t_k), with commanded angles φ and rates u, independent of the actual joint angles ([T] IV.C); wheel
+servos follow rates. The state that the controller uses:
 
     feedforward   its own command, integrated ([T] IV.C.2)
     estimated     encoders of the joints; x, y, γ of the head integrated ([T] IV.C.1)
@@ -37,11 +37,11 @@ from dynsim.snake.description import CommandSource, TaskSpaceController
 from dynsim.snake.ticks import FEEDFORWARD, GIVEN, MEASURED, Schedule, SnakeTrace, command_tick, record_row
 
 _ROOT_COORDINATES = 7
-# How often somebody looks whether the head lies on the ground, and how long it does until the run ends [s].
-OVERLOAD_LOOK, LIES_FOR = 0.1, 0.5
-# The head is far below its target by more than this [m], and the robot has fallen over at this tilt [rad] (assumed).
-SAGS, OVERTURNED = 0.05, 0.8
-# Attributes of the switcher and of the pilot that a snapshot keeps: their values are replaced, never modified in place.
+# Interval of the overload checks, and duration of an overload after which the run ends [s].
+OVERLOAD_LOOK, OVERLOAD_TIME = 0.1, 0.5
+# The head is far below its target by more than this [m]; the robot has overturned at this tilt [rad] (assumed).
+SAG, OVERTURNED = 0.05, 0.8
+# Attributes of the switcher and of the pilot in a snapshot: their values are replaced, never modified in place.
 _SWITCHER = ("row", "switching", "next_switch", "switches", "_place")
 _OWN = (
     "block",
@@ -54,22 +54,30 @@ _OWN = (
     "_added_rate",
     "_next_look",
     "_commanded",
-    "_lies_since",
+    "_overloaded_since",
 )
 
 
 class SnakePilot(SnakeControl):
-    """The control of a snake that a simulation moves.
+    """Control of a dynamic snake, called at the ticks of its simulation.
 
     Parameters
     ----------
-    model : of a :class:`~dynsim.compile.snake_tree.SnakeTree`
-    source : of the commands, instead of the controller's script
-    ticks : control periods of the run; stride : of those that are recorded
-    sensors : through which the controller sees the robot
+    model : Model
+        Model of a :class:`~dynsim.compile.snake_tree.SnakeTree`.
+    controller : TaskSpaceController
+        Controller.
+    ticks : int
+        Control periods of the run.
+    stride : int
+        Control periods between recorded samples.
+    source : CommandSource, optional
+        Source of the commands instead of the controller's script.
+    sensors : Sensors, optional
+        Sensors through which the controller observes the robot.
     """
 
-    path = None  # the target is in the record with the rest of what the controller thinks
+    path = None  # the record has the target as part of the controller state
 
     def __init__(
         self,
@@ -82,25 +90,25 @@ class SnakePilot(SnakeControl):
     ) -> None:
         robot = model.robot
         assert isinstance(robot, SnakeTree)
-        believed = controller.schedule.state_source
-        schedule = controller.schedule._replace(state_source=GIVEN if believed == MEASURED else FEEDFORWARD)
+        state_source = controller.schedule.state_source
+        schedule = controller.schedule._replace(state_source=GIVEN if state_source == MEASURED else FEEDFORWARD)
         controller = _with_schedules(controller, schedule)
         d = robot.description
         chosen = controller.source if source is None else source
         super().__init__(d, d.arrays(), controller, chosen, ticks, stride)
-        self.believed, self.tree, self.robot = believed, model, robot
+        self.state_source, self.tree, self.robot = state_source, model, robot
         self.period, self.rate = schedule.period, 1.0 / schedule.period
         self._joints, self._root = _places(robot, d.joint_names), model.body_index(ROOT)
-        # Those on the ground. The last joint of the head part is at the axle of wheel pair 1.
+        # Head contacts with the ground. The last joint of the head part is at the axle of wheel pair 1.
         ends = (HEAD, f"{HEAD}_end", *d.joint_names[: d.head_joints - 1])
         self._head_contacts = frozenset([*ends, *(f"{name}_{GROUND}" for name in ends)])
-        # Motors that are told lines: of joints, of the pitch joints that only lift, and of wheels.
+        # Motors with position and rate references: joints, pitch joints that only lift, and wheels.
         joints = (*d.joint_names, *robot.lifting_joints[1:])
         motors = [motor.joint for motor in robot.motors]
         self._motors = np.array([motors.index(joint) for joint in (*joints, *robot.wheel_joints)])
         self._lifting = np.array([joints.index(joint) for joint in robot.lifting_joints])
         self._command = FixedSignature(command_tick)
-        # Of the line that the robot is drawn as: rows of joint_positions, whose last are the hand and the tail's axle.
+        # Rows of joint_positions that form the drawn polyline; the last two are the hand and the tail's axle.
         chain = list(d.joint_names[: d.head_joints + 1])
         for k in range(1, d.base_joints):
             chain += [robot.lifting_joints[k], d.joint_names[d.head_joints + k]]
@@ -115,7 +123,7 @@ class SnakePilot(SnakeControl):
         self._volts_per_rad = np.array([servos[joint].k_p for joint in d.joint_names])
         self._volts = np.array([servos[joint].voltage_limit for joint in d.joint_names])
         self._overload_ticks = max(1, round(OVERLOAD_LOOK / self.period))
-        self._lies_since: float | None = None
+        self._overloaded_since: float | None = None
         self.sensors = self._sensors(sensors or Sensors())
         objects = graspable(robot)
         self.grip = GripperControl(model, robot.gripper, objects, self.period) if objects else None
@@ -125,31 +133,31 @@ class SnakePilot(SnakeControl):
 
     @property
     def hindrance(self) -> str:
-        """What the target waits for; empty where it does not."""
+        """Reason why the target waits; empty if it does not."""
         if self.recovering:
             return OBSTACLES[-1]
         return OBSTACLES[int(self.state.counts[ss.STILL_FOR]) - 1] if self.blocked else ""
 
     def posture(self) -> tuple[Array, Array, Array]:
-        """See :meth:`SnakeControl.posture`: where the robot is, not where the controller takes it to be."""
+        """Return the actual posture instead of the controller's estimate, see :meth:`SnakeControl.posture`."""
         if self._seen is None:
             return super().posture()
         q = self._seen.q
         return self.head_pose(q), base_pose(q), q[self._joints]
 
     def head_pose(self, q: Array) -> Array:
-        """Pose w of the controlled point at coordinates (nq,), (6,) [m, rad]."""
+        """Return the pose w of the controlled point at coordinates (nq,), (6,) [m, rad]."""
         body, point = self.robot.hand
         R, p = self.tree.body_pose(body, q)
         return np.concatenate([p + R @ point, roll_pitch_yaw(R)])
 
     def __call__(self, simulation: Referenced) -> None:
-        """One control period: rewrite the references for the time up to the next tick."""
+        """Run one control period: rewrite the references for the interval up to the next tick."""
         if self.tick >= self.ticks:
             return
         self._seen = simulation.state
         self._refuse_overload(simulation)
-        self._look()
+        self._read_sensors()
         self.begin_period()
         if self.grip is not None:
             self.grip.step(self.time, bool(self.gripper[self.tick]), self._seen, simulation)
@@ -175,10 +183,10 @@ class SnakePilot(SnakeControl):
         if not math.isfinite(float(state.phi.sum())):
             raise self.diverged()
         self.end_period(bool(blocked))
-        self._tell(simulation, time, phi)
+        self._set_references(simulation, time, phi)
 
     def _refuse_overload(self, simulation: Referenced) -> None:
-        """Stop where the robot falls over, or where a servo can do no more and the head stays far below its target."""
+        """Stop if the robot overturns, or if a servo is saturated and the head stays far below its target."""
         if self.tick % self._overload_ticks:
             return
         q, time = self._seen.q, self.time
@@ -190,53 +198,58 @@ class SnakePilot(SnakeControl):
         off = np.abs(self._volts_per_rad * (self.state.phi - q[self._joints]))
         overloaded = [name for name, most in zip(self.description.joint_names, off >= self._volts, strict=True) if most]
         below = float(self.state.w_target[2] - self.head_pose(q)[2])
-        lies = any(touch.force > 0.0 for name, touch in simulation.touching.items() if name in self._head_contacts)
-        if not overloaded or not (lies or below > SAGS):
-            self._lies_since = None
-        elif self._lies_since is None:
-            self._lies_since = time
-        elif time - self._lies_since >= LIES_FOR:
-            how = "the head lies on the ground" if lies else f"the head is {1e3 * below:.0f} mm below its target"
+        on_ground = any(touch.force > 0.0 for name, touch in simulation.touching.items() if name in self._head_contacts)
+        if not overloaded or not (on_ground or below > SAG):
+            self._overloaded_since = None
+        elif self._overloaded_since is None:
+            self._overloaded_since = time
+        elif time - self._overloaded_since >= OVERLOAD_TIME:
+            how = "the head lies on the ground" if on_ground else f"the head is {1e3 * below:.0f} mm below its target"
             raise SimulationStopped(
-                f"too_heavy: {how} at t = {time:g} s, since t = {self._lies_since:g} s with {', '.join(overloaded)} at "
-                "the limit of its voltage",
+                f"too_heavy: {how} at t = {time:g} s, with {', '.join(overloaded)} at the voltage limit since "
+                f"t = {self._overloaded_since:g} s",
                 time=time,
                 state=self.postures(),
                 kind="too_heavy",
             )
 
-    def _look(self) -> None:
-        """What the controller is told of the robot, into its beliefs."""
+    def _read_sensors(self) -> None:
+        """Update the controller's state from the sensors."""
         self.state.base[:] = base_pose(self._seen.q)
         for sensor in self.sensors:
-            belief = self.state.w_hat if self.believed == ss.MEASURED else self.state.phi_hat
-            belief[:] = sensor.value(self._seen.time)
+            estimate = self.state.w_hat if self.state_source == ss.MEASURED else self.state.phi_hat
+            estimate[:] = sensor.value(self._seen.time)
 
     def _sensors(self, config: Sensors) -> list[SampledSensor]:
-        """What tells the controller of the robot: nothing under feedforward."""
+        """Return the sensors of the controller, empty under feedforward."""
 
         def sensor(read: Callable[[State], Array], of: Any, noise: Array, resolution: Array) -> SampledSensor:
             period = self.period if of is None or of.rate_hz is None else 1.0 / of.rate_hz
             delay = 0.0 if of is None else of.delay_s
             return SampledSensor(
-                read, period=period, delay=delay, noise=noise, resolution=resolution, seed=[config.seed, self.believed]
+                read,
+                period=period,
+                delay=delay,
+                noise=noise,
+                resolution=resolution,
+                seed=[config.seed, self.state_source],
             )
 
-        if self.believed == ss.MEASURED:
+        if self.state_source == ss.MEASURED:
             capture = config.motion_capture
             noise = np.zeros(6)
             if capture is not None:
                 noise[:3], noise[3:] = capture.position_noise_m, capture.attitude_noise_rad
             return [sensor(lambda state: self.head_pose(state.q), capture, noise, np.zeros(6))]
-        if self.believed == ss.ESTIMATED:
+        if self.state_source == ss.ESTIMATED:
             encoders = config.encoders
             deg = np.zeros(2) if encoders is None else np.radians([encoders.noise_deg, encoders.resolution_deg])
             noise, resolution = np.repeat(deg, len(self._joints)).reshape(2, -1)
             return [sensor(lambda state: state.q[self._joints], encoders, noise, resolution)]
         return []
 
-    def _tell(self, simulation: Referenced, time: float, phi: Array) -> None:
-        """References of joints and wheels from the tick at ``time`` on, at which joints are told ``phi``."""
+    def _set_references(self, simulation: Referenced, time: float, phi: Array) -> None:
+        """Set the references of joints and wheels from the tick at ``time`` on; joints start at ``phi``."""
         rates, joints, lines = self.ws.work.u, len(phi), np.zeros((len(self._motors), 2))
         self._lift(time)
         lines[:joints, 0], lines[:joints, 1] = phi, rates[:joints]
@@ -247,29 +260,31 @@ class SnakePilot(SnakeControl):
         self._added = self._added + self.period * self._added_rate
 
     def _lift(self, time: float) -> None:
-        """Rates at which lifting moves the pitch joints: every tick while heights change, else now and then."""
-        now = self.tick  # of the tick that has just been commanded
+        """Update the rates at which lifting moves the pitch joints: every tick while heights change, otherwise less
+        often.
+        """
+        now = self.tick  # number of the tick that has just been commanded
         if now < self._next_look:
             return
         ticks = 1 if self._lifter.moving(time) else STEADY_TICKS
         span = ticks * self.period
-        # Yaw angles go on at their rates until the next look.
+        # Yaw angles continue at their rates until the next update.
         head, joints = self.description.head_joints, len(self.state.phi)
         yaw = self.state.phi[head:] + (span - self.period) * self.ws.work.u[head:joints]
         try:
             then = self._lifter.angles(time + span, yaw)
         except ArithmeticError:
             raise SimulationStopped(
-                f"too_far: no pitch angles lift the wheel pairs of mode {self.mode} at t = {time:g} s: the base part "
-                "is bent too much",
+                f"too_far: no pitch angles can lift the wheel pairs of mode {self.mode} at t = {time:g} s: the base "
+                "part is bent too much",
                 time=time,
                 state=self.postures(),
             ) from None
         self._added_rate = (then - self._added) / span
         self._next_look = now + ticks
 
-    def remembered(self) -> dict[str, Any]:
-        """What the future depends on, and what was recorded."""
+    def saved_state(self) -> dict[str, Any]:
+        """Return the state of the control and its recorded samples."""
         switcher = self.switcher
         return {
             "state": copy_of(self.state),
@@ -277,14 +292,14 @@ class SnakePilot(SnakeControl):
             "rates": self.ws.work.u.copy(),
             "gripper": self.gripper.copy(),
             "lifter": self._lifter.state(),
-            "sensors": [sensor.remembered() for sensor in self.sensors],
+            "sensors": [sensor.saved_state() for sensor in self.sensors],
             "switcher": {name: getattr(switcher, name) for name in _SWITCHER} | {"refusals": list(switcher.refusals)},
             "own": {name: getattr(self, name) for name in _OWN},
-            "grip": None if self.grip is None else self.grip.remembered(),
+            "grip": None if self.grip is None else self.grip.saved_state(),
         }
 
     def restore(self, kept: dict[str, Any]) -> None:
-        """Go back to what :meth:`remembered` gave."""
+        """Restore the result of :meth:`saved_state`."""
         for mine, array in zip(self.state, kept["state"], strict=True):
             mine[...] = array
         for mine, array in zip(self.trace, kept["trace"], strict=True):
@@ -302,11 +317,11 @@ class SnakePilot(SnakeControl):
             self.grip.restore(kept["grip"])
 
     def add_to(self, record: Record) -> None:
-        """Signals and summary of the control, and of the snake as such: joints and wheels by their columns."""
+        """Add signals and summary of the control, and of joints and wheels by their snake names."""
         rows, q, v = len(record), record["q"], record["v"]
         if rows == 0:
             return
-        # The last sample may be one between the ticks, at the end of the run.
+        # The last sample may be between ticks, at the end of the run.
         ticks = np.floor(record.time / self.period + 1e-6).astype(int) // self.stride
         d, law, model = self.description, self.controller.law, self.model
         trace = SnakeTrace(*(array[ticks] for array in self.trace))
@@ -319,7 +334,8 @@ class SnakePilot(SnakeControl):
             trace.mode[-1], trace.w_target[-1] = self.state.counts[ss.MODE], self.state.w_target
             commanded[-1], trace.w_hat[-1] = self.state.phi, self.state.w_hat
         if between:
-            # Joints follow lines since the last tick, and the target has been moved up to the next one.
+            # Joints have followed linear references since the last tick, and the target has already moved to the next
+            # one.
             now = self.tick * self.period
             commanded[-1] += (end - now) * self.ws.work.u[: commanded.shape[1]]
             if end < now:
@@ -342,7 +358,7 @@ class SnakePilot(SnakeControl):
         add("phi_dot", rates, "rad/s", labels=names, description="joint rates")
         rates = np.stack([rate[joint] for joint in self.robot.wheel_joints], axis=1)
         add("rho_dot", rates, "rad/s", labels=d.wheel_names, description="rates of the active wheels")
-        text = "joint angles that servos are commanded, without lifting"
+        text = "joint angles commanded to the servos, without lifting"
         add("phi_command", commanded, "rad", labels=names, description=text)
         text = "rates held from this time on, as commanded"
         add("phi_dot_command", trace.u[:, :columns], "rad/s", labels=names, description=f"joint {text}")
@@ -354,31 +370,31 @@ class SnakePilot(SnakeControl):
         record.summary = {**summary, "warnings": [*summary["warnings"], *task_warnings(self, record, summary)]}
 
     def _polyline(self, q: Array) -> Array:
-        """Controlled point, joints and axles to the tail at coordinates (nq,), (points, 3) [m]."""
+        """Return controlled point, joints and axles to the tail at coordinates (nq,), (points, 3) [m]."""
         return self.tree.joint_positions(q, self._tail)[self._line]
 
 
 def _with_schedules(controller: TaskSpaceController, schedule: Schedule) -> TaskSpaceController:
-    # A predicted period goes on from what is believed now, as feedforward does.
+    # A predicted period continues from the present estimate, as feedforward does.
     return replace(controller, schedule=schedule, prediction=controller.prediction._replace(state_source=FEEDFORWARD))
 
 
 def _places(robot: SnakeTree, joints: tuple[str, ...]) -> Array:
-    """Where coordinates of joints are in q."""
+    """Return the indices of joint coordinates in q."""
     places = dict(zip(robot.joint_names, robot.position_index, strict=True))
     return np.array([places[joint] for joint in joints])
 
 
 def base_pose(q: Array) -> Array:
-    """x, y [m] of wheel pair 1 and yaw [rad] of the base part at coordinates (…, nq) of the tree, (…, 3)."""
+    """Return x, y [m] of wheel pair 1 and yaw [rad] of the base part at coordinates (…, nq) of the tree, (…, 3)."""
     w, x, y, z = (q[..., k] for k in range(3, _ROOT_COORDINATES))
-    # Of the axle, e_y of the root: it stays level where the body behind it is tilted.
+    # Yaw of the axle, e_y of the root: it stays level even if the body behind it is tilted.
     yaw = np.arctan2(-2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z))
     return np.stack([q[..., 0], q[..., 1], yaw], axis=-1)
 
 
 def roll_pitch_yaw(R: Array) -> Array:
-    """α, β, γ of R = Rz(γ) Ry(β) Rx(α), (…, 3, 3) → (…, 3) [rad]."""
+    """Return α, β, γ of R = Rz(γ) Ry(β) Rx(α), (…, 3, 3) → (…, 3) [rad]."""
     return np.stack(
         [
             np.arctan2(R[..., 2, 1], R[..., 2, 2]),

@@ -1,13 +1,13 @@
-"""Whether a system can be integrated: joints that move no inertia, and stability of sampled control loops.
+"""Checks whether a system can be integrated: joints that move no inertia, and stability of sampled control loops.
 
 A loop is stable at a posture if its spectral radius over a period is at most 1. The open loop is linear in small
-deviations δq, v and currents i, with the commands u held:
+deviations δq, v and currents i, with constant commands u:
 
     M v̇ = K_m i − D v,    L di/dt = u − R i − K_m v,    u = −k_p δq̂ − k_d v̂ at each tick
 
-in the motions that couplings and the contacts that hold allow. Over a period it is integrated exactly. Positions q̂ and
-rates v̂ are the true ones at the tick, or measurements of encoders with their delay. Gravity and velocity products are
-left out: a posture that falls slowly is not an unstable loop.
+in the motions that couplings and active contacts allow. Over a period it is integrated exactly. Positions q̂ and rates
+v̂ are the true values at the tick, or encoder measurements with their delay. Gravity and velocity products are
+neglected: a posture that falls slowly is not an unstable loop.
 """
 
 from __future__ import annotations
@@ -32,21 +32,22 @@ from dynsim.scenario.schema import Encoders
 if TYPE_CHECKING:
     from dynsim.engine.prepare import Prepared
 
-# Joints up to which the loop is examined: its matrices have three rows each.
+# Maximum number of joints for which the loop is examined: its matrices have three rows for each.
 LARGE = 100
-# Rows up to which a loop with the samples of late encoders is: as many as those of LARGE joints.
+# Maximum number of rows of a loop with delayed encoder samples: the same as for LARGE joints.
 LATE = 3 * LARGE
-# Growth of deviations that counts [1/s], and per period: free motions have a double eigenvalue 1 with rounding 1e-8.
+# Minimum growth of deviations that counts [1/s], and per period: free motions have a double eigenvalue 1 with rounding
+# errors of 1e-8.
 GROWTH, ROUNDING = 1.0, 1e-6
 # Periods of encoders and of the controller must be multiples of each other to this relative accuracy.
 WHOLE = 1e-9
-# Shorter periods that are tried for a message, each half the one before.
+# Number of shorter periods tried for a message, each half of the previous one.
 HALVINGS = 8
-# Logarithm of the growth of deviations up to a stop, from which on it is the reason of the stop: a factor of 20.
+# Minimum logarithmic growth of deviations until a stop for which instability is the reported reason: a factor of 20.
 GROWN = 3.0
-# Postures of a record in which a sampled loop is examined.
+# Number of postures of a record in which a sampled loop is examined.
 POSTURES = 10
-# Postures that differ by less have nearly the same growth [rad or m].
+# Postures that differ by less than this have nearly the same growth [rad or m].
 NEAR_POSTURE = 0.02
 
 
@@ -56,8 +57,12 @@ class Growth:
 
     Attributes
     ----------
-    radius : spectral radius, per ``period`` [s]
-    motor : number of the motor whose command has the largest part in it
+    radius : float
+        Spectral radius per ``period``.
+    period : float
+        Period [s].
+    motor : int
+        Index of the motor whose command contributes most.
     """
 
     radius: float
@@ -66,24 +71,30 @@ class Growth:
 
     @property
     def rate(self) -> float:
-        """[1/s], negative where they decay."""
+        """Growth rate [1/s], negative if deviations decay."""
         return math.log(max(self.radius, 1e-300)) / self.period
 
     @property
     def unstable(self) -> bool:
-        """Whether deviations grow, beyond rounding."""
+        """True if deviations grow beyond rounding errors."""
         return self.radius > 1.0 + ROUNDING and self.rate > GROWTH
 
 
 @dataclass(frozen=True)
 class HeldLoop:
-    """The linear open loop dx/dt = A x + B u of states x = (δq, v, i), with commands u; δq and v in free motions.
+    """Linear open loop dx/dt = A x + B u with states x = (δq, v, i) and commands u; δq and v are coordinates of free
+    motions.
 
     Attributes
     ----------
-    A, B : (s, s), (s, na)
-    position, rate : positions and rates of the motors' joints, (na, s)
-    gain : k_p and k_d of the held commands, (na, 2); 0 for commands that do not follow the state
+    A : (s, s) ndarray
+        State matrix.
+    B : (s, na) ndarray
+        Input matrix.
+    position, rate : (na, s) ndarray
+        Positions and rates of the motors' joints as functions of the state.
+    gain : (na, 2) ndarray
+        k_p and k_d of the held commands; 0 for commands that do not depend on the state.
     """
 
     A: Array
@@ -93,16 +104,16 @@ class HeldLoop:
     gain: Array
 
     def growth(self, period: float) -> Growth:
-        """With positions and rates of the ticks."""
+        """Return the growth with exact positions and rates at the ticks."""
         law = -self.gain[:, :1] * self.position - self.gain[:, 1:] * self.rate
         advance, input_ = self._over(period)
         return _growth(advance + input_ @ law, law, period)
 
     def growth_by_encoders(self, period: float, encoders: Encoders) -> Growth | None:
-        """With positions of encoders and their differences.
+        """Return the growth with encoder positions and their differences.
 
-        None if the two periods do not fit each other, or if the delay spans so many samples that the loop has more
-        than :data:`LATE` rows.
+        Returns None if neither period is a multiple of the other, or if a long delay makes the loop larger than
+        :data:`LATE` rows.
         """
         between = period if encoders.rate_hz is None else 1.0 / encoders.rate_hz
         ratio = max(period, between) / min(period, between)
@@ -111,7 +122,7 @@ class HeldLoop:
         step, steps = min(period, between), round(ratio)
         size, na = self.B.shape
         kept = math.ceil(encoders.delay_s / between + 1.0 - WHOLE) + 2
-        # The vector has the states, the commands, and so many samples, beginning with the last one.
+        # The vector contains the states, the commands, and the samples, starting with the last one.
         whole = size + na + kept * na
         if whole > LATE:
             return None
@@ -126,7 +137,7 @@ class HeldLoop:
                 taken[samples : samples + na, :size] = self.position
                 product = taken @ product
             if period <= between or k == 0:
-                since = k * step if between > period else 0.0  # the last sample was taken so long ago
+                since = k * step if between > period else 0.0  # time since the last sample
                 late = max(0, math.ceil((encoders.delay_s - since) / between - WHOLE))
                 commanded = np.eye(whole)
                 commanded[size : size + na] = 0.0
@@ -142,8 +153,8 @@ class HeldLoop:
         return _growth(product, commands, steps * step)
 
     def _over(self, period: float) -> tuple[Array, Array]:
-        """x(t + period) = advance x + input u."""
-        from scipy.linalg import expm  # here, because most runs have no sampled loop, and it takes long to load
+        """Return the matrices of x(t + period) = advance x + input u."""
+        from scipy.linalg import expm  # imported here because it loads slowly and most runs have no sampled loop
 
         size, na = self.B.shape
         both = expm(np.block([[self.A, self.B], [np.zeros((na, size + na))]]) * period)
@@ -157,9 +168,9 @@ def _growth(step: Array, commands: Array, period: float) -> Growth:
 
 
 def held_loop(model: Model, drives: ka.DriveArrays, q: Array, rows: Array) -> HeldLoop:
-    """The loop at coordinates q (nq,), whose rates v meet ``rows`` v = 0, (r, n).
+    """Return the loop at coordinates q (nq,), whose rates v satisfy ``rows`` v = 0, (r, n).
 
-    Gear friction that is smoothed has its slope at rest.
+    Smoothed gear friction has its slope at rest.
     """
     from scipy.linalg import null_space  # as in HeldLoop
 
@@ -187,7 +198,7 @@ def held_loop(model: Model, drives: ka.DriveArrays, q: Array, rows: Array) -> He
             own = (0.0, motor[ka.K_V] - k_m) if velocity else (motor[ka.K_P], motor[ka.K_D])
         else:
             continue
-        # Continuous commands are part of A, and those that callers hold do not follow the state.
+        # Continuous commands are part of A; commands set by the caller do not depend on the state.
         if table[ka.SAMPLED] == ka.AT_TICKS:
             gain[a] = own
     B[f : 2 * f] = np.linalg.solve(inertia, pushed)
@@ -195,7 +206,9 @@ def held_loop(model: Model, drives: ka.DriveArrays, q: Array, rows: Array) -> He
 
 
 def held_rows(model: Model, contacts: Sequence[Contact], real: bool, q: Array) -> Array:
-    """Rows of couplings and of the contacts that hold at q: all by the bilateral law, else closed ones, at rest."""
+    """Return the rows of couplings and active contacts at q: all under the bilateral law, otherwise closed ones, at
+    rest.
+    """
     rows = [model.coupling_rows]
     for contact in contacts:
         if contact.stiffness > 0.0 or (real and abs(gap_at(model, contact, q)) > build.START_TOLERANCE):
@@ -205,14 +218,14 @@ def held_rows(model: Model, contacts: Sequence[Contact], real: bool, q: Array) -
 
 
 def loop_growth(scenario: Scenario, prepared: Prepared, q: Array, period: float) -> Growth | None:
-    """Growth of the sampled loop at coordinates q (nq,); None where it is not examined."""
+    """Return the growth of the sampled loop at coordinates q (nq,), or None if the loop is not examined."""
     model, drives = prepared.model, prepared.system.drives
     if model.n > LARGE or not len(drives.table) or not np.isfinite(q).all():
         return None
     rows = held_rows(model, prepared.contacts, prepared.system.unilateral is not None, q)
     try:
         loop = held_loop(model, drives, q, rows)
-    except np.linalg.LinAlgError:  # a joint that moves no inertia has its own message
+    except np.linalg.LinAlgError:  # a joint that moves no inertia has a separate message
         return None
     if not loop.A.shape[0] or not (np.isfinite(loop.A).all() and loop.gain.any()):
         return None
@@ -221,9 +234,9 @@ def loop_growth(scenario: Scenario, prepared: Prepared, q: Array, period: float)
 
 
 def unstable_loop(scenario: Scenario, prepared: Prepared, q: Array | None = None) -> tuple[str, Growth] | None:
-    """A sentence about a sampled loop that is unstable at coordinates q (default: the start), and its growth.
+    """Return a warning about a sampled loop that is unstable at coordinates q (default: the start), and its growth.
 
-    None for a stable loop, without a sampled controller, and for more than :data:`LARGE` joints.
+    Returns None for a stable loop, without a sampled controller, and for more than :data:`LARGE` joints.
     """
     period = prepared.control.sample_time
     if period is None:
@@ -236,23 +249,24 @@ def unstable_loop(scenario: Scenario, prepared: Prepared, q: Array | None = None
     for halved in range(1, HALVINGS + 1):
         shorter = loop_growth(scenario, prepared, at, period / 2**halved)
         if shorter is not None and not shorter.unstable:
-            remedy = f"use {period / 2**halved:.3g}, which is stable, or smaller gains"
+            remedy = f"use {period / 2**halved:.3g} s, which is stable, or smaller gains"
             break
     table, motor = prepared.system.drives.table[growth.motor], prepared.system.drives.motor[growth.motor]
     gains = f"k_p = {motor[ka.K_P]:.4g} V/rad, k_d = {motor[ka.K_D]:.4g} V s/rad"
     if table[ka.DRIVE_KIND] == ka.POSITION_SERVO and table[ka.SERVO_MODE] == ka.VELOCITY_MODE:
         gains = f"k_v = {motor[ka.K_V]:.4g} V s/rad"
     return (
-        f"controller.sample_time_s = {period:g} s: the sampled loop is unstable in the posture "
-        f"{'of the start' if q is None else 'reached'}, deviations grow {math.exp(growth.rate * period):.4g} times per "
-        f"period (most at {prepared.model.robot.motors[growth.motor].joint}, {gains}); {remedy}"
+        f"controller.sample_time_s = {period:g} s: the sampled loop is unstable in the "
+        f"{'start posture' if q is None else 'posture reached'}: deviations grow by a factor of "
+        f"{math.exp(growth.rate * period):.4g} per period "
+        f"(most at {prepared.model.robot.motors[growth.motor].joint}, {gains}); {remedy}"
     ), growth
 
 
 def unstable_later(scenario: Scenario, prepared: Prepared, record: Record) -> str:
-    """The sentence of a loop that is unstable in later postures for as long as deviations need to grow by e³.
+    """Return the warning about a loop that is unstable in later postures long enough for deviations to grow by e³.
 
-    Some postures of the record are examined, at equal distances in time. Empty if none is, or only for a moment.
+    Postures of the record are examined at equal intervals. Empty if none is unstable, or only briefly.
     """
     period, time = prepared.control.sample_time, record.time
     if period is None or len(record) < 2:
@@ -268,15 +282,15 @@ def unstable_later(scenario: Scenario, prepared: Prepared, record: Record) -> st
             first = k if first < 0 else first
             grown += growth.rate * float(time[k] - time[before])
             if grown >= GROWN and (verdict := unstable_loop(scenario, prepared, record["q"][first])) is not None:
-                return f"{verdict[0]}; from t = {time[first]:.3g} s on deviations have had the time to grow 20 times"
+                return f"{verdict[0]}; since t = {time[first]:.3g} s deviations may have grown by a factor of 20"
         before = k
     return ""
 
 
 def unstable_stop(scenario: Scenario, prepared: Prepared, q: Array, v: Array, elapsed: float) -> str:
-    """The sentence of a loop whose growth is the reason of a stop after ``elapsed`` [s]; empty where it is not.
+    """Return the warning about a loop whose growth is the reason of a stop after ``elapsed`` [s], or an empty string.
 
-    Deviations have had the time to grow by e³, and the kinetic energy is greater than at the start, or is not finite.
+    Deviations had time to grow by e³, and the kinetic energy is larger than at the start or not finite.
     """
     for at in (None, q):
         verdict = unstable_loop(scenario, prepared, at)
@@ -285,7 +299,7 @@ def unstable_stop(scenario: Scenario, prepared: Prepared, q: Array, v: Array, el
         if not (np.isfinite(q).all() and np.isfinite(v).all()):
             return verdict[0]
         if prepared.model.kinetic_energy(q, v) > 0.0:
-            # The motion may have been stopped by contacts just now: its energy says little.
+            # Contacts may just have stopped the motion, so its energy is not conclusive.
             growth = verdict[1].rate * elapsed / math.log(10.0)
             return f"{verdict[0]}; until then they could grow by a factor of 1e{growth:.0f}"
     return ""

@@ -1,4 +1,4 @@
-"""Data types of a stepped simulation: states, contact forces, snapshots; its guards, and events from the kernels."""
+"""Data types of a stepped simulation: states, contact forces, snapshots; default guards, and events of the kernels."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from dynsim.record.measures import TIP_OVER
 
 Array = NDArray[np.float64]
 
-# Guards of events by name: their number in the kernels, and the kind of object that they observe.
+# Guards of events: their number in the kernels and the kind of object that they observe.
 GUARDS = {
     "joint_position": (events.JOINT_POSITION, "joint"),
     "joint_rate": (events.JOINT_RATE, "joint"),
@@ -46,16 +46,16 @@ CONTACT_EVENTS = {
 
 
 def take_log(run: ki.Run) -> list[tuple[float, int]]:
-    """Empty the log of the kernels: times [s] and numbers of what has happened."""
+    """Empty the event log of the kernels and return times [s] and event numbers."""
     logged = int(run.count[ki.LOGGED])
     run.count[ki.LOGGED] = 0
     return list(zip(run.log_time[:logged].tolist(), run.log_event[:logged].tolist(), strict=True))
 
 
 def own_guards(prepared: Prepared) -> list[tuple[str, str]]:
-    """Kind and subject of the events that a run watches for by itself, in the order of its guards.
+    """Return kind and subject of the events that a run watches for by default, in the order of its guards.
 
-    Those of contacts and stops are logged under numbers of their own: :func:`event_name`.
+    Events of contacts and stops are logged under separate numbers: :func:`event_name`.
     """
     base = prepared.model.robot.base
     tipping = [] if base is None else [(TIP_OVER, base.body)]
@@ -63,7 +63,7 @@ def own_guards(prepared: Prepared) -> list[tuple[str, str]]:
 
 
 def event_name(prepared: Prepared, number: int) -> tuple[str, str] | None:
-    """Kind and subject of a logged event of a contact, a joint stop or a joint that rubs; None for that of a guard."""
+    """Return kind and subject of a logged event of a contact, stop or joint with dry friction; None for a guard."""
     if number < ki.CONTACT_LOG:
         return None
     first = max(log for log in (ki.CONTACT_LOG, ki.STOP_LOG, ki.DRY_LOG) if log <= number)
@@ -75,13 +75,37 @@ def event_name(prepared: Prepared, number: int) -> tuple[str, str] | None:
 
 @dataclass(frozen=True)
 class State:
-    """The state of a simulation.
+    """State of a simulation.
 
     Attributes
     ----------
-    time : [s]
-    q : (nq,) positions [rad or m]; v : (n,) rates; current : of the motors that have a circuit [A]
-    tie_rest : x_0 of the ties [m or rad], which move beyond a bound; None: as at the start of the scenario
+    time : float
+        Time [s].
+    q : (nq,) ndarray
+        Joint positions [rad or m]; quaternions [1].
+    v : (n,) ndarray
+        Joint rates [rad/s or m/s].
+    current : (circuits,) ndarray
+        Currents of the motors that have a circuit [A].
+    tie_rest : (ties,) ndarray or None
+        Rest values x_0 of the ties [m or rad], which change when ties slide beyond a bound; None: as at the start of
+        the scenario.
+
+    Notes
+    -----
+    Symbols as in docs/notation.md.
+
+    Examples
+    --------
+    Start a second simulation from the end of a record:
+
+    >>> import dynsim
+    >>> scenario = dynsim.load_scenario("single_pendulum", overrides={"duration_s": 1})
+    >>> state = dynsim.State.of(dynsim.simulate(scenario))
+    >>> state.time, state.q.shape, state.current.shape
+    (1.0, (1,), (0,))
+    >>> dynsim.Simulation(scenario, state=state, duration=2.0).advance(1.5).time
+    1.5
     """
 
     time: float
@@ -92,12 +116,31 @@ class State:
 
     @classmethod
     def of(cls, record: Record, sample: int = -1) -> State:
-        """The state at a sample of a record, by default the last; records do not have ``tie_rest``.
+        """Return the state at a sample of a record.
+
+        Parameters
+        ----------
+        record : Record
+            Record of a dynamics run.
+        sample : int, optional
+            Index of the sample; default: the last.
+
+        Returns
+        -------
+        State
+            State at the sample, without ``tie_rest``, which records do not contain.
 
         Raises
         ------
         MissingEntry
-            The record has no positions, rates or currents.
+            If the record has no positions, rates or currents.
+
+        Examples
+        --------
+        >>> import dynsim
+        >>> record = dynsim.simulate(dynsim.load_scenario("single_pendulum", overrides={"duration_s": 1}))
+        >>> dynsim.State.of(record, 0).time
+        0.0
         """
         names = ("q", "v", "current")
         return cls(float(record.time[sample]), *(np.array(record[name][sample], dtype=np.float64) for name in names))
@@ -105,12 +148,16 @@ class State:
 
 @dataclass(frozen=True)
 class Touch:
-    """What a contact point does.
+    """Force and mode of a contact point.
 
     Attributes
     ----------
-    force : normal [N], negative: it pulls; vector : (3,) with friction, in the world [N]
-    mode : 0 off its surface, 1 sliding, 2 sticking; None under the bilateral law
+    force : float
+        Normal force [N]; negative: pulling.
+    vector : (3,) ndarray
+        Normal and friction force in the world frame [N].
+    mode : int or None
+        0 off its surface, 1 sliding, 2 sticking; None under the bilateral law.
     """
 
     force: float
@@ -120,7 +167,7 @@ class Touch:
 
 @dataclass(frozen=True)
 class Snapshot:
-    """Everything that the future of a simulation depends on; made by :meth:`Simulation.snapshot`."""
+    """Complete state of a simulation; created by :meth:`Simulation.snapshot`."""
 
     owner: object
     arrays: dict[str, NDArray[Any]]
@@ -131,6 +178,6 @@ class Snapshot:
     base_as_planned: bool
     behind_brakes: Mapping[str, float]
     frozen: bool
-    attendants: list[dict[str, Any]]
+    tick_handlers: list[dict[str, Any]]
     due: tuple[Callable[[Any], None], ...]
     window: tuple[float, tuple[Snapshot, float] | None]

@@ -1,4 +1,4 @@
-"""Messages and last state of an integration that stopped before its end."""
+"""Running of compiled code with signals and time limits, and the messages and last state of runs that stopped."""
 
 from __future__ import annotations
 
@@ -32,42 +32,47 @@ from dynsim.integrators.stepping import tables as kt
 from dynsim.scenario import Scenario
 from dynsim.system import interruption
 
-# Loading and running of compiled code in a thread; the calling thread handles signals and the wall-time limit.
+# Compiled code is loaded and run in a thread; the calling thread handles signals and the wall-clock limit.
 
 
 log = logging.getLogger(__name__)
 
-# Interval of the checks, and how long to wait for compiled code that was asked to return [s].
+# Interval of the checks, and time to wait for compiled code that was asked to return [s].
 LOOK_S, PATIENCE_S = 0.1, 0.5
-# A run whose present step takes longer than this is stuck [s]. The longest step observed took 80 s: of 24 contacts
+# A run whose present step takes longer than this is stuck [s]. The longest step observed took 80 s, with 24 contacts
 # whose forces no method of the solver finds.
 STUCK_S = 600.0
-# Most steps of time stepping in the caller's own thread: contacts may close within them.
+# Maximum number of time-stepping steps in the caller's thread: contacts may close within them.
 MOST_SHORT = 50
-# Time of one iteration of the contact solver, divided by the cube of the number of rows [s].
+# Time of one contact-solver iteration divided by the cube of the number of rows [s].
 ROUND = 2e-9
 
 
-def attend(
+def run_in_thread(
     work: Callable[[], None], ask: Callable[[], None], look: Callable[[], None]
 ) -> tuple[bool, BaseException | None]:
-    """Do ``work`` in a thread of its own; meanwhile handle signals and call ``look``.
+    """Run ``work`` in a separate thread; meanwhile handle signals and call ``look``.
 
     Parameters
     ----------
-    work : that releases the interpreter's lock
-    ask : asks the work to end soon
-    look : called every LOOK_S; what it raises, as what signals raise here, asks the work to end
+    work : callable
+        Work that releases the interpreter lock.
+    ask : callable
+        Requests the work to end soon.
+    look : callable
+        Called every LOOK_S; its exceptions, like those of signals, request the work to end.
 
     Returns
     -------
-    ended : False when the work was left alone: it may go on for a while, and write to its arrays
-    raised : by ``look``, or by a signal
+    ended : bool
+        False if the work was abandoned: it may continue for a while and write to its arrays.
+    raised : BaseException or None
+        Exception raised by ``look`` or by a signal.
 
     Raises
     ------
     Exception
-        That of the work.
+        If the work raises it.
     """
     done, failure = threading.Event(), list[BaseException]()
 
@@ -89,7 +94,7 @@ def attend(
             ask()
             ended = done.wait(PATIENCE_S)
     finally:
-        # Also after a second signal.
+        # Needed also after a second signal.
         if not ended:
             interruption.leave()
     if ended and failure:
@@ -98,7 +103,7 @@ def attend(
 
 
 class OutOfTime(Exception):
-    """Whoever listens has seen a run for too long; ``status`` is what it has come to."""
+    """The watch ended a run; ``status`` is its new status."""
 
     def __init__(self, status: int) -> None:
         super().__init__(status)
@@ -106,11 +111,12 @@ class OutOfTime(Exception):
 
 
 class WallWatch:
-    """Looks at the clock: for the wall limit of a run, and for one step that does not end.
+    """Watches the wall-clock limit of a run and detects a step that does not end.
 
     Parameters
     ----------
-    limit : wall time that the integration may take [s]; None: any
+    limit : float or None
+        Maximum wall-clock time of the integration [s]; None for no limit.
     """
 
     def __init__(self, limit: float | None) -> None:
@@ -120,27 +126,27 @@ class WallWatch:
 
     @property
     def over(self) -> bool:
-        """The limit is."""
+        """True if the limit is exceeded."""
         return self._limit is not None and self._spent > self._limit
 
     def begin(self) -> None:
-        """A piece begins; what was between pieces counts as nothing."""
+        """Start a piece of work; time between pieces does not count."""
         self._looked, self._seen, self._still = clock.monotonic(), -1, 0.0
 
     def spend(self) -> float:
-        """Count the time since the last look, and return it [s]."""
+        """Add the time since the last check, and return it [s]."""
         now = clock.monotonic()
         passed, self._looked = now - self._looked, now
         self._spent += passed
         return passed
 
     def look(self, run: ki.Run) -> None:
-        """Raise :class:`OutOfTime` where there is a reason."""
+        """Raise :class:`OutOfTime` if the limit is exceeded or a step does not end."""
         passed = self.spend()
         if self.over:
             raise OutOfTime(ki.OUT_OF_TIME)
         seen = int(run.count.sum()) + (0 if run.newton is None else int(run.newton.count.sum()))
-        # A process that was stopped for a while has not looked either.
+        # A suspended process has not checked either.
         self._still = self._still + min(passed, 10.0 * LOOK_S) if seen == self._seen else 0.0
         self._seen = seen
         if self._still > STUCK_S:
@@ -148,28 +154,28 @@ class WallWatch:
 
 
 def load(prepared: Prepared) -> None:
-    """Load the kernels of a run, or compile them, and log that.
+    """Load or compile the kernels of a run, and log it.
 
     Raises
     ------
     KeyboardInterrupt
-        The compiler goes on alone.
+        On Ctrl-C; the compiler continues in its thread.
     """
     with kernels_logged(log, prepared.kind):
         compiled = partial(driver.advance, prepared.system, prepared.workspace, prepared.run, -1)
-        _, raised = attend(compiled, lambda: None, interruption.check)
+        _, raised = run_in_thread(compiled, lambda: None, interruption.check)
     if raised is not None:
         raise raised
 
 
 def _short_steps(prepared: Prepared) -> int:
-    """How many steps are over before anybody would have looked, whatever happens within them.
+    """Return the number of steps certain to end before the first check would be due.
 
-    They are taken in the caller's own thread: to hand a short run to another one costs some hundredths of its time.
-    None under the unilateral law, where one step may take a minute; but steps of one length, whose contact problems
-    are given up after so many rounds: as many as take no longer than code that was asked to return, with the rows of
-    the last step. So many rounds are hardly ever needed, and a thread for each tick of a controller would double the
-    time of a snake.
+    They run in the caller's thread, because handing a short run to another thread costs some hundredths of its time.
+    Under the unilateral law the number is zero, as one step may take a minute. The exception is time stepping, whose
+    contact problems are given up after a fixed number of iterations: its steps must not exceed PATIENCE_S, with the
+    rows of the last step. This number of iterations is hardly ever needed, and a thread for each controller tick would
+    double the time of a snake.
     """
     if prepared.system.unilateral is not None:
         rows = max(int(prepared.workspace.counts[ka.ROWS]), 1)
@@ -177,7 +183,7 @@ def _short_steps(prepared: Prepared) -> int:
         return few if prepared.run.stepping is not None else 0
     n, p = len(prepared.workspace.joints), prepared.workspace.small.shape[1]
     seconds = right_hand_side(n, p, dense=prepared.system.dense is not None)
-    # Of RADAU5 with a Jacobian and its factors.
+    # A RADAU5 step, including a Jacobian and its factors.
     step = (2 * n + 60) * seconds + 3e-9 * n**3 if prepared.run.newton is not None else 6.0 * seconds
     return int(LOOK_S / step)
 
@@ -189,18 +195,29 @@ def advance(
     look: Callable[[], None],
     kernel: Callable[..., None] | None = None,
 ) -> tuple[Prepared, BaseException | None]:
-    """One piece of up to ``limit`` steps, see :func:`dynsim.integrators.driver.advance`.
+    """Run one piece of up to ``limit`` steps, see :func:`dynsim.integrators.driver.advance`.
 
-    STATUS may be OUT_OF_TIME or STUCK besides what the kernels make of it.
+    In addition to the status values of the kernels, STATUS may be OUT_OF_TIME or STUCK.
 
     Parameters
     ----------
-    kernel : what takes the steps, of :func:`dynsim.integrators.driver.direct`; default: that of the driver
+    prepared : Prepared
+        Prepared run.
+    limit : int
+        Maximum number of steps.
+    watch : WallWatch
+        Watch of the run.
+    look : callable
+        Called regularly; may raise.
+    kernel : callable, optional
+        Stepping function of :func:`dynsim.integrators.driver.direct`; default: ``driver.advance``.
 
     Returns
     -------
-    prepared : the same, or a copy where the piece was left alone; that one cannot go on
-    raised : what ``look`` has raised, or a signal
+    prepared : Prepared
+        The same run, or a copy if the piece was abandoned; the copy cannot continue.
+    raised : BaseException or None
+        Exception raised by ``look`` or by a signal.
     """
     run, few, kernel = prepared.run, min(_short_steps(prepared), limit), kernel or driver.advance
     ended, raised = True, None
@@ -216,12 +233,12 @@ def advance(
     due = few == 0
     if not due:
         kernel(prepared.system, prepared.workspace, run, few)
-        # Not where it has come to what its caller is to look at. (A pending step at the begin is to be accepted.)
+        # Not if the caller has to act first. (A pending step at the start is to be accepted.)
         count = run.count
         due = count[ki.STATUS] == ki.RUNNING and count[ki.PENDING] == count[ki.TICKED] == count[ki.LOGGED] == 0
     if due and limit > few:
         remainder = partial(kernel, prepared.system, prepared.workspace, run, limit - few)
-        ended, raised = attend(remainder, ask, both)
+        ended, raised = run_in_thread(remainder, ask, both)
     watch.spend()
     if not ended:
         prepared = copied(prepared)
@@ -238,7 +255,7 @@ def advance(
 
 
 def copied(value: Any) -> Any:
-    """Tables and arrays of their own, in which nothing moves any more."""
+    """Return separate copies of tables and arrays, which nothing modifies any more."""
     if isinstance(value, Prepared):
         return replace(value, run=copied(value.run), workspace=copied(value.workspace), system=copied(value.system))
     if isinstance(value, np.ndarray):
@@ -249,18 +266,18 @@ def copied(value: Any) -> Any:
     return value
 
 
-# How fast friction changes with slip: why explicit steps are short.
+# Friction that changes fast with slip, the reason for short explicit steps.
 
 
 Array = NDArray[np.float64]
 
-# Steps of an explicit method at the limit of stability, in time constants: 3.3 by DOPRI5 [Hairer and Wanner], shorter
+# Steps of an explicit method at the stability limit, in time constants: 3.3 for DOPRI5 [Hairer and Wanner], shorter
 # after a rejected step, longer before one.
 LEAST, MOST = 1.0, 5.0
 
 
-def held_up(prepared: Prepared) -> str:
-    """A clause about the contact whose friction changes so fast that explicit steps have to be this short, or ""."""
+def short_step_reason(prepared: Prepared) -> str:
+    """Return a clause about the contact whose fast friction changes force short explicit steps, or ""."""
     run = prepared.run
     step = float(run.clock[ki.STEP])
     if not by_number(run.method).explicit or not prepared.contacts or not np.isfinite(run.y).all():
@@ -270,13 +287,15 @@ def held_up(prepared: Prepared) -> str:
         return ""
     return (
         f"steps are as short as {step:.1e} s because {changing.contact} slips at {changing.speed:.3g} m/s and its "
-        f"friction changes within {changing.within:.3g} s; integrator.method: radau5 follows that with longer steps"
+        f"friction changes within {changing.within:.3g} s; integrator.method: radau5 allows longer steps"
     )
 
 
 @dataclass(frozen=True)
 class Changing:
-    """The contact whose friction changes fastest by itself, its slip [m/s], and τ of all together [s]."""
+    """The contact whose friction alone changes fastest, its slip [m/s], and the joint time constant τ of all contacts
+    [s].
+    """
 
     contact: str
     speed: float
@@ -284,7 +303,7 @@ class Changing:
 
 
 def fastest(prepared: Prepared) -> Changing | None:
-    """The fastest change of friction at the state of the run; None if none changes."""
+    """Return the fastest change of friction at the state of the run; None if none changes."""
     system, run, ws, model = prepared.system, prepared.run, prepared.workspace, prepared.model
     unilateral = system.unilateral
     q = run.y[block(run.layout, "q")]
@@ -329,7 +348,10 @@ def _slip(prepared: Prepared, k: int) -> Array:
 
 
 def _friction(prepared: Prepared, k: int, normal: Array) -> tuple[Array, Array, Array]:
-    """Friction of contact k that slips: minus its force per normal force, (3,); the rows of E on the surface; and D."""
+    """Return the friction of sliding contact k.
+
+    Minus its force per normal force, (3,); the rows of E on the surface; and D.
+    """
     ws, unilateral, contact = prepared.workspace, prepared.system.unilateral, prepared.contacts[k]
     slip = _slip(prepared, k)
     pressed = float(ws.contacts[k, ka.NORMAL_FORCE])
@@ -346,7 +368,7 @@ def _friction(prepared: Prepared, k: int, normal: Array) -> tuple[Array, Array, 
     return contact.friction * np.sign(size * pressed) * slip / smooth, tangents, damping
 
 
-# Names of the values of STATUS.
+# Names of the STATUS values.
 KINDS = {
     ki.NOT_FINITE: "not_finite",
     ki.STEP_TOO_SMALL: "step_too_small",
@@ -361,7 +383,7 @@ KINDS = {
     ki.OUT_OF_TIME: "out_of_time",
     ki.STUCK: "stuck",
 }
-STEP_OVER = "integrator.method: time_stepping, which goes on through it"
+STEP_OVER = "integrator.method: time_stepping, which continues through such events"
 _MODES = {ka.SLIDING: "slides", ka.STICKING: "sticks"}
 
 
@@ -370,7 +392,7 @@ def stopped(scenario: Scenario, prepared: Prepared) -> SimulationStopped:
     run = prepared.run
     status, time = int(run.count[ki.STATUS]), float(run.clock[ki.TIME])
     kind = KINDS[status]
-    if status != ki.STOPPED:  # a base that tips over does so for any reason
+    if status != ki.STOPPED:  # a base may tip over for any reason
         q, v = (run.y[block(run.layout, name)] for name in ("q", "v"))
         elapsed = float((run.tick_table[:, ki.TICK_COUNT] * run.tick[:, ki.TICK_PERIOD]).max(initial=0.0))
         if unstable := unstable_stop(scenario, prepared, q, v, elapsed):
@@ -394,14 +416,14 @@ def last_state(prepared: Prepared, y: np.ndarray) -> dict[str, Sequence[float]]:
 
 
 def _listed(prepared: Prepared, *choices: NDArray[np.bool_]) -> str:
-    """ " at" and the names of the contacts of the first choice, (c,) or more, that is not empty; "" if all are."""
+    """Return " at" and the contact names of the first non-empty choice, (c,) or more; "" if all are empty."""
     for chosen in choices:
         if chosen[: len(prepared.contacts)].any():
             return " at " + ", ".join(c.name for c, here in zip(prepared.contacts, chosen, strict=False) if here)
     return ""
 
 
-def _doing(prepared: Prepared) -> str:
+def _modes_text(prepared: Prepared) -> str:
     """Return the modes of the unilateral contacts as text for the end of a sentence."""
     if prepared.system.unilateral is None or not prepared.contacts:
         return ""
@@ -417,7 +439,9 @@ def _doing(prepared: Prepared) -> str:
 
 
 def _can_step_over(prepared: Prepared) -> bool:
-    """Return whether time stepping supports this system: real contacts, and no mobile base (dynsim.engine.prepare)."""
+    """Return whether time stepping supports this system: unilateral contacts and no mobile base
+    (dynsim.engine.prepare).
+    """
     events = prepared.system.unilateral is not None and prepared.run.stepping is None
     return events and bool(prepared.contacts) and prepared.model.robot.base is None
 
@@ -430,48 +454,49 @@ def _reason(scenario: Scenario, prepared: Prepared) -> str:
     if diverged and (nothing := moving_nothing(prepared.model, run.y[block(run.layout, "q")])):
         return f"{where}: {nothing}"
     if status == ki.NOT_FINITE:
-        return f"{where}: the state is no longer finite (divergence); look at the last state for a joint that runs away"
+        return f"{where}: the state is no longer finite (divergence); check the last state for a joint that diverges"
     if status == ki.NO_FORCES:
         names = ", ".join(contact.name for contact in prepared.contacts)
         return (
-            f"{where}: no signs of the normal forces at {names} agree with dissipative friction (Painlevé's paradox); "
-            "lower contacts.friction, or take contacts.pulling_friction: signed"
+            f"{where}: no signs of the normal forces at {names} are consistent with dissipative friction (Painlevé's "
+            "paradox); lower contacts.friction, or use contacts.pulling_friction: signed"
         )
     if status == ki.STEP_TOO_SMALL:
-        stiff = "look at the last state for a joint that runs away"
+        stiff = "check the last state for a joint that diverges"
         if method != "radau5":
             stiff = f"try integrator.method radau5, or {stiff}"
         if _can_step_over(prepared):
-            stiff = f"try {STEP_OVER}{_doing(prepared)}"
+            stiff = f"try {STEP_OVER}{_modes_text(prepared)}"
         return f"{where}: the step size fell to {run.clock[ki.STEP]:.1e} s; {stiff}"
     if status == ki.STOPPED:
         return (
-            f"{where}: the base tips over (tip margin zero), and plant.base.on_overturn is stop; brace it, move its "
-            "caster or make it heavier, or take on_overturn: warn to go on as if it were held down"
+            f"{where}: the base tips over (tip margin zero) and plant.base.on_overturn is stop; brace it, move its "
+            "caster or make it heavier, or use on_overturn: warn to continue as if the base were fixed"
         )
     if status == ki.NO_CONTACT_FORCES:
         names = _listed(prepared, prepared.workspace.active[:, ka.MODE] != ka.OPEN)
         return (
-            f"{where}: no forces{names} agree with Coulomb's law (Painlevé's paradox, or rows that contradict each "
-            "other); lower contacts.friction, or take another posture"
+            f"{where}: no forces{names} are consistent with Coulomb's law (Painlevé's paradox, or contradicting "
+            "rows); lower contacts.friction or change the posture"
         )
     if status == ki.NO_PROGRESS:
         other = STEP_OVER if _can_step_over(prepared) else "another integrator.method"
-        because = held_up(prepared) or f"take {other}, or longer steps where they are fixed"
+        because = short_step_reason(prepared) or f"use {other}, or longer steps if they are fixed"
         return (
-            f"{where}: no progress, the last {ki.MOST_TRIALS} steps came no further than "
-            f"{run.clock[ki.LEAST_PROGRESS]:.1e} s, the last of {run.clock[ki.STEP]:.1e} s{_doing(prepared)}; {because}"
+            f"{where}: no progress, the last {ki.MOST_TRIALS} steps advanced by less than "
+            f"{run.clock[ki.LEAST_PROGRESS]:.1e} s, last step {run.clock[ki.STEP]:.1e} s"
+            f"{_modes_text(prepared)}; {because}"
         )
     if status == ki.OUT_OF_TIME:
-        because = held_up(prepared)
+        because = short_step_reason(prepared)
         return (
-            f"{where}: the wall limit, integrator.wall_limit_s = {scenario.integrator.wall_limit_s:g} s, is over, the "
-            f"last step of {run.clock[ki.STEP]:.1e} s{_doing(prepared)}{'; ' if because else ''}{because}"
+            f"{where}: the wall-clock limit, integrator.wall_limit_s = {scenario.integrator.wall_limit_s:g} s, is "
+            f"exceeded, last step {run.clock[ki.STEP]:.1e} s{_modes_text(prepared)}{'; ' if because else ''}{because}"
         )
     if status == ki.STUCK:
         return (
-            f"{where}: one step of {run.clock[ki.STEP]:.1e} s does not end{_doing(prepared)}; "
-            "take another integrator.method, or fewer contacts"
+            f"{where}: one step of {run.clock[ki.STEP]:.1e} s does not end{_modes_text(prepared)}; "
+            "use another integrator.method, or fewer contacts"
         )
     if status == ki.CHATTER and (law := prepared.system.unilateral) is not None:
         at = _listed(
@@ -485,12 +510,12 @@ def _reason(scenario: Scenario, prepared: Prepared) -> str:
         )
         if joints and not law.tally[:, ku.CHATTERED].any():
             return (
-                f"{where}: {', '.join(joints)} hits and leaves its stop without end; "
-                f"take {STEP_OVER if _can_step_over(prepared) else 'a larger integrator.atol'}"
+                f"{where}: {', '.join(joints)} hits and leaves its stop endlessly; "
+                f"use {STEP_OVER if _can_step_over(prepared) else 'a larger integrator.atol'}"
             )
         return (
-            f"{where}: {'the' if at else 'a'} contact{at} opens and closes, or slips and sticks, without end; "
-            f"take {f'{STEP_OVER}, or ' if _can_step_over(prepared) else ''}a larger integrator.atol"
+            f"{where}: {'the' if at else 'a'} contact{at} opens and closes, or slips and sticks, endlessly; "
+            f"use {f'{STEP_OVER}, or ' if _can_step_over(prepared) else ''}a larger integrator.atol"
         )
     ws = prepared.workspace
     gaps, rates = ws.rows[: ws.counts[ka.ROWS], [ka.ROW_GAP, ka.ROW_RATE]].T
@@ -500,13 +525,13 @@ def _reason(scenario: Scenario, prepared: Prepared) -> str:
         couplings = prepared.model.robot.couplings
         if owner >= len(couplings) + len(prepared.stops):
             joint = prepared.dry[owner - len(couplings) - len(prepared.stops)].joint
-            return f"{where}: dry friction cannot keep joint {joint} where it is (off by {gaps[worst]:+.2e})"
+            return f"{where}: dry friction cannot keep joint {joint} in place (off by {gaps[worst]:+.2e})"
         if owner >= len(couplings):
             joint = prepared.stops[owner - len(couplings)].joint
             return f"{where}: joint {joint} cannot be kept at its stop (off by {gaps[worst]:+.2e})"
         coupling = couplings[owner]
-        failure = f"joint {coupling.joint} cannot be kept where {coupling.leader} leads it (off by {gaps[worst]:+.2e})"
+        failure = f"joint {coupling.joint} cannot follow its leader {coupling.leader} (off by {gaps[worst]:+.2e})"
     else:
         failure = f"contact {prepared.contacts[owner].name} cannot be kept on its surface (gap {gaps[worst]:+.2e} m, "
         failure += f"rate {rates[worst]:+.2e} m/s)"
-    return f"{where}: {failure}; the contacts contradict each other or the arm is singular here"
+    return f"{where}: {failure}; the contacts contradict each other, or the arm is singular here"

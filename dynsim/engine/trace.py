@@ -1,4 +1,4 @@
-"""Sampling of a stepped simulation: blocks of sample times for the kernels, and the sampled rows that are kept."""
+"""Sampling of a stepped simulation: blocks of sample times for the kernels, and the samples to keep."""
 
 from __future__ import annotations
 
@@ -14,32 +14,41 @@ Array = NDArray[np.float64]
 Rows = tuple[Array, Array, Array]
 TraceState = tuple[tuple[Rows, ...], int, float, Array | None]
 
-# Number of rows of the buffer into which kernels sample before it is emptied.
+# Rows of the buffer that kernels write samples to before it is emptied.
 BLOCK = 256
 
 
 def even_times(start: float, end: float, rate: float, first: int = 0, count: int | None = None) -> Array:
-    """Times of samples [s]: so many from number ``first`` on, or those up to the end, at which there always is one.
+    """Return evenly spaced sample times [s], including the end.
 
     Parameters
     ----------
-    start, end, rate : first time, end [s] and rate [1/s] of all samples; without an end, ``count`` is needed
+    start : float
+        First time of all samples [s].
+    end : float
+        End [s]; if infinite, ``count`` is required.
+    rate : float
+        Sampling rate [1/s].
+    first : int, optional
+        Number of the first sample to return.
+    count : int, optional
+        Number of samples; default: up to the end.
     """
     if not math.isfinite(end):
         assert count is not None
         return _times(start, rate, np.arange(first, first + count))
     last = math.floor((end - start) * rate * (1.0 + 1e-12))
     stop = last + 2 if count is None else first + count
-    # A sample that rounding puts behind the end would never come.
+    # Rounding must not put a sample after the end, where it would never be taken.
     times = np.minimum(_times(start, rate, np.arange(first, min(stop, last + 1))), end)
     apart = end - (start + last / rate) > 1e-9 * (end - start)
     return np.append(times, end) if apart and first <= last + 1 < stop else times
 
 
 def _times(start: float, rate: float, numbers: NDArray[np.int64]) -> Array:
-    """Times [s] of samples by number; of a run that goes on from a sample of another one, exactly those of that one.
+    """Return times [s] of samples by number; after a start from a sample of another run, exactly the times of that run.
 
-    A load may jump at such a time. 0.35 + 0.05 is before 0.4.
+    A load may jump at such a time, and 0.35 + 0.05 is before 0.4.
     """
     before = round(start * rate)
     if abs(start * rate - before) > 1e-9:
@@ -54,9 +63,16 @@ class Trace:
 
     Parameters
     ----------
-    start, end, rate : first time, end [s] and rate [1/s] of the samples; at the end there is one, whatever the rate
-    keep : samples that are kept: all (None), the last so many, or none (0)
-    times : of all samples, where they are known beforehand
+    start : float
+        First sample time [s].
+    end : float
+        Last sample time [s]; a sample is taken there for any rate.
+    rate : float
+        Sampling rate [1/s].
+    keep : int or None
+        Number of last samples to keep; None for all, 0 for none.
+    times : (T,) ndarray, optional
+        Times of all samples if known in advance [s].
     """
 
     def __init__(self, start: float, end: float, rate: float, keep: int | None, times: Array | None = None) -> None:
@@ -65,7 +81,7 @@ class Trace:
         self._next = 0
 
     def end_at(self, end: float, run: ki.Run) -> None:
-        """Let the samples, also those that the run has yet to take into its buffer, end with one at a time [s]."""
+        """End the samples, including those of the run's buffer, with a sample at a time [s]."""
         self._end, self._times = end, None
         if self._keep != 0:
             taken = int(run.count[ki.SAMPLE])
@@ -75,12 +91,12 @@ class Trace:
             run.sample_time[taken : taken + len(times)] = times
 
     def taken(self, run: ki.Run) -> Rows:
-        """What the buffer of the run holds."""
+        """Return the contents of the run's buffer."""
         rows = int(run.count[ki.SAMPLE])
         return run.sample_time[:rows].copy(), run.sample[:rows].copy(), run.output[:rows].copy()
 
     def move(self, run: ki.Run, until: float = -np.inf) -> Array:
-        """Keep what the buffer holds; the sample times from there on, at least up to ``until`` and one more [s]."""
+        """Keep the buffer's contents and return the next sample times [s], at least up to ``until`` and one more."""
         taken = self.taken(run)
         if len(taken[0]):
             self._rows.append(taken)
@@ -91,27 +107,27 @@ class Trace:
         return self._block(until)
 
     def rows(self, run: ki.Run) -> Rows:
-        """All that is kept, with what the buffer of the run holds."""
+        """Return all kept samples, including the run's buffer."""
         parts = zip(*self._rows, self.taken(run), strict=True)
         times, states, outputs = (np.concatenate(part) for part in parts)
         first = 0 if self._keep is None else max(len(times) - self._keep, 0)
         return times[first:], states[first:], outputs[first:]
 
     def last_output(self) -> Array | None:
-        """Outputs of the last sample that is kept."""
+        """Return the outputs of the last kept sample."""
         return self._rows[-1][2][-1] if self._rows else None
 
     def snapshot(self) -> TraceState:
-        """What :meth:`restore` goes back to; rows are never written again, so they are shared."""
+        """Return a snapshot for :meth:`restore`; rows are never modified, so they are shared."""
         return tuple(self._rows), self._next, self._end, self._times
 
     def restore(self, snapshot: TraceState) -> None:
-        """Go back to a snapshot."""
+        """Restore a snapshot."""
         rows, self._next, self._end, self._times = snapshot
         self._rows = deque(rows)
 
     def _block(self, until: float) -> Array:
-        """The next times of samples [s]; infinite ones are never reached."""
+        """Return the next sample times [s]; infinite times are never reached."""
         if self._keep == 0:
             return np.full(1, np.inf)
         first, count = self._next, BLOCK
@@ -122,5 +138,5 @@ class Trace:
             if math.isfinite(until):
                 count = max(count, int((until - self._start) * self._rate) + 2 - first)
             times = even_times(self._start, self._end, self._rate, first, count)
-        # After the last sample the buffer must not hold steps back.
+        # After the last sample the buffer must not limit the steps.
         return np.append(times, np.inf) if len(times) < count else times

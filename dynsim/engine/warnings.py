@@ -1,4 +1,4 @@
-"""Warnings of a dynamics run: sentences with the location, the number, and the fix."""
+"""Warnings of a dynamics run: sentences with location, number and fix."""
 
 from __future__ import annotations
 
@@ -29,30 +29,30 @@ from dynsim.scenario import Scenario, build
 from dynsim.scenario.effect import without_effect
 
 DRIFT_LIMIT_M = 1e-9
-# A larger acceleration of a joint at an equilibrium start is motion, not rounding [rad/s² or m/s²].
+# A larger joint acceleration at an equilibrium start is motion, not rounding [rad/s² or m/s²].
 STARTS_MOVING = 1e-6
-# Postures that differ by less are equal except for rounding [rad or m].
+# Postures that differ by less are equal up to rounding [rad or m].
 SAME_POSTURE = 1e-12
-# If an equilibrium uses less than all friction, accelerations below this share of gravity are rounding errors of stiff
-# contacts.
+# If an equilibrium does not use the full friction, accelerations below this fraction of gravity are rounding errors of
+# stiff contacts.
 OF_WEIGHT = 1e-4
 # Contact forces at the start that differ by more than this, relative or in N, differ from the forces at rest.
 DIFFERS = 1e-3
-# Slip that begins earlier belongs to the start [s].
-AT_ONCE = 1e-3
+# Slip that starts before this time belongs to the start [s].
+START_SLIP_TIME = 1e-3
 # A joint with dry friction that is slower than this is at rest [rad/s or m/s].
 AT_REST = 1e-9
-# Negative friction heat below this share of the turnover is rounding.
+# Negative friction heat below this fraction of the turnover is rounding.
 FRICTION_ROUNDING = 1e-12
-# Limits in files are rounded: a joint that starts at 1.5707963 = 90° is not beyond it.
+# Limits in files are rounded: a joint that starts at 1.5707963 = 90° does not exceed it.
 LIMIT_SLACK = 1e-6
 # Relative distance from a current limit within which it counts as reached.
 NEAR_LIMIT = 1e-3
-NOT_ENFORCED = "no law enforces this limit"
+NOT_ENFORCED = "this limit is not enforced"
 # Warning limits of time stepping: energy that the steps remove or add, and change of the energy if everything happened
-# half a step later, both as shares of the turnover; depth of points below surfaces [m].
+# half a step later, both as fractions of the turnover; depth of points below surfaces [m].
 SCHEME_LIMIT = 1e-2
-# Energy that the steps make where contacts give way: a spring that is met within a step stores more than it has taken.
+# Energy added by the steps at compliant contacts: a spring first met within a step stores more than it has taken.
 GAIN_LIMIT = 1e-3
 HALF_STEP_LIMIT = 2e-2
 PENETRATION_LIMIT_M = 1e-3
@@ -72,10 +72,22 @@ def warnings_of(
 
     Parameters
     ----------
-    summary : entries of the summary so far
-    scale : turnover of the energy, at least the resolution of the ledger [J]
-    sunk : bodies below surfaces; motors : loads of the motors
-    begun : time at which the run began [s]; the samples of a ring buffer begin later
+    record : Record
+        Record of the run.
+    scenario : Scenario
+        Scenario of the run.
+    prepared : Prepared
+        Prepared run after its last step.
+    summary : dict
+        Entries of the summary so far.
+    scale : float
+        Turnover of the energy, at least the resolution of the ledger [J].
+    sunk : sequence of Sinking
+        Bodies below surfaces.
+    motors : sequence of dict
+        Loads of the motors.
+    begun : float, optional
+        Start time of the run [s]; the samples of a ring buffer may start later.
     """
     robot = prepared.model.robot
     unstable = unstable_loop(scenario, prepared)
@@ -119,19 +131,19 @@ def _contact_warnings(
             if tally[ku.CHATTERED]:
                 warnings.append(
                     f"{contact.name}: chatter, more than {ke.MOST_EVENTS} contact events within {ke.WINDOW:g} s; "
-                    f"what left more slowly than {tally[ku.SETTLE]:.0e} m/s was kept on the surface"
+                    f"lift-offs slower than {tally[ku.SETTLE]:.0e} m/s were suppressed"
                 )
         warnings += [
             f"{stop.joint}: chatter, more than {ke.MOST_EVENTS} events of its stop within {ke.WINDOW:g} s; "
-            f"what left more slowly than {row[ku.STOP_SETTLE]:.0e} {units[stop.joint][1]} was kept on the stop"
+            f"rebounds slower than {row[ku.STOP_SETTLE]:.0e} {units[stop.joint][1]} were suppressed"
             for stop, row in zip(prepared.stops, unilateral.stop, strict=True)
             if row[ku.STOP_CHATTERED]
         ]
     for contact in summary["contacts"]:
         if contact["normal_force_min_N"] < 0.0 and unilateral is not None:
             warnings.append(
-                f"{contact['name']}: pulls with up to {-contact['normal_force_min_N']:.3g} N within a step, where it "
-                "would leave its surface and land again; make integrator.step_max_s shorter"
+                f"{contact['name']}: pulls with up to {-contact['normal_force_min_N']:.3g} N within a step, when it "
+                "would lift off and land again; reduce integrator.step_max_s"
             )
         elif contact["normal_force_min_N"] < 0.0:
             warnings.append(
@@ -143,11 +155,11 @@ def _contact_warnings(
     warnings += build.left_out_warnings(scenario, contacts, prepared.behind_brakes)
     initial, columns = scenario.config.initial, record.labels["contact_gap"]
     placed = () if initial is None else initial.on_surface
-    # A ring buffer does not have the earlier samples.
+    # A ring buffer does not contain the earlier samples.
     within = f" from t = {record.time[0]:.4g} s on" if len(record) and record.time[0] > begun else ""
     for contact in summary["contacts"]:
         name = contact["name"]
-        # A contact that only bounces is never closed, and a run that ends in its first step gives it no time to be.
+        # A contact that only bounces is never closed, and a run that ends in its first step leaves no time for closing.
         pressed = contact["closed_fraction"] > 0.0 or contact.get("bounces") or contact["normal_force_max_N"] > 0.0
         never = "gap_min_m" in contact and not pressed
         if never and name not in left_out:
@@ -155,31 +167,31 @@ def _contact_warnings(
             time, surface = f"t = {record.time[nearest]:.4g} s", contact["surface"]
             if contact["gap_min_m"] <= build.START_TOLERANCE:
                 warnings.append(
-                    f"{name}: this brace is on the {surface} at {time}, but never pressed{within}: it carries nothing"
+                    f"{name}: is on the {surface} at {time}, but is never pressed{within} and carries no load"
                 )
                 continue
             warnings.append(
-                f"{name}: this brace never touches the {surface}{within}: it carries nothing; nearest "
+                f"{name}: never touches the {surface}{within} and carries no load; nearest "
                 f"{1e3 * contact['gap_min_m']:.3g} mm at {time}"
-                f"{'' if name in placed else ' (initial.on_surface lets it start there)'}"
+                f"{'' if name in placed else ' (use initial.on_surface to start on the surface)'}"
             )
     for k, (brace, since) in enumerate(zip(contacts, prepared.run.extremes[:, ki.LOCAL_SINCE], strict=True)):
-        # The end of a rejected step explains a stop and is not a part of the run. Without another brace the run stops.
+        # The end of a rejected step explains a stop and is not part of the run. Without another brace the run stops.
         if since <= prepared.run.clock[ki.TIME] and _others_closed(record, k, since):
             warnings.append(
-                f"{brace.name}: from t = {since:.4g} s on, its friction turns its own force against it (negative "
-                "diagonal of J M⁻¹F, Painlevé's paradox at one contact): only the other braces hold it there, and "
-                "whether real ones do depends on their stiffness; lower contacts.friction or take another posture"
+                f"{brace.name}: from t = {since:.4g} s on, its friction reverses the effect of its normal force "
+                "(negative diagonal of J M⁻¹F, Painlevé's paradox at one contact); only the other braces hold it, and "
+                "whether real braces do depends on their stiffness; lower contacts.friction or change the posture"
             )
     gained = -summary["friction_heat_J"]
     if gained > FRICTION_ROUNDING * summary["energy_turnover_J"]:
-        put = f"friction has put {gained:.3g} J into the arm: "
+        text = f"friction has added {gained:.3g} J to the arm: "
         if unilateral is None:
-            put += "f_t = μ f_n reverses with a pulling normal force "
-            put += "(contacts.pulling_friction: dissipative takes μ |f_n|)"
+            text += "f_t = μ f_n reverses with a pulling normal force "
+            text += "(contacts.pulling_friction: dissipative uses μ |f_n|)"
         else:
-            put += "an error of the integration; shorten integrator.step_s or tighten integrator.rtol"
-        warnings.append(put)
+            text += "an integration error; reduce integrator.step_s or tighten integrator.rtol"
+        warnings.append(text)
     return warnings
 
 
@@ -190,18 +202,18 @@ def _saturated(record: Record, robot: Robot) -> list[str]:
     limited = [
         (a, motor, limits) for a, motor in enumerate(robot.motors) for limits in _limits_of(motor, units[motor.joint])
     ]
-    # A maximum along contiguous samples needs a third of the time.
+    # The maximum along contiguous samples needs a third of the time.
     peaks = {
         name: np.abs(record[name].T.copy()).max(axis=1, initial=0.0) for name in {limit[1] for *_, limit in limited}
     }
     for a, motor, (quantity, signal, limit, unit) in limited:
-        # The current of a DC motor approaches the limit of its driver but does not reach it.
+        # The current of a DC motor approaches its driver limit but does not reach it.
         reached = limit * (1.0 - NEAR_LIMIT) if isinstance(motor, Motor) and quantity == "current" else limit
-        # A run that diverged may contain NaN, which hides a peak.
+        # A diverged run may contain NaN, which hides a peak.
         if not peaks[signal][a] < reached:
             saturated = np.abs(record[signal][:, a]) >= reached
             if isinstance(motor, Servo):
-                # Without a current its voltage equals the back-EMF.
+                # Without current, its voltage equals the back-EMF.
                 saturated &= record["current"][:, a] != 0.0
             if saturated.mean() >= SHORT:
                 warnings.append(
@@ -214,7 +226,7 @@ def _saturated(record: Record, robot: Robot) -> list[str]:
 def _limits_of(motor: Drive, unit: str) -> list[tuple[str, str, float, str]]:
     """Return the limits of a motor: the limited quantity, its signal, the limit and its unit.
 
-    ``unit`` : of the joint's torque, or force
+    ``unit`` is the unit of the joint's torque or force.
     """
     if isinstance(motor, TorqueSource):
         return [("torque" if unit == "N m" else "force", "current", motor.torque_limit, unit)]
@@ -244,17 +256,17 @@ def _undetermined(record: Record, prepared: Prepared, stepped: bool) -> list[str
         return _shared_forces(record, prepared, evaluations > 0, stepped)
     if not evaluations:
         return []
-    warnings = [f"contact rows depended on each other in {evaluations} evaluations: forces are the split of least norm"]
+    warnings = [f"contact rows were linearly dependent in {evaluations} evaluations: forces are the least-norm split"]
     spread = None
     if len(record) and any(contact.friction > 0.0 for contact in contacts):
         rows, units = len(record), [(link.joint, link.units[2]) for link in prepared.model.robot.links]
         spread = motion_spread(system, record.time, run.sample[:rows], units)
     if spread is not None:
         warnings.append(
-            f"with friction, dependent contact rows leave the motion open too: at t = {spread.time:.4g} s the "
-            f"acceleration of {spread.joint} is anything from {spread.low:.4g} to {spread.high:.4g} {spread.unit} over "
-            "the splits of the normal forces "
-            f"that keep their signs (this run: {spread.taken:.4g}); take away braces until the rest are independent"
+            f"with friction, dependent contact rows also leave the motion undetermined: at t = {spread.time:.4g} s the "
+            f"acceleration of {spread.joint} may be from {spread.low:.4g} to {spread.high:.4g} {spread.unit} for "
+            "splits of the normal forces that keep their signs "
+            f"(this run: {spread.taken:.4g}); remove braces until the remaining ones are independent"
         )
     return warnings
 
@@ -262,7 +274,8 @@ def _undetermined(record: Record, prepared: Prepared, stepped: bool) -> list[str
 def _shared_forces(record: Record, prepared: Prepared, dependent: bool, stepped: bool) -> list[str]:
     """Warn of unilateral forces that the motion does not determine; if all points stick, the motion is unique.
 
-    dependent : whether rows have depended on each other; stepped : whether time stepping ran, which does not detect it
+    ``dependent`` is True if rows have depended on each other; ``stepped`` is True for time stepping, which does not
+    detect dependent rows.
     """
     contacts, rests = prepared.contacts, _joints_at_rest(record, prepared)
     if not len(record) or not (dependent or stepped or rests.any()):
@@ -271,37 +284,37 @@ def _shared_forces(record: Record, prepared: Prepared, dependent: bool, stepped:
     touching, joints = shared.contacts, shared.joints
     if joints and not touching:
         return [
-            f"{first_few(joints)}: shared forces of the dry friction which keeps these coupled joints at rest; the "
-            "motion does not determine them, and those of the record are one choice of many"
+            f"{first_few(joints)}: shared dry friction forces keep these coupled joints at rest; the motion does not "
+            "determine them, and the recorded forces are only one solution"
         ]
     if not touching:
         return []
     sliding = _sliding(record, contacts, touching, rests.any(axis=1) if joints else slice(None))
     verb = "slides" if len(sliding) == 1 else "slide"
-    motion = f"; while {first_few(sliding)} {verb}, other choices may move otherwise" if sliding else ""
+    motion = f"; while {first_few(sliding)} {verb}, other solutions may move differently" if sliding else ""
     if joints:
         if not sliding and (leaving := _leaving(record, contacts, touching, rests)):
             leave = "leaves its surface" if len(leaving) == 1 else "leave their surfaces"
-            motion = f"; where {first_few(leaving)} {leave}, other choices may move otherwise"
+            motion = f"; when {first_few(leaving)} {leave}, other solutions may move differently"
         return [
-            f"{first_few(touching)}: shared forces with the dry friction of {first_few(joints)}, which keeps these "
-            "joints at rest; the motion does not determine them, and those of the record are one choice of many"
+            f"{first_few(touching)}: forces shared with the dry friction of {first_few(joints)}, which keeps these "
+            "joints at rest; the motion does not determine them, and the recorded forces are only one solution"
             f"{motion}"
         ]
     if sliding:
-        choice = "have the least norm" if stepped else "change least from the last change of modes"
+        choice = "have the least norm" if stepped else "change least from the last mode change"
         return [
-            f"{', '.join(touching)}: shared forces which the motion does not determine{motion}; those of the record "
+            f"{', '.join(touching)}: shared forces that the motion does not determine{motion}; the recorded forces "
             f"{choice}"
         ]
     return [
-        f"{', '.join(touching)}: shared forces which the motion does not determine, as points that stick do: "
-        "they are the split of least norm among those that lie in all friction cones"
+        f"{', '.join(touching)}: shared forces that the motion does not determine, because the points stick; "
+        "the recorded forces are the least-norm split within all friction cones"
     ]
 
 
 def _others_closed(record: Record, k: int, since: float) -> bool:
-    """Return whether a contact other than the k-th is closed at some sample from a time on, or at the last one."""
+    """Return whether a contact other than the k-th is closed at a sample from a time on, or at the last sample."""
     if "contact_mode" not in record:
         return len(record.labels["contact_gap"]) > 1
     first = min(int(np.searchsorted(record.time, since)), len(record) - 1)
@@ -310,7 +323,7 @@ def _others_closed(record: Record, k: int, since: float) -> bool:
 
 
 def _leaving(record: Record, contacts: Sequence[Contact], names: Sequence[str], rests: NDArray[np.bool_]) -> list[str]:
-    """Return the named contacts that leave their surface from sticking while dry friction keeps joints at rest."""
+    """Return the named contacts that change from sticking to open while dry friction keeps joints at rest."""
     modes = record["contact_mode"]
     leaves = (modes[:-1] == ka.STICKING) & (modes[1:] == ka.OPEN) & rests[:-1].any(axis=1, keepdims=True)
     return _named(contacts, leaves.any(axis=0), names)
@@ -318,7 +331,7 @@ def _leaving(record: Record, contacts: Sequence[Contact], names: Sequence[str], 
 
 def _unpressed(record: Record, prepared: Prepared, begun: float) -> list[str]:
     """Warn of contacts that stick although no force presses them; then the motion is not unique."""
-    # The share refers to the whole run, even with a ring buffer, because samples do not show the pressing forces.
+    # The fraction refers to the whole run, even with a ring buffer, because samples do not show the pressing forces.
     unilateral, time = prepared.system.unilateral, prepared.run.clock[ki.TIME] - begun
     if unilateral is None or not time > 0.0:
         return []
@@ -331,15 +344,15 @@ def _unpressed(record: Record, prepared: Prepared, begun: float) -> list[str]:
     if not stuck:
         return []
     return [
-        f"the motion is not unique: nothing presses {first_few(stuck)}, held by forces within the friction cones; "
-        "without these forces it would leave its surface, which agrees with the contact law too. This run keeps it, as "
+        f"the motion is not unique: no load presses {first_few(stuck)}, held by forces within the friction cones; "
+        "without these forces it would lift off, which also satisfies the contact law. This run keeps it closed, as "
         "equally stiff supports would; lower contacts.friction, or model the supports (contacts.stiffness_N_per_m with "
         "integrator.method: time_stepping)"
     ]
 
 
 def _open_impacts(prepared: Prepared) -> list[str]:
-    """Warn of impacts in which contacts left although the law also has a solution that keeps them."""
+    """Warn of impacts in which contacts left although the law also has a solution that keeps them closed."""
     if prepared.system.unilateral is None:
         return []
     left = [
@@ -351,27 +364,27 @@ def _open_impacts(prepared: Prepared) -> list[str]:
         return []
     return [
         "the motion is not unique: impacts of other points or joint stops, the first at the time in brackets, lift "
-        f"{first_few(left)} off, while impulses within the friction cones could keep the contact closed, wedged, which "
-        "agrees with the contact law too; lower contacts.friction, or model the supports (contacts.stiffness_N_per_m "
-        "with integrator.method: time_stepping)"
+        f"{first_few(left)} off, although impulses within the friction cones could keep the contact closed (wedged), "
+        "which also satisfies the contact law; lower contacts.friction, or model the supports "
+        "(contacts.stiffness_N_per_m with integrator.method: time_stepping)"
     ]
 
 
 def _wedged(record: Record, prepared: Prepared) -> list[str]:
-    """Warn of contacts that friction can wedge against their surface by itself."""
+    """Warn of contacts that friction alone can wedge against their surface."""
     if prepared.system.unilateral is None:
         return []
     names = [
-        f"{wedge.contact.name} against {wedge.contact.surface_name} from a coefficient of {wedge.least:.4g} on (it has "
+        f"{wedge.contact.name} against {wedge.contact.surface_name} for coefficients from {wedge.least:.4g} on (here "
         f"{wedge.friction:.4g}, t = {wedge.time:.6g} s)"
         for wedge in wedges(prepared.model, prepared.contacts, record)
     ]
     if not names:
         return []
     return [
-        f"the motion is not unique: friction can wedge {first_few(names)} by itself, without a load: no joint moves "
-        "the point along some direction inside its friction cone, so that a force of any size along it can hold the "
-        "point, or none, and both agree with the contact law; lower contacts.friction, or model the surface "
+        f"the motion is not unique: friction alone can wedge {first_few(names)} without a load: no joint moves "
+        "the point along some direction inside its friction cone, so a force of any size along it, or none, satisfies "
+        "the contact law; lower contacts.friction, or model the surface "
         "(contacts.stiffness_N_per_m with integrator.method: time_stepping)"
     ]
 
@@ -384,11 +397,11 @@ def _slipping_start(record: Record, prepared: Prepared) -> list[str]:
         slips = 0.0
     else:
         slips = min((event.time for event in record.events if event.kind == "slip_start"), default=np.inf)
-    if slips > AT_ONCE:
+    if slips > START_SLIP_TIME:
         return []
     return [
-        f"initial.equilibrium: the start slips at t = {slips:.3g} s, because this posture needs all of the static "
-        "friction; raise contacts.friction, or change the posture"
+        f"initial.equilibrium: the start slips at t = {slips:.3g} s because this posture requires the full static "
+        "friction; raise contacts.friction or change the posture"
     ]
 
 
@@ -397,7 +410,7 @@ def _moving_start(record: Record, prepared: Prepared) -> list[str]:
     balance, robot = prepared.balance, prepared.model.robot
     if balance is None or balance.warnings or not len(record) or record.time[0] != 0.0:
         return []
-    # The run may have begun from a different state. Quaternions have been normalised.
+    # The run may have started from a different state. Quaternions have been normalised.
     there = np.allclose(record["q"][0], robot.initial, rtol=0.0, atol=SAME_POSTURE)
     # A projection leaves rates of the size of rounding errors.
     if not there or np.abs(record["v"][0]).max(initial=0.0) > RATE_TOLERANCE:
@@ -412,17 +425,17 @@ def _moving_start(record: Record, prepared: Prepared) -> list[str]:
         for name, force in balance.normal_forces.items()
         if abs(touch[names.index(name)] - force) > DIFFERS * (1.0 + abs(force))
     ]
-    text = f"initial.equilibrium: {link.joint} starts with {acceleration:.4g} {link.units[2]} all the same"
+    text = f"initial.equilibrium: {link.joint} nevertheless starts with {acceleration:.4g} {link.units[2]}"
     if other:
         text += (
-            f", and contacts with other forces than at rest: {first_few(other)}; the contact law allows both, and the "
-            "run takes the motion; take one of these contacts away, lower its friction, or change the posture"
+            f", and contact forces differ from rest: {first_few(other)}; the contact law allows both, and the "
+            "run follows the motion; remove one of these contacts, lower its friction, or change the posture"
         )
     return [text]
 
 
 def _joints_at_rest(record: Record, prepared: Prepared) -> NDArray[np.bool_]:
-    """Return whether dry friction keeps each joint at rest, by sample, (T, n)."""
+    """Return whether dry friction keeps each joint at rest, (T, n)."""
     rests = np.zeros((len(record), prepared.model.n), dtype=bool)
     law = prepared.system.unilateral
     if law is not None and "joint_friction" in record:
@@ -448,7 +461,7 @@ def _sunk(record: Record, sunk: Sequence[Sinking]) -> list[str]:
         warnings.append(
             f"{names} {verb} below {surface}{beyond}: {deepest.body}{radius} by up to {1e3 * deepest.depth:.3g} mm in "
             f"the samples, first at t = {record.time[min(s.sample for s in below)]:.4g} s; "
-            "surfaces hold only the points of contacts"
+            "only contact points interact with surfaces"
         )
     return warnings
 
@@ -457,7 +470,7 @@ def _passed_limits(record: Record, robot: Robot, real: bool) -> list[str]:
     """Warn of joint limits that samples of the record exceed.
 
     Only stops are enforced, and only under the unilateral law (``real``). Under this law only time stepping lets joints
-    pass their stops, by up to one step of motion at a hit; then it moves them back.
+    pass their stops, by up to one step of motion at a hit, and then moves them back.
     """
     torque = dict(zip(record.labels["torque"], record["torque"].T, strict=True))
     warnings = []
@@ -485,7 +498,7 @@ def _passed_limits(record: Record, robot: Robot, real: bool) -> list[str]:
             if over.size:
                 amount, first = beyond[over].max(), record.time[over[0]]
                 warnings.append(
-                    f"{link.joint}: passes its {quantity} limit of {format_quantity(limit, unit, 4)} by up to "
+                    f"{link.joint}: exceeds its {quantity} limit of {format_quantity(limit, unit, 4)} by up to "
                     f"{format_quantity(amount, unit, 3)}, first at t = {first:.4g} s; {note}"
                 )
     return warnings
@@ -494,12 +507,12 @@ def _passed_limits(record: Record, robot: Robot, real: bool) -> list[str]:
 def _after_passing(left: float, unit: str, real: bool) -> str:
     """Return consequence and fix for a joint that passed its stop and is ``left`` beyond it at the end [rad or m]."""
     if not real:
-        return "stops are enforced under contacts.law: unilateral"
+        return "joint stops require contacts.law: unilateral"
     if left > LIMIT_SLACK:
         end = f"it is still {format_quantity(left, unit, 3)} beyond its stop at the end"
     else:
         end = "time stepping has moved it back to its stop"
-    return f"{end}; a shorter integrator.step_s lets it pass less"
+    return f"{end}; reduce integrator.step_s to reduce the overshoot"
 
 
 def _beyond_stops(robot: Robot, stops: Sequence[JointStop], control: JointControl) -> list[str]:
@@ -520,66 +533,66 @@ def _beyond_stops(robot: Robot, stops: Sequence[JointStop], control: JointContro
                 first.setdefault(stop, float(times[beyond > START_TOLERANCE][0]))
                 worst[stop] = max(worst.get(stop, (0.0, 0.0)), (float(beyond[k]), float(times[k])))
     return [
-        f"{stop.joint}: its reference goes beyond its stop at {format_quantity(stop.position, units[stop.joint])} by "
+        f"{stop.joint}: its reference exceeds its stop at {format_quantity(stop.position, units[stop.joint])} by "
         f"up to {format_quantity(most, units[stop.joint])}, first at t = {first[stop]:.4g} s, most at t = {time:.4g} "
-        "s; the motor pushes against the stop and misses its path: change the path or the limit"
+        "s; the motor pushes against the stop and misses its path; change the path or the limit"
         for stop, (most, time) in worst.items()
     ]
 
 
 def coarse(stepping: dict[str, Any], scale: float) -> list[str]:
-    """Warn of steps so long that they remove, add or blur energy or let points sink in, and suggest a shorter step.
+    """Warn of steps that remove, add or blur too much energy or let points sink in too far, and suggest a shorter step.
 
-    scale : turnover of the energy, at least the resolution of the ledger; zero before the first motion [J]
+    ``scale`` is the turnover of the energy, at least the resolution of the ledger; zero before the first motion [J].
     """
     step, worst = stepping["step_s"], stepping["scheme_loss_worst_J"]
-    # A ring buffer does not have this value.
+    # Missing for a ring buffer.
     blurred = stepping.get("half_step_energy_J", 0.0)
-    # Only where contacts give way, or bodies are tied.
+    # Only with compliant contacts or ties.
     made = stepping.get("scheme_gain_J", 0.0)
     warnings: list[str] = []
     if scale > 0.0 and made > GAIN_LIMIT * scale:
         warnings.append(
-            f"time stepping: contacts or ties that give way get {made:.3g} J from the steps themselves, "
+            f"time stepping: the steps themselves add {made:.3g} J to compliant contacts or ties, "
             f"{100 * made / scale:.2g} % of the turnover (limit {100 * GAIN_LIMIT:g} %); "
-            f"integrator.step_s is {step:g}: take {_shorter(_resolving(stepping, made / scale)):g}"
+            f"integrator.step_s is {step:g}: use {_shorter(_resolving(stepping, made / scale)):g}"
         )
-    # What steps have made counts once.
+    # Energy added by the steps is reported only once.
     another = worst > 0.0 or made <= GAIN_LIMIT * scale
     if scale > 0.0 and another and abs(worst) > SCHEME_LIMIT * scale:
         warnings.append(
-            f"time stepping: the steps themselves {'took' if worst > 0.0 else 'made'} up to {abs(worst):.3g} J, "
+            f"time stepping: the steps themselves {'removed' if worst > 0.0 else 'added'} up to {abs(worst):.3g} J, "
             f"{100 * abs(worst) / scale:.2g} % of the turnover (limit {100 * SCHEME_LIMIT:g} %); "
-            f"integrator.step_s is {step:g}: take {_shorter(step * SCHEME_LIMIT * scale / abs(worst)):g}"
+            f"integrator.step_s is {step:g}: use {_shorter(step * SCHEME_LIMIT * scale / abs(worst)):g}"
         )
     if scale > 0.0 and blurred > HALF_STEP_LIMIT * scale:
         warnings.append(
-            f"time stepping: the power changes so fast that the energy is known to {blurred:.3g} J only, "
-            f"{100 * blurred / scale:.2g} % of the turnover (limit {100 * HALF_STEP_LIMIT:g} %), as it "
-            f"would change if all came half a step later; integrator.step_s is {step:g}: take "
+            f"time stepping: the power changes so fast that the energy is known only to {blurred:.3g} J, "
+            f"{100 * blurred / scale:.2g} % of the turnover (limit {100 * HALF_STEP_LIMIT:g} %), the "
+            f"change if everything happened half a step later; integrator.step_s is {step:g}: use "
             f"{_shorter(step * HALF_STEP_LIMIT * scale / blurred):g}"
         )
     deepest = stepping["penetration_max_m"]
     if deepest > PENETRATION_LIMIT_M:
         warnings.append(
             f"time stepping: points sink up to {1e3 * deepest:.3g} mm into their surfaces as they land (limit "
-            f"{1e3 * PENETRATION_LIMIT_M:g} mm); integrator.step_s is {step:g}: take "
+            f"{1e3 * PENETRATION_LIMIT_M:g} mm); integrator.step_s is {step:g}: use "
             f"{_shorter(step * PENETRATION_LIMIT_M / deepest):g}"
         )
     return warnings
 
 
 def _resolving(stepping: dict[str, Any], share: float) -> float:
-    """Return a step with which landings on springs make less than GAIN_LIMIT of the energy; now it is ``share``.
+    """Return a step with which landings on springs add less than GAIN_LIMIT of the energy; now they add ``share``.
 
-    A step at whose middle the spring is not met yet has no force, and one at whose middle it is has all of it. Of
-    the kinetic energy of a landing that makes up to z/4 and on average z/12, by the place in the step, z = (ω h)²:
-    with z = GAIN_LIMIT four landings at worst, and twelve on average, make no more than the limit. The share that one
-    run has made is no measure for it: it depends on these places, and has no order where z > 1.
+    A step has the full spring force if its midpoint is in contact, and none otherwise. This adds up to z/4, and on
+    average z/12, of the kinetic energy of a landing, depending on the position within the step, z = (ω h)². With z =
+    GAIN_LIMIT, four landings at worst, and twelve on average, stay within the limit. The share of a single run is not a
+    measure: it depends on these positions, and has no order for z > 1.
     """
     step, pulsation = float(stepping["step_s"]), stepping["spring_rate_rad_per_s"]
-    # What else makes energy, of the method's order or of first order, is in the share.
-    if pulsation == 0.0:  # ties that are dampers alone
+    # The share includes energy added by other effects, of the method's order or of first order.
+    if pulsation == 0.0:  # ties with dampers only
         return step * GAIN_LIMIT / share
     return float(min(GAIN_LIMIT**0.5 / pulsation, step * (GAIN_LIMIT / share) ** 0.5))
 
@@ -587,7 +600,7 @@ def _resolving(stepping: dict[str, Any], share: float) -> float:
 def _shorter(step: float) -> float:
     """Return the step rounded down to one digit."""
     power = 10.0 ** np.floor(np.log10(step))
-    # Just below a power of ten its logarithm rounds up to a whole number.
+    # Just below a power of ten, the logarithm rounds up to an integer.
     return float(max(np.floor(step / power), 1.0) * power)
 
 
@@ -596,14 +609,14 @@ def capped(stepping: dict[str, Any]) -> list[str]:
     if not stepping["capped_solves"]:
         return []
     return [
-        f"time stepping: {stepping['capped_solves']} of {stepping['contact_solves']} contact problems were given up "
-        f"above {kt.BAD:g} m/s, the worst at {stepping['residual_max_m_s']:.1e} m/s: their forces are not quite "
-        "Coulomb's; shorten integrator.step_s"
+        f"time stepping: {stepping['capped_solves']} of {stepping['contact_solves']} contact problems were abandoned "
+        f"with a residual above {kt.BAD:g} m/s (maximum {stepping['residual_max_m_s']:.1e} m/s); their forces violate "
+        "Coulomb's law slightly; reduce integrator.step_s"
     ]
 
 
 def _base_warnings(record: Record, scenario: Scenario, prepared: Prepared, begun: float) -> list[str]:
-    """Warn if a mobile base does something that is impossible for a real base."""
+    """Warn of behaviour that is impossible for a real mobile base."""
     base, run, settle = prepared.model.robot.base, prepared.run, scenario.metrics.settle_s
     if base is None:
         return []
@@ -612,7 +625,7 @@ def _base_warnings(record: Record, scenario: Scenario, prepared: Prepared, begun
     lowest = least_loads(record, run.support.least)
     late = record["tip_margin"][record.time >= settle]
     first = min((event.time for event in record.events if event.kind == TIP_OVER), default=np.inf)
-    # The samples of a ring buffer may begin after the base has tipped.
+    # The samples of a ring buffer may start after the base has tipped.
     tipped = len(record) > 0 and record.time[0] > begun and record["tip_margin"][0] < 0.0
     if tipped:
         first = float(record.time[0])
@@ -625,19 +638,19 @@ def _base_warnings(record: Record, scenario: Scenario, prepared: Prepared, begun
         beyond = f"{percent((record['tip_margin'] < 0.0).mean())} of the samples"
         if late.size and overturns_settled(record, settle) is None:
             warnings.append(
-                f"a jolt of the start takes the tip margin below zero at t = {first:.4f} s, in {beyond}, none from "
-                f"{settle:g} s on (margin at least {late.min():.3g}){least}: start with initial.equilibrium, or with a "
-                "motion that begins at rest"
+                f"a jolt at the start drives the tip margin below zero at t = {first:.4f} s, in {beyond}, none from "
+                f"{settle:g} s on (margin at least {late.min():.3g}){least}; use initial.equilibrium, or start the "
+                "motion at rest"
             )
         else:
             warnings.append(
-                f"the base {tips} at t = {first:.4f} s, with a tip margin below zero in {beyond}; the run goes on "
-                f"as if it were held down{least}: plant.base.on_overturn: stop ends it there"
+                f"the base {tips} at t = {first:.4f} s, with a tip margin below zero in {beyond}; the run continues "
+                f"as if the base were fixed{least}; use plant.base.on_overturn: stop to end it there"
             )
     lifted = load.sum(axis=1) <= 0.0
     if lifted.any():
         warnings.append(
-            f"the base is lifted: no load on its wheels and caster in {percent(lifted.mean())} of the samples, "
+            f"the base is lifted: its wheels and caster carry no load in {percent(lifted.mean())} of the samples, "
             f"first at t = {record.time[lifted.argmax()]:.4g} s (counts as a tip margin of -1)"
         )
     # After the base has tipped, the loads are meaningless.
@@ -646,9 +659,9 @@ def _base_warnings(record: Record, scenario: Scenario, prepared: Prepared, begun
         slips = demand > 1.0
         if slips.any():
             warnings.append(
-                f"the {name} wheel would slip: it needs up to {np.nanmax(demand):.3g} times the traction that "
-                f"plant.base.wheel_friction = {base.wheel_friction:g} gives, first at "
-                f"t = {record.time[standing][slips.argmax()]:.4g} s; rolling is enforced all the same"
+                f"the {name} wheel would slip: it requires up to {np.nanmax(demand):.3g} times the traction of "
+                f"plant.base.wheel_friction = {base.wheel_friction:g}, first at "
+                f"t = {record.time[standing][slips.argmax()]:.4g} s; the simulation enforces rolling anyway"
             )
     return warnings
 
@@ -665,7 +678,7 @@ def _overloaded(loads: Sequence[dict[str, Any]]) -> list[str]:
         if over:
             texts = [text for _, text in sorted(over, key=lambda entry: -entry[0])]
             warnings.append(
-                f"{', '.join(texts)}: the {label}, rms over the run, is more than nominal, which a motor does not "
-                "stand for long; brace the arm, go slower, or take a larger motor"
+                f"{', '.join(texts)}: the rms {label} of the run exceeds the nominal {label}; a real motor would "
+                "overheat: brace the arm, slow down, or use a larger motor"
             )
     return warnings

@@ -470,12 +470,12 @@ def test_ticks_of_a_snake_are_run_without_a_thread_each(monkeypatch: pytest.Monk
     """A thread for each tick took more than half of the time."""
     handed_over = []
 
-    def attend(work: Any, *others: Any) -> Any:
+    def run_in_thread(work: Any, *others: Any) -> Any:
         handed_over.append(1)
         return attend_to(work, *others)
 
-    attend_to = stopping.attend
-    monkeypatch.setattr(stopping, "attend", attend)
+    attend_to = stopping.run_in_thread
+    monkeypatch.setattr(stopping, "run_in_thread", run_in_thread)
     dynsim.simulate(dynsim.load_scenario("snake_positioning_dynamic", "x", {"duration_s": 0.1}))
     assert handed_over == [1]  # the loading of kernels
 
@@ -485,7 +485,7 @@ def test_what_the_work_raises_is_raised():
         raise ValueError("of the work")
 
     with pytest.raises(ValueError, match="of the work"):
-        stopping.attend(work, lambda: None, lambda: None)
+        stopping.run_in_thread(work, lambda: None, lambda: None)
 
 
 def test_work_of_one_thread_is_not_mistaken_for_that_of_another_task():
@@ -495,8 +495,8 @@ def test_work_of_one_thread_is_not_mistaken_for_that_of_another_task():
     def look() -> None:
         raise KeyboardInterrupt
 
-    ended, raised = stopping.attend(lambda: release.wait(30.0), lambda: None, look)
+    ended, raised = stopping.run_in_thread(lambda: release.wait(30.0), lambda: None, look)
     assert (ended, type(raised)) == (False, KeyboardInterrupt)
-    assert stopping.attend(lambda: done.append(1), lambda: None, lambda: None) == (True, None)
+    assert stopping.run_in_thread(lambda: done.append(1), lambda: None, lambda: None) == (True, None)
     assert done == [1]
     release.set()

@@ -1,4 +1,4 @@
-"""Joint references by inverse kinematics of a hand path, on the joints that the scenario names."""
+"""Joint references by inverse kinematics of a hand path, and planned voltages along joint references."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from dynsim.system.memo import recall
 
 Array = NDArray[np.float64]
 
-# Limits in files are rounded: 1.5707963 = 90° is not beyond 90° [rad or m].
+# Limits in files are rounded: 1.5707963 = 90° does not exceed 90° [rad or m].
 LIMIT_SLACK = 1e-6
 # Targets between two checks of the clock and for Ctrl-C: some milliseconds.
 PIECE = 256
-# Wall time before the first report of progress, and between two [s]; most paths take less than the first.
+# Wall-clock time before the first progress report, and between reports [s]; most paths take less than the first.
 QUIET_S, REPORT_S = 1.0, 0.1
 
 
@@ -46,35 +46,48 @@ def follow(
     braces: Sequence[Contact] = (),
     orientation: Array | None = None,
 ) -> Array:
-    """Positions of ``joints`` that put the hand on ``targets`` at ``times``; the others stay as in ``q``.
+    """Compute positions of ``joints`` that put the hand on ``targets`` at ``times``; other joints stay as in ``q``.
 
-    Joints keep their limits on the way. The targets are in the world: what a mobile base moves by meanwhile, the joints
-    make up for.
+    The joint limits are enforced. The targets are in the world frame: the joints compensate the motion of a mobile
+    base.
 
-    Damped Gauss–Newton from the previous solution: dq = Jᵀ (J Jᵀ + λ 1)⁻¹ e, with λ falling with the error, so that
-    near a solution it is Newton's method and far from one it does not jump. More than three joints move as little as
+    Damped Gauss–Newton from the previous solution: dq = Jᵀ (J Jᵀ + λ 1)⁻¹ e, with λ decreasing with the error, so that
+    it is Newton's method near a solution and does not jump far from one. More than three joints move as little as
     possible.
 
     Parameters
     ----------
-    times : (T,) [s]; targets : (T, 3) [m]
-    joints : names of the joints that move
-    q : (nq,) configuration to start from; it selects the branch
-    tolerance : distance that counts as reached [m]
-    progress : called now and then with the time on the path [s], when it takes longer than a second
-    braces : points that stay on their surfaces on the way, as exactly as the hand is on its path
-    base : (T, 4) coordinates of the mobile base at ``times``: its wheels [rad], x and y [m]; None: it stays
-    orientation : (3, 3) rotation of the hand in the world, which it keeps all the way; None: any
+    model : Model
+        Model of the robot.
+    times : (T,) ndarray
+        Times [s].
+    targets : (T, 3) ndarray
+        Hand positions in the world frame [m].
+    joints : sequence of str
+        Joints that move.
+    q : (nq,) ndarray
+        Configuration to start from, which selects the solution branch.
+    tolerance : float
+        Distance that counts as reached [m].
+    progress : callable, optional
+        Called regularly with the time on the path [s] if the computation takes longer than a second.
+    base : (T, 4) ndarray, optional
+        Coordinates of the mobile base at ``times``: wheels [rad], x and y [m]; default: it does not move.
+    braces : sequence of Contact, optional
+        Points that stay on their surfaces, as accurately as the hand on its path.
+    orientation : (3, 3) ndarray, optional
+        Constant rotation of the hand in the world; default: any.
 
     Returns
     -------
-    array, shape (T, len(joints)) [rad or m]
+    (T, len(joints)) ndarray
+        Joint positions [rad or m].
 
     Raises
     ------
     UnreachableReference
-        With the first time at which the hand cannot reach its target, and the distance that is left; or with the joint
-        that would pass its limit, when, and by how much.
+        With the first time at which the hand cannot reach its target, and the remaining distance; or with the joint
+        that would exceed its limit, the time and the amount.
     """
     if orientation is not None:
         _check_start(model, joints, q)
@@ -104,20 +117,20 @@ def follow(
                 if reached > k and (passed := _passed_limits(model, joints, times, result[:reached])):
                     raise UnreachableReference(
                         "controller.hand.path: "
-                        f"the hand cannot follow its path with {', '.join(joints)} within their limits: {passed}; move "
-                        "the path, let more joints follow it, or change the limit"
+                        f"out of reach with {', '.join(joints)} within their limits: {passed}; move the path, add "
+                        "joints to controller.hand.joints, or change the limit"
                     )
                 target = wanted[k]
                 raise UnreachableReference(
                     "controller.hand.path: "
-                    f"the hand cannot follow its path with {', '.join(joints)}: at t = {times[k]:.3f} s it stays "
+                    f"out of reach with {', '.join(joints)}: at t = {times[k]:.3f} s the hand is "
                     f"{left:.4g} m from ({target[0]:.4g}, {target[1]:.4g}, {target[2]:.4g}) m; "
-                    "move the path, or let more joints follow it"
+                    "move the path or add joints to controller.hand.joints"
                 )
         return result
 
     inputs = geometry, path, wanted, carried, first, tolerance, np.asarray(q)
-    # Not from masses. The path has room for one step in it, which holds anything afterwards.
+    # The memo does not depend on masses. The path contains a workspace for one step with arbitrary contents.
     return recall("inverse kinematics", solved, *inputs)
 
 
@@ -131,7 +144,7 @@ def _turned(
     orientation: Array,
     braces: Sequence[Contact],
 ) -> Array:
-    """As :func:`follow`, for a hand that keeps its orientation."""
+    """Compute the positions like :func:`follow`, for a hand with constant orientation."""
     columns = [model.robot.position_index[model.joint_names.index(name)] for name in joints]
     postures = np.zeros((len(times), len(joints)))
     for k, target in enumerate(targets):
@@ -140,15 +153,15 @@ def _turned(
         except UnreachableReference as error:
             raise UnreachableReference(
                 "controller.hand.path: "
-                f"the hand cannot follow its path with {', '.join(joints)}, turned as controller.hand.orientation "
-                f"says: at t = {times[k]:.3f} s {error}"
+                f"out of reach with {', '.join(joints)} and controller.hand.orientation: at t = {times[k]:.3f} s: "
+                f"{error}"
             ) from None
         postures[k] = q[columns]
     return postures
 
 
 def _check_start(model: Model, joints: Sequence[str], q: Array) -> None:
-    """Refuse joints that begin beyond their limits: the path would begin with a jump."""
+    """Raise UnreachableReference for joints that start beyond their limits: the path would start with a jump."""
     for name in joints:
         i = model.joint_names.index(name)
         link, at = model.robot.links[i], float(q[model.robot.position_index[i]])
@@ -156,14 +169,14 @@ def _check_start(model: Model, joints: Sequence[str], q: Array) -> None:
             if beyond > LIMIT_SLACK:
                 raise UnreachableReference(
                     "controller.hand.path: "
-                    f"{name} follows the hand's path, but starts at {format_quantity(at, link.units[0])}, beyond "
+                    f"{name} follows the path, but starts at {format_quantity(at, link.units[0])}, beyond "
                     f"its {which} limit of {format_quantity(limit, link.units[0])}; change its initial "
                     "position or its limit"
                 )
 
 
 def _passed_limits(model: Model, joints: Sequence[str], times: Array, positions: Array) -> str:
-    """What joints without limits would do: joint, limit, time and amount of the one that goes furthest beyond."""
+    """Describe how joints without limits would exceed them: joint, limit, time and amount, the largest first."""
     passed: list[tuple[float, str]] = []
     for name, column in zip(joints, positions.T, strict=True):
         link = model.robot.links[model.joint_names.index(name)]
@@ -173,19 +186,19 @@ def _passed_limits(model: Model, joints: Sequence[str], times: Array, positions:
             over = np.flatnonzero(beyond > LIMIT_SLACK)
             if over.size:
                 most, since = float(beyond[over].max()), times[over[0]]
-                text = f"{name} would pass its {which} limit of {format_quantity(limit, unit)} from"
+                text = f"{name} would exceed its {which} limit of {format_quantity(limit, unit)} from"
                 passed.append((most, f"{text} t = {since:.3f} s on, by up to {format_quantity(most, unit, 3)}"))
     return "; ".join(text for _, text in sorted(passed, reverse=True))
 
 
-# Feed-forward voltages along joint references, from full dynamics with brace forces or from gravity alone.
+# Feed-forward voltages along joint references, from the full dynamics with brace forces or from gravity alone.
 
 
 # Smoothing speed v_s of planned friction [m/s], μ s/√(s² + v_s²): a jump would make the voltages oscillate.
 SLIP_SCALE = 5e-3
 # Slip speed s below which the plan contains no friction [m/s].
 SLIP_MIN = 1e-9
-# Largest distance of a brace from its surface, above or below, along the references [m]; more is a ModelError.
+# Maximum distance of a brace from its surface, above or below, along the references [m]; more is a ModelError.
 GAP_MAX = 2e-3
 
 
@@ -201,26 +214,33 @@ def planned_voltages(
 
     Parameters
     ----------
-    times : (T,) equally spaced instants [s]
-    positions : positions of the moving joints, (T,) [rad or m]; the remaining joints hold their initial positions
-    braces : contact and commanded normal force [N] for each brace; None for the force of least heat, at least ``min_N``
-    whole : True for the whole dynamics and the circuits; False for the currents that hold the weight at rest,
-        i = g / K_m
+    model : Model
+        Model of the robot.
+    times : (T,) ndarray
+        Equally spaced times [s].
+    positions : mapping of str to (T,) ndarray
+        Positions of the moving joints [rad or m]; the other joints keep their initial positions.
+    braces : mapping of str to (Contact, float or None)
+        Contact and commanded normal force [N] for each brace; None for the force of least heat, at least ``min_N``.
+    min_N : float, optional
+        Minimum normal force [N].
+    whole : bool, optional
+        True for the full dynamics and the circuits; False for the currents that hold the weight at rest, i = g / K_m.
 
     Raises
     ------
     ModelError
-        If a joint has no DC motor, a mobile base must move, a brace is not a point or the references pull it off its
+        If a joint has no DC motor, a mobile base must move, a brace is not a point, the references pull a brace off its
         surface, or no brace forces carry the motion.
     """
     robot = model.robot
     driven = [motor.joint for motor in robot.motors]
     if sorted(driven) != sorted(robot.joint_names) or not all(isinstance(m, Motor) for m in robot.motors):
-        raise ModelError("controller: planned voltages need a DC motor on every joint", keys=("controller",))
+        raise ModelError("controller: planned voltages require a DC motor on every joint", keys=("controller",))
     q, places = np.tile(robot.initial, (len(times), 1)), list(robot.position_index)
     for name, values in positions.items():
         if robot.base is not None and name in robot.base.wheels and np.ptp(values) > 0.0:
-            raise ModelError("controller: planned voltages need a mobile base that stands", keys=("controller",))
+            raise ModelError("controller: planned voltages require a stationary mobile base", keys=("controller",))
         q[:, places[model.joint_names.index(name)]] = values
     spacing = float(times[1] - times[0])
     v, vdot = quintic_rates(spacing, q[:, places])
@@ -251,13 +271,13 @@ def pressing(
 ) -> tuple[BracePlanner, Array]:
     """Return the planner of braces that press along references, and their kernel tables, (T, c, BRACE_SIZE).
 
-    Friction acts against the slip of the references: μ f_n v/√(v² + v_s²), with v_s = ``slip_scale`` [m/s].
+    Friction opposes the slip of the references: μ f_n v/√(v² + v_s²), with v_s = ``slip_scale`` [m/s].
     """
     attached = []
     for name, (contact, _) in braces.items():
         if contact.tip is not None:
             raise ModelError(
-                f"controller.brace: {name} is the axis of a link; name points of contacts.points that are to press",
+                f"controller.brace: {name} is the axis of a link; use points of contacts.points",
                 keys=("controller", "brace"),
             )
         attached.append(model.robot.attach(contact.body, contact.point))
@@ -274,7 +294,7 @@ def pressing(
         slip = velocity - np.sum(velocity * normals, axis=1, keepdims=True) * normals
         speed = np.linalg.norm(slip, axis=1)
         slip[speed <= SLIP_MIN] = 0.0
-        # The plan has no friction for a point at rest along the surface: the friction there depends on its history.
+        # No planned friction for a point at rest along the surface: its friction depends on its history.
         friction = np.where(speed > SLIP_MIN, contact.friction * speed / np.hypot(speed, slip_scale), 0.0)
         tables[:, k] = brace_rows(touching, normals, friction, min_N, np.nan if force is None else force, slip)
     return planner, tables
@@ -289,13 +309,13 @@ def _pressing_torques(
     braces: Mapping[str, tuple[Contact, float | None]],
     min_N: float,
 ) -> Array:
-    """Return the torques of the motors along the references, (T, n), with braces that press."""
+    """Return the motor torques along the references, (T, n), with braces that press."""
     planner, tables = pressing(model, times, q, v, braces, min_N)
     torques, _, solved = planner.least_heat(q, v, vdot, tables)
     if solved < len(times):
         raise ModelError(
             f"controller.brace: at t = {times[solved]:.3f} s no forces of {', '.join(braces)} carry the motion within "
-            "the limits of the motors; ask for other forces, go slower, or raise a voltage_limit_V or peak_current_A",
+            "the motor limits; change the forces, slow down, or raise a voltage_limit_V or peak_current_A",
             keys=("controller", "brace"),
         )
     return torques
@@ -308,13 +328,19 @@ def _lowest_points(
 
     Parameters
     ----------
-    attached : link, and the point in its frame [m]
-    offsets : offsets in the world frame, (T, 3) [m]
+    model : Model
+        Model of the robot.
+    attached : (int, (3,) ndarray)
+        Link, and the point in its frame [m].
+    offsets : (T, 3) ndarray
+        Offsets in the world frame [m].
+    q, v : (T, nq), (T, n) ndarray
+        Positions and rates of the motion.
     """
     link, point = attached
     planner = BracePlanner(model.robot, model.arrays, [link] * 4)
     positions, velocities = planner.motion(point + np.vstack([np.zeros(3), np.eye(3)]), q, v)
-    axes = positions[:, 1:] - positions[:, :1]  # (T, 3, 3), a row for each axis of the body
+    axes = positions[:, 1:] - positions[:, :1]  # (T, 3, 3), one row for each body axis
     shifts = np.einsum("tij,tj->ti", axes, offsets)
     return point + shifts, velocities[:, 0] + np.einsum("ti,tij->tj", shifts, velocities[:, 1:] - velocities[:, :1])
 

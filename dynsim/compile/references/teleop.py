@@ -1,4 +1,4 @@
-"""Velocities of hand and mobile base from an operator: their source, a script of them, options of the references."""
+"""Velocity commands for hand and mobile base from an operator: source, script, and options of the references."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from dynsim.model.description import Contact
 
 Array = NDArray[np.float64]
 
-# Within a velocity: of the hand along x, y, z [m/s]; of a base ahead [m/s] and about z [rad/s].
+# Parts of a velocity: hand along x, y, z [m/s]; base ahead [m/s] and about z [rad/s].
 HAND, BASE = slice(0, 3), slice(3, 5)
 VELOCITIES = 5
 
@@ -22,40 +22,55 @@ class VelocitySource(Protocol):
     """An operator, live or a script."""
 
     def read(self, tick: int) -> Array:
-        """Velocities from a tick to the next, (5,): see ``HAND`` and ``BASE``."""
+        """Return the velocities from a tick to the next, (5,): see ``HAND`` and ``BASE``."""
         ...
 
 
 @dataclass(frozen=True)
 class VelocityScript:
-    """Velocities that hold from their ticks on, and none before the first.
+    """Piecewise constant velocities.
 
     Attributes
     ----------
-    ticks : (K,) increasing or equal; velocity : (K, 5) [m/s, rad/s]
+    ticks : (K,) ndarray of int
+        Start ticks, not decreasing.
+    velocity : (K, 5) ndarray
+        Velocities from these ticks on [m/s, rad/s].
     """
 
     ticks: NDArray[np.int64]
     velocity: Array
 
     def read(self, tick: int) -> Array:
-        """The last one that has begun."""
+        """Return the velocity in force at ``tick``, shape (5,); zeros before the first entry."""
         k = int(np.searchsorted(self.ticks, tick, side="right")) - 1
         return self.velocity[k] if k >= 0 else np.zeros(VELOCITIES)
 
 
 @dataclass(frozen=True)
 class TeleopOptions:
-    """What an operator moves, and how.
+    """Motions that an operator controls, and their limits.
 
     Attributes
     ----------
-    rate : of the ticks [1/s]
-    joints : names of those that follow the hand's velocity; braces : contact points that they keep on their surfaces
-    rate_limit : fastest joint rate [rad/s or m/s]; acceleration_limit : fastest change of it [rad/s² or m/s²]
-    hand_acceleration : of the hand [m/s²]; base_acceleration : of the base ahead and about z [m/s², rad/s²]
-    tolerance : distance from its target at which the hand counts as there [m]
-    script : velocities of the scenario
+    rate : float
+        Tick rate [1/s].
+    joints : sequence of str
+        Joints that follow the hand velocity.
+    braces : sequence of Contact
+        Contact points that these joints keep on their surfaces.
+    rate_limit : float
+        Maximum joint rate [rad/s or m/s].
+    acceleration_limit : float
+        Maximum joint acceleration [rad/s² or m/s²].
+    hand_acceleration : float
+        Maximum hand acceleration [m/s²].
+    base_acceleration : (float, float)
+        Maximum acceleration of the base ahead and about z [m/s², rad/s²].
+    tolerance : float
+        Distance from its target at which the hand counts as there [m].
+    script : VelocityScript
+        Velocities of the scenario.
     """
 
     rate: float
