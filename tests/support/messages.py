@@ -15,6 +15,13 @@ Name = str | re.Pattern[str]
 PHRASES = {
     "outside": "outside the triangle",
     "unloaded": "a wheel carries nothing",
+    "pulls": "surface pulls",
+    "slides": "slides",
+    "takes": "seconds to two minutes",
+    "no scene": "has no scene",
+    "no poses": "not every joint was recorded",
+    "other bodies": "other bodies than the record",
+    "fails": "does not survive",
 }
 
 
@@ -28,7 +35,7 @@ def says(text: object, phrase: str) -> bool:
     return PHRASES[phrase] in str(text)
 
 
-def lines(text: str | Iterable[str], *names: Name, phrase: str = "") -> list[str]:
+def lines_with(text: str | Iterable[str], *names: Name, phrase: str = "") -> list[str]:
     """Lines of a text, or of several warnings, that have every name and the phrase."""
     rows = text.splitlines() if isinstance(text, str) else text
     return [row for row in rows if mentions(row, *names) and (not phrase or says(row, phrase))]
@@ -36,7 +43,8 @@ def lines(text: str | Iterable[str], *names: Name, phrase: str = "") -> list[str
 
 def check_message(text: object, *names: Name, phrase: str = "") -> None:
     """Assert that a message has words, further problems in indented lines, no traceback, every name, and the phrase."""
-    message = str(text)
+    __tracebackhide__ = True
+    message = str(text).rstrip()
     assert len(re.findall(r"[^\W\d_]{2,}", message)) > 1, f"no words: {message!r}"
     assert not re.search(r"\n(?!  )|\n\s*(\n|$)", message), f"further lines must be indented and not blank: {message!r}"
     assert not re.search(r"Traceback|\bat 0x[0-9a-f]{6}", message), message
@@ -52,6 +60,15 @@ def raises(
     with pytest.raises(error) as caught:
         yield caught
     check_message(caught.value, *names, phrase=phrase)
+
+
+@contextmanager
+def warns(category: type[Warning], *names: Name, phrase: str = "") -> Iterator[pytest.WarningsRecorder]:
+    """``pytest.warns``, with a warning that has every name and the phrase."""
+    with pytest.warns(category) as caught:
+        yield caught
+    rows = [str(warning.message) for warning in caught]
+    assert lines_with(rows, *names, phrase=phrase), rows
 
 
 def _missing(text: str, names: Iterable[Name]) -> list[str]:

@@ -233,7 +233,7 @@ def test_a_missing_package_is_one_line_with_the_way_out(
     record: Record, monkeypatch: pytest.MonkeyPatch, method: str, package: str
 ):
     monkeypatch.setitem(sys.modules, package, None)
-    with raises(RecordError, f"pip install {package}") as error:
+    with raises(RecordError, f"pip install {package}"):
         getattr(record, method)()
 
 
