@@ -22,6 +22,9 @@ PHRASES = {
     "no poses": "not every joint was recorded",
     "other bodies": "other bodies than the record",
     "fails": "does not survive",
+    "reference": "its reference",
+    "energy row": "electrical energy [J]",
+    "impact row": "impact loss",
 }
 
 
