@@ -25,6 +25,9 @@ PHRASES = {
     "reference": "its reference",
     "energy row": "electrical energy [J]",
     "impact row": "impact loss",
+    "no posture": "could be brought onto the hand's path",
+    "no forces": "carry the motion",
+    "incomplete": "incomplete",
 }
 
 
