@@ -28,6 +28,9 @@ PHRASES = {
     "no posture": "could be brought onto the hand's path",
     "no forces": "carry the motion",
     "incomplete": "incomplete",
+    "all silent": "is the supply or the line lost?",
+    "late answers": "earlier requests",
+    "output failed": " failed: ",
 }
 
 
