@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import sys
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
@@ -60,7 +61,7 @@ def test_check_replay_compare_on_virtual_servos(call, files: Path) -> None:
         "registers.json",
     }
     log = (files / "out" / "replay.log").read_text(encoding="utf-8")
-    states = [line.split()[1] for line in log.splitlines() if line.endswith("enter")]
+    states = [state for state, _ in groupby(line.split()[1] for line in log.splitlines())]
     assert states == ["CONNECT", "VERIFY", "ARM", "MOVE_TO_START", "SETTLE", "REPLAY", "SETTLE", "DISARM"]
     code, out, _ = call("hw", "compare", record, files / "out" / "measured.h5")
     assert code == 0

@@ -220,9 +220,9 @@ def blinking(away: dict[int, tuple[float, float]], duration: float = 2.0, rate: 
 @pytest.mark.parametrize(
     ("away", "names"),
     [
-        ({1: (0.5, 1.5)}, ["pair1", "head", "0.5"]),
+        ({1: (0.5, 1.5)}, ["pair1", "0.500 s"]),
         (dict.fromkeys(range(2, 8), (0.5, 1.5)), ["pair1"]),
-        ({4: (0.5, 0.9)}, ["pair4", "0.4", "0.6 s", "blend_s"]),
+        ({4: (0.5, 0.9)}, ["pair4", "0.400 s", "0.6 s", "lifts.blend_s"]),
         ({4: (1.8, 9.0)}, ["pair4", "0.3 s"]),
     ],
 )

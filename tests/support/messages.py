@@ -31,6 +31,9 @@ PHRASES = {
     "all silent": "is the supply or the line lost?",
     "late answers": "earlier requests",
     "output failed": " failed: ",
+    "busy": "too busy",
+    "sent": "was sent",
+    "unconfirmed": "NOT confirmed",
 }
 
 
