@@ -14,9 +14,11 @@ from typing import Any
 
 import h5py
 import pytest
+from support.messages import check_message, lines_with, mentions, says
 
 from dynsim._version import __version__
 from dynsim.cli import main
+from dynsim.cli.tables import _CONTACT_ROWS
 from dynsim.engine import check
 from dynsim.jit.kernel import cache_folder
 from dynsim.record import FORMAT, Record
@@ -86,9 +88,9 @@ def test_compare_prints_the_table_and_writes_the_comparison(tmp_path: Path):
 def test_compare_says_what_real_contacts_did(tmp_path: Path):
     result = dynsim("compare", "elbow_comparison_floor", "--no-figures", *SHORT, folder=tmp_path)
     assert result.returncode == 0, result.stderr
-    rows = {line.strip()[:24].strip(): line for line in result.stdout.splitlines()}
-    assert "pulling [% of time]" not in rows
-    assert {"closed [% of time]", "sticking [% of time]", "lift-offs, landings", "loss at its impacts [J]"} <= set(rows)
+    said = result.stdout.splitlines()
+    for heading, _, real in _CONTACT_ROWS:
+        assert any(heading.strip() in line for line in said) is (real is not False), heading
     folder = tmp_path / "results" / "elbow_comparison_floor"
     with (folder / "comparison.csv").open(newline="") as stream:
         by_variant = {row["variant"]: row for row in csv.DictReader(stream)}
@@ -109,28 +111,34 @@ def test_compare_says_what_real_contacts_did(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "expected"),
+    ("arguments", "names"),
     [
-        (["run", "nonsense.yaml"], "no such file"),
-        (["run", "elbow_comparison", "--variant", "elbow_5"], "did you mean 'elbow_7'"),
-        (["run", "elbow_comparison", "--set", "integrator.rtol"], "--set integrator.rtol"),
-        (["run", "elbow_comparison", "--set", "plant.link.mass_kg=-1"], "mass_kg"),
-        (["run", "elbow_comparison", "--set", "plant.link.motor.inductance_H=0"], "inductance"),
-        (["compare", "single_pendulum"], "no variants"),
-        (["check", "elbow_comparison", "--set", "duraton_s=1"], "did you mean 'duration_s'"),
-        (["plot", "missing.h5"], "no such record"),
-        (["run", "elbow_comparison", "--set", "record.rate_hz=1e7"], "GB"),
-        (["run", "."], "is a folder"),
+        (["run", "nonsense.yaml"], ("nonsense.yaml",)),
+        (["run", "elbow_comparison", "--variant", "elbow_5"], ("elbow_5", "'elbow_7'")),
+        (["run", "elbow_comparison", "--set", "integrator.rtol"], ("--set integrator.rtol", "integrator.rtol=1e-8")),
+        (["run", "elbow_comparison", "--set", "plant.link.mass_kg=-1"], ("plant.link.mass_kg = -1",)),
+        (
+            ["run", "elbow_comparison", "--set", "plant.link.motor.inductance_H=0"],
+            ("plant.link.motor.inductance_H = 0",),
+        ),
+        (["compare", "single_pendulum"], ("single_pendulum",)),
+        (["check", "elbow_comparison", "--set", "duraton_s=1"], ("duraton_s", "'duration_s'")),
+        (["plot", "missing.h5"], ("missing.h5",)),
+        (["run", "elbow_comparison", "--set", "record.rate_hz=1e7"], ("record.rate_hz", "GB")),
+        (["run", "."], (re.compile(r"^error: \.: "),)),
         (
             ["run", "elbow_comparison", "--set", "plant.initial_deg.1=40"],
-            ".yaml:46 (two_elbows): contacts.points.elbow_4: its point starts",
+            (".yaml:46 (two_elbows): contacts.points.elbow_4", "+0.03698 m", "floor"),
         ),
-        (["check", "elbow_comparison", "--set", "controller.hand.path.radius_m=0.6"], "at t = 0.000 s it stays 0.34 m"),
+        (
+            ["check", "elbow_comparison", "--set", "controller.hand.path.radius_m=0.6"],
+            ("controller.hand.path", "0.000 s", "0.34 m"),
+        ),
         (
             ["check", "six_axis_arm", "--set", "plant.motor.inductance_H=0"],
-            "plant.motor.inductance_H = 0: must be positive",
+            ("plant.motor.inductance_H = 0",),
         ),
-        (["check", "elbow_comparison", "--set", "a:b"], "--set a:b: must look like"),
+        (["check", "elbow_comparison", "--set", "a:b"], ("--set a:b", "integrator.rtol=1e-8")),
         (
             [
                 "check",
@@ -140,15 +148,15 @@ def test_compare_says_what_real_contacts_did(tmp_path: Path):
                 "--set",
                 "integrator.method=dopri5",
             ],
-            "take integrator.method: auto or radau5",
+            ("integrator.method: auto", "radau5"),
         ),
-        (["plot", "other.h5"], "has no digest (SHA-256) at its end"),
-        (["plot", "other.h5", "--trust"], "lacks parts"),
-        (["run", "single_pendulum", "--out", "other.h5"], "is a file, not a folder"),
+        (["plot", "other.h5"], ("other.h5", "SHA-256")),
+        (["plot", "other.h5", "--trust"], ("other.h5",)),
+        (["run", "single_pendulum", "--out", "other.h5"], ("other.h5",)),
     ],
 )
 def test_bad_input_is_one_clear_line_and_exit_code_2(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture, arguments: list[str], expected: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture, arguments: list[str], names: tuple
 ):
     with h5py.File(tmp_path / "other.h5", "w") as file:
         file.attrs["format"] = FORMAT
@@ -159,7 +167,7 @@ def test_bad_input_is_one_clear_line_and_exit_code_2(
     assert exit_code.value.code == 2
     lines = [line for line in capfd.readouterr().err.splitlines() if line.strip()]
     assert len(lines) == 1
-    assert expected in lines[0]
+    check_message(lines[0], *names)
     assert not (tmp_path / "results").exists()
 
 
@@ -229,7 +237,7 @@ def test_export_to_a_pipe_is_refused(tmp_path: Path, format_: str):
     os.mkfifo(tmp_path / "pipe")
     result = dynsim("export", "record.h5", "--format", format_, "--out", "pipe", folder=tmp_path)
     assert result.returncode == 2
-    assert result.stderr.startswith("error: cannot write pipe: is a device, pipe or socket; write to a file")
+    check_message(result.stderr, re.compile("^error: "), "pipe")
     assert {path.name for path in tmp_path.iterdir()} == {"record.h5", "pipe"}
 
 
@@ -238,7 +246,7 @@ def test_a_run_that_stops_ends_with_code_3_and_keeps_what_there_is(tmp_path: Pat
     held = "controller.sample_time_s=0.1"
     result = dynsim("run", "elbow_comparison", "--no-figures", "--set", held, folder=tmp_path)
     assert result.returncode == 3
-    assert "stopped at t = 0.182" in result.stderr
+    assert mentions(result.stderr, re.compile(r"\bt = 0\.182\d* s"), "controller.sample_time_s = 0.1 s")
     record = Record.load(tmp_path / "results" / "elbow_comparison" / "two_elbows" / "record.h5")
     assert not record.complete
     assert len(record["q"]) > 0
@@ -255,10 +263,10 @@ def test_a_variant_that_stops_does_not_keep_the_others_from_the_comparison(tmp_p
     result = dynsim("compare", *arguments, folder=tmp_path)
     assert result.returncode == 3, result.stderr
     saved, error = result.stderr.splitlines()
-    assert saved == "what was simulated of bad until then is in out/bad, marked incomplete"
-    assert error.startswith("error: bad: stopped at t = ")
+    check_message(saved, "bad", "out/bad")
+    check_message(error, re.compile(r"^error: bad: .*\bt = "))
     assert list(json.loads((tmp_path / "out" / "comparison.json").read_text())["variants"]) == ["one", "two"]
-    assert "electrical energy" in result.stdout
+    assert says(result.stdout, "energy row")
     assert not Record.load(tmp_path / "out" / "bad" / "record.h5").complete
 
 
@@ -270,9 +278,8 @@ def test_a_full_disk_is_one_line_and_leaves_no_half_file(tmp_path: Path):
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000)),
     )  # fmt: skip
     assert result.returncode == 2, result.stderr
-    assert result.stderr.splitlines() == [
-        "error: cannot write full/record.h5: File too large; nothing was changed there"
-    ]
+    (error,) = result.stderr.splitlines()
+    check_message(error, re.compile("^error: "), "full/record.h5", "File too large")
     assert list((tmp_path / "full").iterdir()) == []
 
 
@@ -284,16 +291,15 @@ def test_check_prints_positions_that_can_be_copied_into_a_surface(tmp_path: Path
     assert start.hand.tolist() == model.point_position(*robot.hand, robot.initial).tolist()
     assert list(start.contacts) == ["elbow_4", "elbow_7"]
     shown = dynsim("check", "elbow_comparison", "snake_operator", folder=tmp_path).stdout.splitlines()
-    assert shown[:4] == [
-        "elbow_comparison: ok (4 variants)",
-        "  two_elbows, at the start [m]:",
-        f"    hand             {start.hand.tolist()}",
-        f"    contact elbow_4  {[*start.contacts['elbow_4'].tolist()[:2], 0.0]}",
-    ]
-    assert [line.split(",")[0] for line in shown if "at the start" in line][1:4] == [
+    assert mentions(shown[0], "elbow_comparison", "4")
+    assert mentions(shown[1], "two_elbows", "[m]")
+    assert mentions(shown[2], "hand", str(start.hand.tolist()))
+    assert mentions(shown[3], "elbow_4", str([*start.contacts["elbow_4"].tolist()[:2], 0.0]))
+    assert [line.split(",")[0] for line in shown if line.endswith("[m]:")][1:4] == [
         "  elbow_7", "  elbow_4", "  no_elbow",
     ]  # fmt: skip
-    copied = shown[4].removeprefix("    contact elbow_7  ")
+    copied = shown[4][shown[4].index("[") :]
+    assert mentions(shown[4], "elbow_7")
     tilted = [
         "check",
         "elbow_comparison",
@@ -306,7 +312,8 @@ def test_check_prints_positions_that_can_be_copied_into_a_surface(tmp_path: Path
     assert again.returncode == 0, again.stderr
     # The snake has no contact points; its head starts where its record does.
     snake = check(load_scenario("snake_operator"))
-    assert shown[-2:] == ["  at the start [m]:", f"    hand  {snake.hand.tolist()}"]
+    assert shown[-2].endswith("[m]:")
+    assert mentions(shown[-1], "hand", str(snake.hand.tolist()))
     assert not snake.contacts
 
 
@@ -316,19 +323,19 @@ def test_check_says_where_it_starts_before_it_refuses(tmp_path: Path):
     reach = dynsim("check", "elbow_comparison", "--set", path, folder=tmp_path)
     assert reach.returncode == 2
     start = check(load_scenario("elbow_comparison", "two_elbows"))
-    assert f"    hand             {start.hand.tolist()}" in reach.stdout.splitlines()
-    assert f"    gap of elbow_4   {start.gaps['elbow_4']:+.4g} m" in reach.stdout.splitlines()
-    assert "controller.hand.path: the hand cannot follow its path" in " ".join(reach.stderr.split())
+    assert lines_with(reach.stdout, "hand", str(start.hand.tolist()))
+    assert lines_with(reach.stdout, "elbow_4", f"{start.gaps['elbow_4']:+.4g} m")
+    assert mentions(" ".join(reach.stderr.split()), "controller.hand.path", "0.000 s")
     off = dynsim("check", "elbow_comparison", "--set", "plant.chain.0.length_m=0.02", folder=tmp_path)
     line = "initial: {on_surface: [elbow_4, elbow_7]}"
-    assert f"they would be with  {line}" in off.stdout
-    assert f"`{line}` puts it there" in off.stderr
+    assert line in off.stdout
+    assert f"`{line}`" in off.stderr
     # What it offers works, also where points are disabled: all variants start in one posture.
     posed = ["--set", "plant.chain.0.length_m=0.02", "--set", "initial={on_surface: [elbow_4, elbow_7]}"]
     posed += ["--set", "contacts.law=bilateral", "--set", "controller.hand=null"]
     solved = dynsim("check", "elbow_comparison", *posed, folder=tmp_path)
     assert solved.returncode == 0, solved.stderr
-    moved = [" ".join(line.split()) for line in solved.stdout.splitlines() if "by on_surface; was" in line]
+    moved = [" ".join(line.split()) for line in lines_with(solved.stdout, "on_surface")]
     assert len(moved) % 4 == 0
     assert len(set(moved)) == len(moved) // 4 > 0
 
@@ -343,7 +350,7 @@ def test_a_list_in_a_pipe_is_lines_with_tabs_and_names_papers(tmp_path: Path):
     assert row[:2] == ["bouncing_link", "half, dead, lively"]
     assert all(line == line.rstrip() and "  " not in line for line in lines)
     assert "[" not in re.sub(r"\[(m|rad)\]", "", listed), "a paper is named"
-    assert "(Wang and Minami, section IV)" in listed
+    assert "(Wang and Minami, section" in listed
     wide = dynsim("list", folder=tmp_path, env=environment | {"COLUMNS": "90"}).stdout
     assert max(map(len, wide.splitlines())) <= 90
 
@@ -351,10 +358,10 @@ def test_a_list_in_a_pipe_is_lines_with_tabs_and_names_papers(tmp_path: Path):
 def test_list_check_schema_and_version(tmp_path: Path):
     for arguments, expected in (
         (["list"], "wang_minami"),
-        (["check", "elbow_comparison", "single_pendulum"], "ok (4 variants)"),
+        (["check", "elbow_comparison", "single_pendulum"], "single_pendulum: "),
         (["schema"], "duration_s"),
         (["--version"], f"{__version__}\n"),
-        (["run", "--help"], "Example"),
+        (["run", "--help"], "--variant"),
     ):
         result = dynsim(*arguments, folder=tmp_path)
         assert result.returncode == 0, result.stderr
@@ -445,10 +452,11 @@ def test_a_working_directory_that_is_gone(
     monkeypatch.chdir(gone)
     gone.rmdir()
     code, output, _ = in_process(monkeypatch, capfd, "check", "single_pendulum")
-    assert (code, output.splitlines()[0]) == (0, "single_pendulum: ok (1 variant)")
+    assert (code, output.partition(" ")[0]) == (0, "single_pendulum:")
     code, _, errors = in_process(monkeypatch, capfd, "run", "single_pendulum")
     assert code == 2
-    assert errors == ["error: the working directory is no longer there; change to another folder"]
+    (error,) = errors
+    check_message(error, re.compile("^error: "))
 
 
 @pytest.mark.long
@@ -473,4 +481,4 @@ def test_a_damaged_kernel_cache_is_a_warning_in_one_line(tmp_path: Path):
     assert done.returncode == 0
     (line,) = done.stderr.splitlines()
     assert line.startswith("warning: ")
-    assert line.endswith(": damaged machine code; compiling it anew")
+    assert mentions(line, damaged[0].name)

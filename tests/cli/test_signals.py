@@ -1,6 +1,7 @@
 """Signals, closed pipes and full disks: simulated results are saved, and no process is left running."""
 
 import os
+import re
 import resource
 import signal
 import subprocess
@@ -12,6 +13,7 @@ from pathlib import Path
 from typing import IO, Any
 
 import pytest
+from support.messages import check_message, mentions, says
 
 from dynsim.record import Record
 
@@ -126,7 +128,7 @@ def test_a_signal_saves_what_was_simulated(tmp_path: Path, number: signal.Signal
     assert process.returncode == 128 + number, stderr
     record = Record.load(tmp_path / "results" / "elbow_comparison" / "two_elbows" / "record.h5")
     assert not record.complete
-    assert "incomplete" in record.summary["warnings"][-1]
+    assert says(record.summary["warnings"][-1], "incomplete")
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=lambda number: number.name)
@@ -152,7 +154,7 @@ def test_a_signal_ends_a_sweep_whose_steps_do_not(tmp_path: Path):
         process.send_signal(signal.SIGTERM)
         _, stderr = communicate(process)
     assert process.returncode == 128 + signal.SIGTERM, stderr
-    assert "interrupted when 0 of 3 runs were done; --resume goes on" in stderr
+    assert mentions(stderr, "0", "3", "--resume")
     assert not any(is_running(pid) for pid in pids(tmp_path, "simulating"))
 
 
@@ -164,7 +166,7 @@ def test_a_signal_saves_the_variant_that_runs(tmp_path: Path):
     assert process.returncode == 128 + signal.SIGTERM, stderr
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"two_elbows"}
     assert not Record.load(tmp_path / "out" / "two_elbows" / "record.h5").complete
-    assert stderr.splitlines()[-1].endswith("; interrupted before elbow_7, elbow_4, no_elbow were started")
+    assert mentions(stderr.splitlines()[-1], "elbow_7, elbow_4, no_elbow")
 
 
 @pytest.mark.parametrize(
@@ -182,9 +184,8 @@ def test_a_signal_saves_all_variants_that_run_in_processes(
         _, stderr = communicate(process)
     assert process.returncode == 128 + number, stderr
     *saved, error = stderr.splitlines()
-    assert sorted(line.split()[4] for line in saved) == ["elbow_7", "two_elbows"]
-    assert error.startswith("error: two_elbows: interrupted at t = ")
-    assert error.endswith("; interrupted before elbow_4, no_elbow were started")
+    assert sorted(name for line in saved for name in VARIANTS if mentions(line, name)) == ["elbow_7", "two_elbows"]
+    check_message(error, re.compile(r"^error: two_elbows: .*\bt = "), "elbow_4, no_elbow")
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"elbow_7", "two_elbows"}
     for name in ("elbow_7", "two_elbows"):
         assert not Record.load(tmp_path / "out" / name / "record.h5").complete
@@ -215,8 +216,8 @@ def test_ctrl_c_while_references_are_planned_names_every_variant(tmp_path: Path,
     assert process.returncode == 130, stderr
     (error,) = stderr.splitlines()
     for name in VARIANTS[:jobs]:
-        assert f"({name}): interrupted before there was anything to save" in error
-    assert error.endswith(f"interrupted before {', '.join(VARIANTS[jobs:])} were started")
+        assert mentions(error, f"({name})")
+    assert mentions(error, ", ".join(VARIANTS[jobs:]))
     assert not (tmp_path / "results").exists()
 
 
@@ -227,7 +228,7 @@ def test_ctrl_c_before_the_first_step_says_that_nothing_is_saved(tmp_path: Path,
         process.send_signal(signal.SIGINT)
         _, stderr = communicate(process)
     assert process.returncode == 130, stderr
-    assert "(two_elbows): interrupted before there was anything to save" in stderr
+    check_message(stderr, re.compile("^error: "), "(two_elbows)")
     assert not (tmp_path / "results").exists()
 
 
@@ -249,7 +250,7 @@ def test_a_full_standard_output_is_one_line_and_loses_no_run(tmp_path: Path):
         with open("/dev/full", "w") as full, started(tmp_path, *command, stdout=full) as process:
             _, stderr = communicate(process)
         assert process.returncode == 2
-        assert stderr == "error: standard output cannot be written (No space left on device)\n"
+        check_message(stderr, re.compile("^error: "), "No space left on device")
     assert Record.load(tmp_path / "out" / "record.h5").complete
 
 
@@ -302,10 +303,10 @@ def test_a_signal_after_the_last_step_loses_nothing(
     assert Record.load(next((tmp_path / "out").rglob("record.h5"))).complete
     assert "Traceback" not in done.stderr
     if command == "run":
-        assert "interrupted; all results are in out, not all figures and pages" in done.stderr
+        check_message(done.stderr.splitlines()[-1], "out")
     if command == "compare":
         assert [path.name for path in (tmp_path / "out").iterdir()] == ["two_elbows"]
-        assert "interrupted before elbow_4, no_elbow were started" in done.stderr
+        assert mentions(done.stderr, "elbow_4, no_elbow")
 
 
 def test_a_signal_while_figures_are_drawn_is_no_error_of_theirs(tmp_path: Path):
@@ -315,7 +316,7 @@ def test_a_signal_while_figures_are_drawn_is_no_error_of_theirs(tmp_path: Path):
         process.send_signal(signal.SIGINT)
         _, stderr = communicate(process)
     assert process.returncode == 128 + signal.SIGINT, stderr
-    assert "interrupted; all results are in out, not all figures and pages" in stderr
+    check_message(stderr.splitlines()[-1], "out")
     assert "error" not in stderr
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
+from support.messages import check_message, lines_with, mentions, raises, says
 
 from dynsim.errors import CheckRefused
 from dynsim.hardware.bus.control_table import RAD_PER_TICK
@@ -41,26 +42,26 @@ def test_a_motion_within_limits_passes_with_its_margins(rig) -> None:
 
 def test_a_violation_names_joint_time_and_margin(rig) -> None:
     record = swing(amplitude=1.2)
-    with pytest.raises(
-        CheckRefused, match=r"shoulder: position -1\.2000 rad at t = 1\.178 s, limit -1\.0472 rad, margin -0\.1528 rad"
-    ) as refusal:
+    with raises(CheckRefused) as refusal:
         check_motion(record, rig.map)
-    assert "velocity 4.8" in str(refusal.value)
+    assert lines_with(
+        str(refusal.value), "shoulder", "position", "-1.2000 rad", "1.178 s", "-1.0472 rad", "-0.1528 rad"
+    )
+    assert lines_with(str(refusal.value), "shoulder", "velocity", "4.8000 rad/s")
 
 
 def test_extremes_between_the_samples_count(rig) -> None:
     """Two samples at 0.9 rad, between them q(½) = 0.9 + h (v0 − v1)/8 = 1.15 rad."""
     time = np.array([0.0, 1.0, 2.0])
     record = record_of(time, np.array([0.9, 0.9, 0.9]), np.array([0.0, 1.0, -1.0]))
-    with pytest.raises(CheckRefused, match=r"shoulder: position 1\.15"):
+    with raises(CheckRefused, re.compile(r"\n  shoulder\b.*\bposition\b.* 1\.15")):
         check_motion(record, rig.map)
 
 
 def test_speed_scales_velocities(rig) -> None:
     check_motion(rig.record, rig.map, speed=1.2)
-    with pytest.raises(CheckRefused, match=r"shoulder: velocity") as refusal:
+    with raises(CheckRefused, "shoulder", "velocity", "--speed 1.25"):
         check_motion(rig.record, rig.map, speed=1.3)
-    assert "--speed 1.25 would pass" in str(refusal.value)
 
 
 def test_held_rates_make_straight_stretches_that_never_overshoot(write_map) -> None:
@@ -91,30 +92,30 @@ def test_a_record_in_motion_gets_a_run_up_and_a_run_out_at_rest(rig) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("change", "names"),
     [
         (
             lambda record: record.signals.pop("v"),
-            "servos.shoulder: follows the signal 'v'; the record has q, rho, rho_dot",
+            ("servos.shoulder", "'v'", "q, rho, rho_dot"),
         ),
-        (lambda record: record["q"].__setitem__((3, 1), math.nan), "elbow: 'q' is nan at t = 0.015 s"),
-        (lambda record: record.time.__setitem__(4, 0.0), "time does not increase at sample 4"),
-        (lambda record: record.time.__setitem__(-1, math.inf), "time is inf at sample 239, of 240 samples"),
-        (lambda record: record.time.__setitem__(-1, math.nan), "time is nan at sample 239, of 240 samples"),
-        (lambda record: record.time.__setitem__(0, -math.inf), "time is -inf at sample 0, of 240 samples"),
+        (lambda record: record["q"].__setitem__((3, 1), math.nan), ("elbow", "'q'", "nan", "0.015 s")),
+        (lambda record: record.time.__setitem__(4, 0.0), ("4", "0 s")),
+        (lambda record: record.time.__setitem__(-1, math.inf), ("inf", "239", "240")),
+        (lambda record: record.time.__setitem__(-1, math.nan), ("nan", "239", "240")),
+        (lambda record: record.time.__setitem__(0, -math.inf), ("-inf", "0", "240")),
     ],
 )
-def test_unusable_records_are_refused(rig, change, message: str) -> None:
+def test_unusable_records_are_refused(rig, change, names: tuple[str, ...]) -> None:
     record = swing()
     change(record)
-    with pytest.raises(CheckRefused, match=message):
+    with raises(CheckRefused, *names):
         check_motion(record, rig.map)
 
 
 def test_a_column_is_proposed_for_a_wrong_name(rig) -> None:
     record = swing()
     record.add("q", record["q"], "rad", labels=("shoulder", "elbow_pitch"))
-    with pytest.raises(CheckRefused, match=r"servos\.elbow: .* shoulder, elbow_pitch; did you mean 'elbow_pitch'\?$"):
+    with raises(CheckRefused, "servos.elbow", "shoulder, elbow_pitch", "'elbow_pitch'"):
         check_motion(record, rig.map)
 
 
@@ -127,31 +128,26 @@ def test_joints_without_a_servo_are_warned_of(rig) -> None:
     record.add("q", np.column_stack([both, wrist, still, still]), "rad", labels=(*labels, "base.x"))
     record.add("v", np.column_stack([record["v"], np.gradient(wrist, record.time), still]), "rad/s", labels=labels)
     (warning,) = check_motion(record, rig.map).warnings
-    assert warning == (
-        "joints of the record without a servo, limp on the robot: wrist (moves by 12.3 deg); tool (does not move)"
-    )
+    check_message(warning, "wrist", "12.3 deg", "tool")
     assert not check_motion(swing(), rig.map).warnings
 
 
 def test_a_missing_column_and_a_wrong_unit_are_refused(rig) -> None:
     record = swing()
     record.add("q", record["q"], "rad", labels=("shoulder", "knee"))
-    with pytest.raises(
-        CheckRefused,
-        match=r"rig\.yaml:\d+: servos\.elbow: follows column 'elbow' of 'q'; its columns are shoulder, knee",
-    ):
+    with raises(CheckRefused, re.compile(r"rig\.yaml:\d+: servos\.elbow: "), "'elbow'", "'q'", "shoulder, knee"):
         check_motion(record, rig.map)
     record.add("q", record["q"], "deg", labels=("shoulder", "elbow"))
-    with pytest.raises(CheckRefused, match="'q' is in 'deg'"):
+    with raises(CheckRefused, "'q'", "'deg'", "'rad'", "shoulder"):
         check_motion(record, rig.map)
-    with pytest.raises(CheckRefused, match="1 samples"):
+    with raises(CheckRefused, "1"):
         check_motion(swing(duration=0.004), rig.map)
 
 
 def test_an_incomplete_record_passes_with_a_warning(rig) -> None:
     record = swing()
     record.complete = False
-    assert "incomplete" in check_motion(record, rig.map).warnings[0]
+    assert says(check_motion(record, rig.map).warnings[0], "incomplete")
 
 
 def test_torque_of_the_record_is_checked_where_the_map_names_it(write_map) -> None:
@@ -160,7 +156,7 @@ def test_torque_of_the_record_is_checked_where_the_map_names_it(write_map) -> No
     torque = np.zeros((len(record), 2))
     torque[7, 1] = -7.0
     record.add("torque", torque, "N m", labels=("shoulder", "elbow"))
-    with pytest.raises(CheckRefused, match=r"elbow: torque -7\.0000 N m at t = 0\.035 s, limit 6"):
+    with raises(CheckRefused, "elbow", "torque", "-7.0000 N m", "0.035 s", "6.0000 N m"):
         check_motion(record, servo_map)
 
 
@@ -219,7 +215,7 @@ HELD = ("{position: q, velocity: v}", "{position: q, velocity: v, rates: held}")
 def test_a_zigzag_of_12_mrad_every_5_ms_is_refused(write_map, replaced, rates: str) -> None:
     """Its speed is within the limit of 3 rad/s (2.4 held): what no servo can follow is the acceleration."""
     servo_map = load_servo_map(write_map(("velocity: 3.0", "velocity: 4.0"), *replaced))
-    with pytest.raises(CheckRefused, match=r"shoulder: jerk \d+\.\d+ rad/s³") as refusal:
+    with raises(CheckRefused, "shoulder", re.compile(r"\bjerk \d+\.\d+ rad/s³")) as refusal:
         check_motion(zigzag(0.012, 0.005, rates), servo_map)
     assert "velocity" not in str(refusal.value)
     # The same way in steps of 100 ms is one that anybody may go.
@@ -237,9 +233,9 @@ def test_the_jerk_of_a_zigzag_does_not_depend_on_the_window() -> None:
 
 def test_what_is_no_number_any_more_is_refused_and_no_speed_offered(rig) -> None:
     tiny = record_of(np.array([0.0, 1e-200, 2e-200]), np.array([0.0, 0.1, 0.2]), np.zeros(3))
-    with pytest.raises(CheckRefused, match="shoulder: acceleration inf") as refusal:
+    with raises(CheckRefused, "shoulder", "acceleration", "inf") as refusal:
         check_motion(tiny, rig.map)
-    assert "would pass" not in str(refusal.value)
+    assert "--speed" not in str(refusal.value)
 
 
 def triangles(tooth: float, every: float, step: float, count: int = 30) -> Record:
@@ -261,8 +257,8 @@ def test_shaking_is_refused_with_its_joint_and_time(write_map, replaced, shake) 
     with pytest.raises(CheckRefused) as refusal:
         check_motion(triangles(*shake), load_servo_map(write_map(wide, *replaced)))
     lines = str(refusal.value).splitlines()
-    assert re.match(r"  shoulder: shaking \d+\.\d+ rad/s at t = \d+\.\d+ s, limit 3\.0000 rad/s", lines[1])
-    assert [line for line in lines[1:] if "shaking" not in line and "would pass" not in line] == []
+    assert lines_with(lines[1], "shoulder", "shaking", re.compile(r"\d+\.\d+ rad/s at t = \d+\.\d+ s"), "3.0000 rad/s")
+    assert [line for line in lines[1:] if "shaking" not in line and "--speed" not in line] == []
 
 
 @pytest.mark.parametrize("drift", [0.0, 0.9])
@@ -272,7 +268,7 @@ def test_a_spike_is_refused_on_a_joint_that_moves_too(write_map, drift: float) -
     time = 0.01 * np.arange(100)
     spike = 0.02 * (np.arange(100) == 50)
     check_motion(record_of(time, drift * (time - 0.5), np.full(100, drift)), servo_map)
-    with pytest.raises(CheckRefused, match=r"1 limit\(s\) .*\n  shoulder: shaking 4\.0000 rad/s at t = 0\.[5-8]\d\d s"):
+    with raises(CheckRefused, "1", re.compile(r"^[^\n]*\n  shoulder: shaking 4\.0000 rad/s at t = 0\.[5-8]\d\d s")):
         check_motion(record_of(time, drift * (time - 0.5) + spike, np.full(100, drift)), servo_map)
 
 
@@ -297,7 +293,7 @@ def test_a_single_jump_of_the_rate_is_bounded_by_the_acceleration(write_map) -> 
     record = record_of(time, angle, rate)
     check_motion(record, load_servo_map(write_map()))
     stricter = load_servo_map(write_map(("[-60, 60], velocity: 3.0", "[-60, 60], acceleration: 400, velocity: 3.0")))
-    with pytest.raises(CheckRefused, match=r"shoulder: acceleration 500\.0000 rad/s² at t = 0\.000 s, limit 400"):
+    with raises(CheckRefused, "shoulder", "acceleration", "500.0000 rad/s²", "0.000 s", "400.0000 rad/s²"):
         check_motion(record, stricter)
 
 
@@ -305,7 +301,7 @@ def test_a_single_jump_of_the_rate_is_bounded_by_the_acceleration(write_map) -> 
 def test_a_slower_replay_that_is_offered_passes(write_map, quantity: str) -> None:
     limits = ("[-60, 60], velocity", f"[-60, 60], {quantity}, velocity")
     servo_map = load_servo_map(write_map(limits, ("run_up: 20", "run_up: 5, stop_time: 0.5")))
-    with pytest.raises(CheckRefused, match=r"--speed 0\.\d+ would pass") as refusal:
+    with raises(CheckRefused, re.compile(r"--speed 0\.\d+")) as refusal:
         check_motion(swing(), servo_map)
     slower = float(str(refusal.value).split("--speed ")[1].split()[0])
     motion = check_motion(swing(), servo_map, speed=slower)
@@ -326,19 +322,18 @@ def test_holes_in_the_record_are_refused_and_a_missing_sample_is_told(rig) -> No
 
     assert rig.motion().warnings == ()
     warning = check_motion(without(100), rig.map).warnings[0]
-    assert "1 of 238 steps are long, samples of the record may be missing: no sample between t = 0.495 and" in warning
+    assert mentions(warning, "1", "238", "0.495", "0.505 s", "2", "5 ms")
     # The median of every third sample missing, and of steps of 5 and 10 ms in turn, is not the usual step.
     every_third = check_motion(without(*range(2, 240, 3)), rig.map).warnings[0]
-    assert "79 of 159 steps are long" in every_third
-    assert "2 of the usual steps of 5 ms" in every_third
-    with pytest.raises(CheckRefused, match=r"2 hole\(s\): no sample between t = 0\.195 and 0\.215 s, 4 of the usual"):
+    assert mentions(every_third, "79", "159", "2", "5 ms")
+    with raises(CheckRefused, "2", "0.195", "0.215 s", "4", "5 ms"):
         check_motion(without(40, 41, 42, 100, 101), rig.map)
 
 
 @pytest.mark.parametrize("speed", [1e-300, 0.0099, 10.1, 1e300])
 def test_speeds_beyond_all_measure_are_refused(rig, speed: float) -> None:
     at_rest = record_of(0.01 * np.arange(5), np.zeros(5), np.zeros(5))
-    with pytest.raises(CheckRefused, match=r"--speed must be from 0\.01 to 10, not"):
+    with raises(CheckRefused, "--speed", "0.01", "10", f"{speed:g}"):
         check_motion(at_rest, rig.map, speed=speed)
     for possible in (0.01, 10.0):
         assert check_motion(at_rest, rig.map, speed=possible).speed == possible
@@ -347,28 +342,28 @@ def test_speeds_beyond_all_measure_are_refused(rig, speed: float) -> None:
 @pytest.mark.parametrize(("step", "speed"), [(1e300, 1.0), (30_000.0, 1.0), (1000.0, 0.03)])
 def test_a_motion_of_more_than_a_day_is_refused(rig, step: float, speed: float) -> None:
     at_rest = record_of(step * np.arange(4), np.zeros(4), np.zeros(4))
-    with pytest.raises(CheckRefused, match=r"would take .* s at --speed .*, more than 24 h\. Is the record's time"):
+    with raises(CheckRefused, f"--speed {speed:g}", "24 h"):
         check_motion(at_rest, rig.map, speed=speed)
     check_motion(record_of(28_000.0 * np.arange(4), np.zeros(4), np.zeros(4)), rig.map)
 
 
 @pytest.mark.parametrize("speed", [0.0, -1.0, math.nan, math.inf])
 def test_nonsense_speeds_and_rates_are_refused(rig, speed: float) -> None:
-    with pytest.raises(CheckRefused, match=r"--speed must be from 0\.01 to 10"):
+    with raises(CheckRefused, "--speed", "0.01", "10", f"{speed:g}"):
         check_motion(rig.record, rig.map, speed=speed)
-    with pytest.raises(CheckRefused, match="--rate must be positive"):
+    with raises(CheckRefused, "--rate", str(speed)):
         check_motion(rig.record, rig.map, rate=speed)
 
 
 def test_a_rate_the_bus_cannot_carry_is_refused_with_one_it_can(rig) -> None:
-    with pytest.raises(CheckRefused, match=r"Use --rate (\d+) or less") as refusal:
+    with raises(CheckRefused, re.compile(r"--rate \d+"), "2000 Hz") as refusal:
         plan_cycle(rig.map, 2000)
     possible = int(str(refusal.value).split("--rate ")[1].split()[0])
     assert plan_cycle(rig.map, possible).health_every <= 10
 
 
 def test_a_rate_at_which_the_watchdogs_would_trip_is_refused(rig) -> None:
-    with pytest.raises(CheckRefused, match=r"watchdogs of 0.2 s would trip within 3 cycles. Use --rate 15 or more"):
+    with raises(CheckRefused, "14 Hz", "0.2 s", "--rate 15"):
         plan_cycle(rig.map, 14)
     plan_cycle(rig.map, 15)
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import sys
 import time
 
 import numpy as np
 import pytest
 from ruamel.yaml import YAML
+from support.messages import check_message, mentions, raises
 
 from dynsim import cli
 from dynsim.draw.figures import style
@@ -76,7 +78,7 @@ def test_where_no_delay_is_common_nothing_says_zero(tmp_path, monkeypatch, capsy
         cli.main()
     assert not leaving.value.code
     *table, headline, _ = capsys.readouterr().out.splitlines()
-    assert headline.startswith("no common delay (none explains half of the mean square error of all joints), worst")
+    check_message(headline)
     cells = [[cell.strip() for cell in line.split("│")[1:-1]] for line in table if "│" in line]
     assert [(row[0], row[4], row[5]) for row in cells] == [("late", "-", "50.1"), ("sagging", "-", "-")]
 
@@ -99,11 +101,13 @@ def test_a_known_delay_and_error_are_found() -> None:
 def test_the_gate_fails_with_every_bound_exceeded(rig, clean_run, tmp_path) -> None:
     comparison = compare_records(rig.record, clean_run.result.record)
     check_gate(comparison, Gate(rms_rad=0.2, delay_s=0.1))
-    with pytest.raises(ComparisonGateFailed, match=r"rms_rad 0\.\d+ > 0\.001, delay_s 0\.\d+ > 0\.01") as failure:
+    with raises(
+        ComparisonGateFailed, re.compile(r"\brms_rad 0\.\d+ > 0\.001\b"), re.compile(r"\bdelay_s 0\.\d+ > 0\.01\b")
+    ) as failure:
         check_gate(comparison, Gate(rms_rad=0.001, delay_s=0.01))
     assert failure.value.exit_code == 5
     (tmp_path / "gate.yaml").write_text("rms: 0.1\n", encoding="utf-8")
-    with pytest.raises(ServoMapError, match="rms: unknown key; did you mean 'rms_rad'"):
+    with raises(ServoMapError, "gate.yaml:1: rms", "'rms_rad'"):
         load_gate(tmp_path / "gate.yaml")
     assert draw_comparison(comparison, tmp_path / "figures" / "comparison.png").stat().st_size > 10_000
     assert json.loads(json.dumps(comparison.summary()))["rms_rad"] == comparison.worst.rms
@@ -112,7 +116,7 @@ def test_the_gate_fails_with_every_bound_exceeded(rig, clean_run, tmp_path) -> N
 def test_records_without_common_angles_are_refused(rig) -> None:
     other = Record([0.0, 1.0])
     other.add("q", np.zeros((2, 1)), "rad", labels=("knee",))
-    with pytest.raises(RecordError, match="share no joint angles"):
+    with raises(RecordError):
         compare_records(rig.record, other)
 
 
@@ -167,11 +171,11 @@ def test_urdf_log_is_one_json_object_per_line(tmp_path) -> None:
 def test_exports_refuse_records_without_motion_and_bad_rates(tmp_path) -> None:
     record = Record([0.0, 1.0])
     record.add("energy", [0.0, 1.0], "J")
-    with pytest.raises(RecordError, match="no joint motion"):
+    with raises(RecordError, "energy"):
         export_record(record, tmp_path / "x.csv", "csv")
-    with pytest.raises(RecordError, match="--rate must be positive"):
+    with raises(RecordError, "--rate", "0"):
         export_record(swing(), tmp_path / "x.csv", "csv", rate=0)
-    with pytest.raises(RecordError, match="cannot write"):
+    with raises(RecordError, str(tmp_path)):
         export_record(swing(), tmp_path, "csv")
 
 
@@ -240,18 +244,13 @@ def test_wheels_are_drawn(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(style, "save", lambda figure, path: figures.append(figure) or path)
     draw_comparison(comparison, tmp_path / "wheels.png", ["rho1"])
     labels = [axes.get_ylabel() for axes in figures[0].axes]
-    assert labels == [
-        "joint angle [rad]",
-        "measured − simulated [mrad]",
-        "wheel rate [rad/s]",
-        "measured − sim. [rad/s]",
-    ]
+    assert [re.search(r"\[.*\]", label)[0] for label in labels] == ["[rad]", "[mrad]", "[rad/s]", "[rad/s]"]
     rates, errors = figures[0].axes[2:]
     drawn = [line for line in rates.get_lines() if len(line.get_xdata())]
     for line, values in zip(drawn, comparison.wheel_rates[::-1, :, 0], strict=True):
         np.testing.assert_allclose(line.get_ydata(), values)
     np.testing.assert_allclose(errors.get_lines()[0].get_ydata(), 0.01)
-    assert "rho1: rms 0.01 rad/s" in errors.get_legend().get_texts()[0].get_text()
+    assert mentions(errors.get_legend().get_texts()[0].get_text(), "rho1", "0.01 rad/s")
 
 
 @pytest.mark.parametrize("speed", [1.0, 0.5])
@@ -281,8 +280,8 @@ def test_missed_answers_of_a_wheel_are_left_out() -> None:
 def test_the_gate_knows_wheels() -> None:
     comparison = compare_records(*turning(0.01, start=0.0))
     check_gate(comparison, Gate(wheel_rate_rms_rad_s=0.02, wheel_angle_max_rad=0.05))
-    with pytest.raises(
-        ComparisonGateFailed, match=r"wheel_rate_rms_rad_s 0\.01 > 0\.009, wheel_angle_max_rad 0\.04 > 0"
+    with raises(
+        ComparisonGateFailed, "wheel_rate_rms_rad_s 0.01 > 0.009", re.compile(r"\bwheel_angle_max_rad 0\.04 > 0")
     ):
         check_gate(comparison, Gate(wheel_rate_rms_rad_s=0.009, wheel_angle_max_rad=0.03))
 
@@ -291,7 +290,7 @@ def test_a_gate_for_wheels_fails_where_there_are_none() -> None:
     t = np.linspace(0, 1, 101)
     record = Record(t)
     record.add("q", np.sin(t)[:, None], "rad", labels=("a",))
-    with pytest.raises(ComparisonGateFailed, match="wheel_angle_max_rad: no wheels to compare"):
+    with raises(ComparisonGateFailed, "wheel_angle_max_rad"):
         check_gate(compare_records(record, record), Gate(wheel_angle_max_rad=1.0))
 
 
@@ -313,5 +312,5 @@ def test_any_joint_can_be_drawn(tmp_path) -> None:
     worst = draw_comparison(comparison, tmp_path / "worst.png").read_bytes()
     assert draw_comparison(comparison, tmp_path / "named.png", ["f", "e", "d", "c"]).read_bytes() == worst
     assert draw_comparison(comparison, tmp_path / "a.png", ["a"]).read_bytes() != worst
-    with pytest.raises(RecordError, match="no joint 'knee' was compared; there are: a, b, c, d, e, f"):
+    with raises(RecordError, "'knee'", "a, b, c, d, e, f"):
         draw_comparison(comparison, tmp_path / "none.png", ["knee"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import random
+import re
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field
@@ -14,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from support.fault_table import CASES, Case
+from support.messages import check_message, raises
 
 from dynsim.errors import CheckRefused, DynsimError
 from dynsim.hardware.bus.protocol import Clock
@@ -249,22 +251,22 @@ def beyond(limit: str) -> Posture:
     return posture
 
 
-WORDS = {
-    "position": "shoulder: position",
-    "velocity": "elbow: velocity",
-    "acceleration": "shoulder: acceleration",
-    "shaking": "shoulder: ",
-    "wheel": "wheel: velocity",
-    "no number": "shoulder: position nan",
+NAMES = {
+    "position": ("shoulder", "position"),
+    "velocity": ("elbow", "velocity"),
+    "acceleration": ("shoulder", "acceleration"),
+    "shaking": ("shoulder",),
+    "wheel": ("wheel", "velocity"),
+    "no number": ("shoulder", "position", "nan"),
 }
 
 
-@pytest.mark.parametrize("limit", WORDS)
+@pytest.mark.parametrize("limit", NAMES)
 def test_what_is_beyond_a_limit_is_never_followed(rig: Rig, limit: str) -> None:
     run = drive(rig, posture=beyond(limit), until=4.0)
     assert run.result.fault is not None
     assert run.result.fault.cause == Cause.LIMIT
-    assert WORDS[limit] in run.result.fault.text
+    check_message(run.result.fault.text, *NAMES[limit])
     assert run.result.fault_state == ReplayState.REPLAY
     assert run.result.end_state == "holding"
     check_goals_within_limits(run)
@@ -386,13 +388,13 @@ def test_what_cannot_begin_is_refused(rig: Rig) -> None:
         return check_drive(Sample(0.0, position, velocity), rig.map, feed, step=STEP, longest=10.0, **options)
 
     assert np.array_equal(begin(zero, zero).start, zero)
-    with pytest.raises(CheckRefused, match=r"would begin beyond 1 limit.*\n.*elbow: position"):
+    with raises(CheckRefused, "1", re.compile(r"\n.*\belbow: position\b")):
         begin(np.array([0.0, 1.2, 0.0]), zero)
-    with pytest.raises(CheckRefused, match=r"begins in motion \(shoulder\)"):
+    with raises(CheckRefused, "shoulder"):
         begin(zero, np.array([0.1, 0.0, 0.0]))
-    with pytest.raises(CheckRefused, match="shoulder"):
+    with raises(CheckRefused, "shoulder"):
         begin(np.array([math.nan, 0.0, 0.0]), zero)
-    with pytest.raises(CheckRefused, match="--rate"):
+    with raises(CheckRefused, "--rate"):
         begin(zero, zero, rate=5000.0)
 
 
@@ -529,5 +531,5 @@ def test_a_map_is_all_that_is_known_of_where_a_drive_goes(rig: Rig) -> None:
     result = run.replay.run()
     assert result.fault is not None
     assert result.fault.cause == Cause.VERIFICATION
-    assert "the motion needs ticks" in result.fault.text
+    check_message(result.fault.text, re.compile(r"\(ID \d\)"), re.compile(r"\d+ to \d+"))
     assert feed_of(run).told == []

@@ -7,6 +7,7 @@ from multiprocessing import get_context
 
 import numpy as np
 import pytest
+from support.messages import check_message, raises
 
 from dynsim import load_scenario
 from dynsim.errors import CheckRefused
@@ -182,11 +183,11 @@ def test_a_simulation_that_is_late_in_a_mode_switch_changes_no_goal() -> None:
     assert time[-1] == pytest.approx(simulated.time[-1])
 
 
-def check_stopped(run: Run, feed: SimulatedSnake, words: str) -> None:
+def check_stopped(run: Run, feed: SimulatedSnake, *names: str) -> None:
     assert run.result.fault is not None
     assert run.result.fault.cause == Cause.SIMULATION
-    assert "wheel pairs cannot be lifted" in run.result.fault.text
-    assert words in str(feed.refused)
+    check_message(run.result.fault.text)
+    check_message(feed.refused, *names)
     assert run.result.end_state == "holding"
     check_goals_within_limits(run)
     # At least as long before what is refused as postures are held back.
@@ -196,12 +197,12 @@ def check_stopped(run: Run, feed: SimulatedSnake, words: str) -> None:
 
 def test_modes_that_follow_too_soon_are_not_followed() -> None:
     run, feed = driven(snake_map(), requests={150: 4, 210: 2})
-    check_stopped(run, feed, "is lifted for 0.300 s only, from t = 0.750 s on; up and down take 0.6 s")
+    check_stopped(run, feed, "0.300 s", "0.750 s", "0.6 s")
 
 
 def test_a_base_that_would_twist_is_not_followed() -> None:
     run, feed = driven(with_lifts(snake_map(), tilt_mm=0.02), requests={}, ticks=2000)
-    check_stopped(run, feed, "would stand on one wheel")
+    check_stopped(run, feed, "lifts.tilt_mm: 0.02")
 
 
 def postures(duration: int, requests: Mapping[int, int]) -> tuple[list[Sample], Record]:
@@ -231,7 +232,7 @@ def test_a_drive_may_end_at_any_tick(ticks: int) -> None:
 
 def test_what_rises_at_the_end_is_left_on_its_way() -> None:
     samples, simulated = postures(180, {150: 4})
-    with pytest.raises(CheckRefused, match=r"for 0\.150 s only"):
+    with raises(CheckRefused, "0.150 s"):
         check_motion(simulated, snake_map())
     assert samples[-1].time == pytest.approx(0.9)
     growing = IncrementalPath(samples[0], snake_map())
@@ -252,15 +253,15 @@ def test_it_is_known_when_modes_may_change(tick: int, steady: bool) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "words"),
+    ("change", "names"),
     [
-        ({"signal": "ground"}, "a live drive has no 'ground'; it has phi, rho, grounded"),
-        ({"joints": ("psi3", "psi4")}, "names 2 pitch joints; the record has 7 wheel pairs"),
-        ({"blend_s": 0.09}, "222 Hz"),
+        ({"signal": "ground"}, ("'ground'", "phi, rho, grounded")),
+        ({"joints": ("psi3", "psi4")}, ("2", "7")),
+        ({"blend_s": 0.09}, ("222 Hz",)),
     ],
 )
-def test_what_cannot_be_lifted_is_said_before_anything_moves(change: dict[str, object], words: str) -> None:
-    with pytest.raises(CheckRefused, match=words):
+def test_what_cannot_be_lifted_is_said_before_anything_moves(change: dict[str, object], names: tuple[str, ...]) -> None:
+    with raises(CheckRefused, *names):
         SimulatedSnake(with_lifts(snake_map(), **change))
 
 
@@ -268,5 +269,5 @@ def test_without_an_entry_in_the_map_wheels_would_be_dragged() -> None:
     servo_map = snake_map()
     servo_map.lifts = None
     still = begin(load_scenario("snake_operator"))
-    with pytest.raises(CheckRefused, match="does not say how"):
+    with raises(CheckRefused):
         Columns(still, servo_map)

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from contextlib import nullcontext
 from typing import Any
 
 import numpy as np
 import pytest
+from support.messages import check_message, lines_with, mentions, says
 
 from dynsim.hardware.bus.packet import Instruction, Packet
 from dynsim.hardware.errors import ReplayAborted
-from dynsim.hardware.replay.output import ReplayState, ServoEnd, StopRequest, robot_state
+from dynsim.hardware.replay.output import LIMP, SILENT, ReplayState, ServoEnd, StopRequest, robot_state
 from dynsim.hardware.replay.rules import Cause
 from dynsim.hardware.replay.session import run_replay
 from dynsim.hardware.servo_map import load_servo_map
@@ -23,7 +25,7 @@ pytestmark = pytest.mark.long
 
 POLICIES = ["hold", "decelerate", "off"]
 OFF = {"hold": "holding", "decelerate": "holding", "off": "off"}
-HEARD = {"hold": "holding", "decelerate": "holding", "off": "limp: off"}
+HEARD = {"hold": "holding", "decelerate": "holding", "off": LIMP}
 
 
 def doing(run: Run) -> dict[str, str]:
@@ -35,13 +37,13 @@ def check_against_the_servos(run: Run) -> None:
     servos = run.line.servos
     for end in run.result.servos:
         registers, index = servos.registers[end.id], servos.ids.index(end.id)
-        if end.doing == "does not answer":
+        if end.doing == SILENT:
             assert run.line.unplugged or end.id in servos.dead
             continue
         assert end.torque == bool(registers["torque_enable"])
         assert end.error == registers["hardware_error"]
         assert end.torque == (not end.doing.startswith("limp"))
-        if end.doing in ("holding", "limp: off"):
+        if end.doing in ("holding", LIMP):
             assert registers["bus_watchdog"] == 0
         if end.doing == "holding":
             assert abs(servos.plant.velocity[index]) < 0.15
@@ -86,8 +88,7 @@ def test_a_stall_is_seen_in_every_state_and_nobody_is_sent_on(rig, state: Replay
     result = finish(run).result
     assert result.fault.cause == Cause.STALL
     assert result.fault_state == state
-    assert "stalled for 1.0" in result.fault.text
-    assert "bus watchdogs (0.20 s) have tripped" in result.fault.text
+    check_message(result.fault.text, re.compile(r"\b1\.0\d* s"), "0.20 s")
     assert result.end_state == OFF[policy]
     check_against_the_servos(run)
     # Where they stopped by themselves they stay: no goal of the path reaches them any more.
@@ -166,17 +167,17 @@ def test_who_is_stopped_by_another_program_while_arming_is_released(rig, armed: 
     result = finish(run).result
     assert result.fault.cause == Cause.TORQUE_LOST
     assert result.fault_state == ReplayState.ARM
-    assert "torque is off again" in result.fault.text
+    check_message(result.fault.text, re.compile(r"\(ID \d\)"))
     assert result.end_state == "off"
     check_against_the_servos(run)
     assert not [packet for _, packet in run.sent if packet.instruction == Instruction.SYNC_WRITE]
 
 
 SECOND = {
-    "drop_off": "does not answer",
+    "drop_off": SILENT,
     "overload": "limp: overload",
     "overheat": "limp: overheating",
-    "reboot": "limp: off",
+    "reboot": LIMP,
 }
 
 
@@ -213,7 +214,7 @@ def test_faults_of_one_cycle_are_all_named(rig) -> None:
     run = rig.run(*faults, {"kind": "drop_off", "id": 7, "at": 1.7})
     for name in ("shoulder (ID 1)", "elbow (ID 2)", "wheel (ID 7)"):
         assert name in run.result.fault_text
-    assert run.result.end_state == "mixed: shoulder limp: overload; elbow limp: overheating; wheel does not answer"
+    assert run.result.end_state == f"mixed: shoulder limp: overload; elbow limp: overheating; wheel {SILENT}"
     summary = run.result.record.summary
     assert [fault["cause"] for fault in summary["faults"]] == [fault.cause for fault in run.result.faults]
     assert [event.name for event in run.result.record.events if event.kind == "fault"] == [
@@ -227,9 +228,9 @@ def test_a_lost_supply_leaves_all_limp_and_is_noticed(rig, onset: float, policy:
     run = rig.run({"kind": "supply_loss", "at": onset}, policy=policy)
     result = run.result
     assert result.fault.cause == Cause.MISSED_STATUS
-    assert "is the supply or the line lost?" in result.fault.text
+    assert says(result.fault.text, "all silent")
     assert result.end_state == "off"
-    assert set(doing(run).values()) == {"limp: off"}
+    assert set(doing(run).values()) == {LIMP}
     check_against_the_servos(run)
     if policy != "off":
         assert Cause.TORQUE_LOST in [fault.cause for fault in result.faults]
@@ -237,8 +238,8 @@ def test_a_lost_supply_leaves_all_limp_and_is_noticed(rig, onset: float, policy:
 
 def test_a_supply_lost_while_slowing_down_is_noticed(rig) -> None:
     run = rig.run({"kind": "drop_off", "id": 1, "at": 1.7}, {"kind": "supply_loss", "at": 1.85}, policy="decelerate")
-    assert "is the supply or the line lost?" in run.result.fault_text
-    assert run.result.end_state == "mixed: 2 limp: off; shoulder does not answer"
+    assert says(run.result.fault_text, "all silent")
+    assert run.result.end_state == f"mixed: 2 {LIMP}; shoulder {SILENT}"
     check_against_the_servos(run)
 
 
@@ -248,7 +249,7 @@ def test_a_stop_by_another_program_is_named(rig, policy: str) -> None:
     at_cycle(run, ReplayState.REPLAY, 40, lambda: [run.line.servos.write(id_, 64, b"\0") for id_ in run.map.ids])
     result = finish(run).result
     assert result.fault.cause == Cause.TORQUE_LOST
-    assert "switched off by another program" in result.fault.text
+    check_message(result.fault.text, re.compile(r"\(ID \d\)"))
     assert result.end_state == "off"
     check_against_the_servos(run)
     assert not [time for time, _, value in run.writes_of(64) if value == 1 and time > result.fault_time]
@@ -259,7 +260,7 @@ def test_a_port_that_dies_during_the_policy_is_named(rig, policy: str) -> None:
     run = rig.run({"kind": "drop_off", "id": 1, "at": 1.7}, {"kind": "unplug", "at": 1.8}, policy=policy)
     assert [fault.cause for fault in run.result.faults] == [Cause.MISSED_STATUS, Cause.PORT]
     assert run.result.end_state == "unreachable"
-    assert set(doing(run).values()) == {"does not answer"}
+    assert set(doing(run).values()) == {SILENT}
 
 
 @pytest.mark.parametrize("number", [2, 15, 40])
@@ -318,7 +319,7 @@ def test_a_second_ctrl_c_comes_too_late_for_nothing(rig) -> None:
 
     run.replay._ending.read_back = reading
     result = finish(run).result
-    assert result.end_state == "off" or result.end_state == "mixed: 2 limp: off; shoulder limp: overload"
+    assert result.end_state == "off" or result.end_state == f"mixed: 2 {LIMP}; shoulder limp: overload"
     assert not any(servo["torque_enable"] for servo in run.line.servos.registers.values())
 
 
@@ -327,7 +328,7 @@ def test_log_error_and_summary_say_what_each_servo_does(rig, tmp_path) -> None:
     connection = nullcontext((run.replay.bus, run.clock))
     with pytest.raises(ReplayAborted) as aborted:
         run_replay(rig.motion(), rig.map, connection, tmp_path, live=True)
-    assert "robot left mixed: 2 holding; elbow limp: overload" in str(aborted.value)
+    assert mentions(aborted.value, "mixed: 2 holding; elbow limp: overload")
     assert aborted.value.exit_code == 4
     summary = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
     assert summary["end_state"] == "mixed: 2 holding; elbow limp: overload"
@@ -338,8 +339,8 @@ def test_log_error_and_summary_say_what_each_servo_does(rig, tmp_path) -> None:
     assert (elbow["torque"], elbow["error"]) == (False, 32)
     assert isinstance(elbow["position_rad"], float)
     log = (tmp_path / "replay.log").read_text(encoding="utf-8")
-    assert "end state: mixed: 2 holding; elbow limp: overload" in log
-    assert "elbow (ID 2): limp: overload, error: overload, " in log
+    assert mentions(log, "mixed: 2 holding; elbow limp: overload")
+    assert lines_with(log, "elbow (ID 2)", "limp: overload")
 
 
 def test_what_the_whole_does() -> None:
@@ -347,8 +348,8 @@ def test_what_the_whole_does() -> None:
         return robot_state([ServoEnd(f"j{k}", k, doing=doing) for k, doing in enumerate(doings)])
 
     assert whole("holding", "holding") == "holding"
-    assert whole("limp: off", "limp: off") == "off"
-    assert whole("does not answer", "does not answer") == "unreachable"
+    assert whole(LIMP, LIMP) == "off"
+    assert whole(SILENT, SILENT) == "unreachable"
     assert whole("limp: input voltage", "limp: input voltage") == "limp: input voltage"
     assert whole("moving", "holding", "holding") == "mixed: 2 holding; j0 moving"
     assert whole("moving", "holding") == "mixed: j0 moving; j1 holding"

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from support.messages import check_message, mentions, raises
 
 from dynsim.hardware.errors import ServoMapError
 from dynsim.hardware.virtual.faults import load_fault_script
@@ -29,9 +30,8 @@ def script(tmp_path: Path) -> Path:
 
 
 def test_a_servo_that_is_not_there_is_refused_with_the_line_and_those_that_are(script: Path) -> None:
-    with pytest.raises(ServoMapError) as error:
+    with raises(ServoMapError, f"{script}:6: faults.2.id = 44", "1, 2, 7"):
         load_fault_script(script, (7, 1, 2))
-    assert str(error.value) == f"{script}:6: faults.2.id = 44: no servo has this ID; there are 1, 2, 7"
     assert [fault.kind for fault in load_fault_script(script, (2, 44)).faults] == ["noise", "stuck", "lost_status"]
     assert len(load_fault_script(script).faults) == 3, "for anybody"
 
@@ -39,13 +39,13 @@ def test_a_servo_that_is_not_there_is_refused_with_the_line_and_those_that_are(s
 def test_a_misspelt_kind_is_told_as_such(tmp_path: Path) -> None:
     path = tmp_path / "faults.yaml"
     path.write_text("faults:\n  - {kind: stuk, id: 2}\n  - {kid: stuck, id: 2}\n", encoding="utf-8")
-    with pytest.raises(ServoMapError) as error:
+    with raises(ServoMapError, "'stuck'", "lost_status") as error:
         load_fault_script(path)
     first, second = str(error.value).split("; /")
-    assert first.startswith(f"{path}:2: faults.0.kind: unknown kind 'stuk'; did you mean 'stuck'?; known: lost_status")
-    assert f"/{second}" == f"{path}:3: faults.1.kid: unknown key; did you mean 'kind'?"
+    assert first.startswith(f"{path}:2: faults.0.kind: ")
+    check_message(f"/{second}", f"{path}:3: faults.1.kid", "'kind'")
     path.write_text("faults: [{kind: stuck, id: 2, att: 1}]", encoding="utf-8")
-    with pytest.raises(ServoMapError, match=r"faults\.0\.att: unknown key; did you mean 'at'\?$"):
+    with raises(ServoMapError, "faults.0.att", "'at'"):
         load_fault_script(path)
 
 
@@ -66,14 +66,14 @@ def test_the_commands_refuse_it_before_anything_starts(script: Path, map_file: P
         cwd=script.parent,
     )
     assert done.returncode == 2
-    assert "faults.2.id = 44: no servo has this ID; there are 1, 2, 7" in done.stderr
+    assert mentions(done.stderr, "faults.2.id = 44", "1, 2, 7")
     assert not done.stdout
 
 
 def test_a_loss_of_the_supply_needs_a_time_and_has_a_length(tmp_path: Path) -> None:
     path = tmp_path / "faults.yaml"
     path.write_text("faults: [{kind: supply_loss}]", encoding="utf-8")
-    with pytest.raises(ServoMapError, match=r"at: is missing"):
+    with raises(ServoMapError, "faults.0.at"):
         load_fault_script(path)
     path.write_text("faults: [{kind: supply_loss, at: 1}]", encoding="utf-8")
     (fault,) = load_fault_script(path).faults

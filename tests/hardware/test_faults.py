@@ -12,7 +12,7 @@ from support.fault_table import CASES, POLICIES, Case, broken_promises
 from dynsim.hardware.bus.control_table import RAD_PER_TICK
 from dynsim.hardware.bus.packet import Instruction
 from dynsim.hardware.replay.check import velocity_limit
-from dynsim.hardware.replay.output import ReplayState
+from dynsim.hardware.replay.output import LIMP, NOT_ARMED, SILENT, TRIPPED, ReplayState
 from dynsim.hardware.replay.rules import Cause
 from dynsim.hardware.replay.trajectory import CyclePlan
 from dynsim.hardware.servo_map import ServoMap
@@ -80,7 +80,7 @@ def check_nothing_but_the_policy_after(run) -> None:
     if run.replay.policy == "off":
         assert not on_the_wire
     everybody = set(result.fault.ids) == set(run.map.ids)  # nobody is left to slow down along the path
-    if run.replay.policy == "decelerate" and result.end_state not in ("not armed", "unreachable") and not everybody:
+    if run.replay.policy == "decelerate" and result.end_state not in (NOT_ARMED, "unreachable") and not everybody:
         check_comes_to_rest(run)
 
 
@@ -105,7 +105,7 @@ def check_comes_to_rest(run) -> None:
 def check_end_state(run, policy: str, entry: dict[str, Any], description: str) -> None:
     end, line = run.result.end_state, run.line
     if run.result.fault.cause == Cause.VERIFICATION:
-        assert end == "not armed", description
+        assert end == NOT_ARMED, description
         assert not any(servo["torque_enable"] for servo in line.servos.registers.values())
         assert not run.goals()
         return
@@ -117,19 +117,19 @@ def check_end_state(run, policy: str, entry: dict[str, Any], description: str) -
         assert np.abs(line.servos.plant.velocity).max() < 1e-3
         return
     silent = {entry["id"]} if entry["kind"] in SILENCING else set()
-    asked = "limp: off" if policy == "off" or entry["kind"] == "supply_loss" else "holding"
+    asked = LIMP if policy == "off" or entry["kind"] == "supply_loss" else "holding"
     check_what_was_read(run, silent, description)
     for servo in run.result.servos:
         if servo.id != entry.get("id"):
             assert servo.doing == asked, description
         elif silent:
-            assert servo.doing == "does not answer", description
+            assert servo.doing == SILENT, description
         elif entry["kind"] not in DISABLING:
             assert servo.doing == asked, description
     doings = {servo.doing for servo in run.result.servos}
-    assert end == ({"holding": "holding", "limp: off": "off"}[asked] if doings == {asked} else end), description
+    assert end == ({"holding": "holding", LIMP: "off"}[asked] if doings == {asked} else end), description
     assert end.startswith("mixed: 2 ") == (len(doings) > 1), description
-    if asked == "limp: off":
+    if asked == LIMP:
         alive = [id_ for id_ in line.servos.ids if line.servos.registers[id_]["torque_enable"]]
         # The torque was taken from those too who cannot say so.
         assert not alive, description
@@ -150,12 +150,10 @@ def check_what_was_read(run, silent: set[int], description: str) -> None:
     for servo, end in zip(run.map.servos, run.result.servos, strict=True):
         assert (end.joint, end.id) == (servo.joint, servo.id)
         if servo.id in silent:
-            assert (end.torque, end.error, end.position, end.doing) == (None, None, None, "does not answer"), (
-                description
-            )
+            assert (end.torque, end.error, end.position, end.doing) == (None, None, None, SILENT), description
             continue
         index = servos.ids.index(servo.id)
-        assert end.torque == (end.doing in ("holding", "moving", "watchdog tripped")), description
+        assert end.torque == (end.doing in ("holding", "moving", TRIPPED)), description
         speed = servo.sign * servos.plant.velocity[index]
         # Who is limp coasts to a halt while it is asked.
         assert not end.torque or abs(end.velocity - speed) < 0.05, description
@@ -249,7 +247,7 @@ def test_torque_taken_away_by_another_program_is_noticed_in_turn(rig) -> None:
     run.replay.journal.observer = take_away
     result = run.replay.run()
     assert result.fault.cause in (Cause.TORQUE_LOST, Cause.FOLLOWING_ERROR)
-    assert result.end_state == "mixed: 2 holding; elbow limp: off"
+    assert result.end_state == f"mixed: 2 holding; elbow {LIMP}"
     assert not run.line.servos.registers[2]["torque_enable"], "nobody may switch it on again"
 
 

@@ -28,6 +28,7 @@ from support.lifted_wheels import (
     snake_map,
     with_lifts,
 )
+from support.messages import raises
 
 from dynsim.errors import CheckRefused, RecordError
 from dynsim.hardware.errors import ServoMapError
@@ -216,26 +217,25 @@ def blinking(away: dict[int, tuple[float, float]], duration: float = 2.0, rate: 
 
 
 @pytest.mark.parametrize(
-    ("away", "words"),
+    ("away", "names"),
     [
-        ({1: (0.5, 1.5)}, ["pair1", "head", "0.5"]),
-        (dict.fromkeys(range(2, 8), (0.5, 1.5)), ["only pair1"]),
-        ({4: (0.5, 0.9)}, ["pair4", "0.4", "0.6 s", "blend_s"]),
+        ({1: (0.5, 1.5)}, ["pair1", "0.500 s"]),
+        (dict.fromkeys(range(2, 8), (0.5, 1.5)), ["pair1"]),
+        ({4: (0.5, 0.9)}, ["pair4", "0.400 s", "0.6 s", "lifts.blend_s"]),
         ({4: (1.8, 9.0)}, ["pair4", "0.3 s"]),
     ],
 )
-def test_what_cannot_be_lifted_is_refused(away, words, simulated) -> None:
+def test_what_cannot_be_lifted_is_refused(away, names, simulated) -> None:
     grounded = blinking(away)
     record = a_snake(np.zeros((len(grounded), 6)), grounded, simulated)
-    with pytest.raises(CheckRefused) as refused:
+    with raises(CheckRefused, *names):
         check_motion(record, snake_map())
-    assert all(word in str(refused.value) for word in words), refused.value
 
 
 def test_a_twist_beyond_the_bound_is_refused_and_the_bound_can_be_set(simulated) -> None:
     grounded = blinking({3: (0.0, 9.0)})
     record = a_snake(np.tile([0.0, 0.6, -0.6, 0.0, 0.0, 0.0], (len(grounded), 1)), grounded, simulated)
-    with pytest.raises(CheckRefused, match=r"would stand on one wheel .*tilt_mm: 2\.5"):
+    with raises(CheckRefused, "lifts.tilt_mm: 2.5"):
         check_motion(record, snake_map())
     assert check_motion(record, with_lifts(snake_map(), tilt_mm=9))
 
@@ -243,7 +243,7 @@ def test_a_twist_beyond_the_bound_is_refused_and_the_bound_can_be_set(simulated)
 def test_a_record_too_coarse_for_the_blend_is_refused(simulated) -> None:
     grounded = blinking({4: (0.5, 1.5)}, rate=50)
     record = a_snake(np.zeros((len(grounded), 6)), grounded, simulated, rate=50)
-    with pytest.raises(CheckRefused, match="67 Hz"):
+    with raises(CheckRefused, "67 Hz"):
         check_motion(record, snake_map())
     assert check_motion(record, with_lifts(snake_map(), blend_s=0.45))
 
@@ -251,7 +251,7 @@ def test_a_record_too_coarse_for_the_blend_is_refused(simulated) -> None:
 def test_without_an_entry_in_the_map_lifted_wheels_are_refused_and_others_pass(simulated) -> None:
     servo_map = snake_map()
     servo_map.lifts = None
-    with pytest.raises(CheckRefused, match=r"pair3, pair6.*does not say how"):
+    with raises(CheckRefused, "pair3, pair6", "lifts"):
         check_motion(simulated("snake_positioning", "z"), servo_map)
     flat = a_snake(np.zeros((400, 6)), np.ones((400, 7)), simulated)
     kept = check_motion(flat, servo_map).path
@@ -259,42 +259,42 @@ def test_without_an_entry_in_the_map_lifted_wheels_are_refused_and_others_pass(s
 
 
 @pytest.mark.parametrize(
-    ("change", "words"),
+    ("change", "names"),
     [
-        ({"signal": "ground"}, "no 'ground'"),
-        ({"signal": "phi"}, "0 or 1"),
-        ({"joints": PITCH[1:]}, "names 5 pitch joints; the record has 7 wheel pairs"),
+        ({"signal": "ground"}, ["'ground'"]),
+        ({"signal": "phi"}, ["'phi'", "0", "1"]),
+        ({"joints": PITCH[1:]}, ["5", "7"]),
     ],
 )
-def test_an_entry_that_does_not_fit_the_record_is_refused(change, words, simulated) -> None:
-    with pytest.raises(CheckRefused, match=words):
+def test_an_entry_that_does_not_fit_the_record_is_refused(change, names, simulated) -> None:
+    with raises(CheckRefused, *names):
         check_motion(simulated("snake_positioning", "z"), with_lifts(snake_map(), **change))
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "words"),
+    ("old", "new", "name"),
     [
-        ("[psi3, psi4,", "[psi3, psi44,", "psi44 is none of the servos"),
-        ("[psi3, psi4,", "[psi3, wheel1,", "wheel1 must be in position mode"),
-        ("id: 8, sign: 1, zero_tick: 2048, hold_at_deg: 0", "id: 8, hold_at_deg: 3", "psi4 must be in position mode"),
+        ("[psi3, psi4,", "[psi3, psi44,", "psi44"),
+        ("[psi3, psi4,", "[psi3, wheel1,", "wheel1"),
+        ("id: 8, sign: 1, zero_tick: 2048, hold_at_deg: 0", "id: 8, hold_at_deg: 3", "psi4"),
         ("clearance_mm: 5", "clearance_mm: 0", "clearance_mm"),
     ],
 )
-def test_an_entry_that_does_not_fit_the_servos_is_refused(old, new, words, tmp_path) -> None:
+def test_an_entry_that_does_not_fit_the_servos_is_refused(old, new, name, tmp_path) -> None:
     text = (SHIPPED / "snake.yaml").read_text(encoding="utf-8")
     assert old in text
     file = tmp_path / "snake.yaml"
     file.write_text(text.replace(old, new), encoding="utf-8")
-    with pytest.raises(ServoMapError, match=words):
+    with raises(ServoMapError, "lifts", name):
         load_servo_map(file)
 
 
 def test_a_record_without_a_scene_has_no_lengths(simulated) -> None:
     record = a_snake(np.zeros((400, 6)), blinking({4: (0.5, 1.5)}), simulated)
     record.scene = None
-    with pytest.raises(CheckRefused, match="no scene"):
+    with raises(CheckRefused):
         check_motion(record, snake_map())
-    with pytest.raises(CheckRefused, match="no wheel pair"):
+    with raises(CheckRefused, "pair9"):
         base_part(simulated("snake_positioning", "z"), ("pair1", "pair9"))
 
 
@@ -312,7 +312,7 @@ def test_what_was_lifted_is_no_error_of_the_replay(simulated) -> None:
     (only,) = compare_records(record, measured).joints
     assert only.joint == "psi3"
     measured.provenance = {"lifts": {"joints": 3}}
-    with pytest.raises(RecordError, match="says lifts"):
+    with raises(RecordError, "lifts"):
         compare_records(record, measured)
 
 

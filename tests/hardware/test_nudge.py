@@ -10,6 +10,7 @@ from contextlib import contextmanager, nullcontext
 
 import numpy as np
 import pytest
+from support.messages import check_message, lines_with, mentions, raises
 
 from dynsim import cli
 from dynsim.cli import hardware
@@ -77,19 +78,19 @@ def test_a_robot_that_is_held_is_not_nudged(rig) -> None:
     """The nudge ends with a broadcast torque off: what another run left holding would fall."""
     run = rig.prepare()
     run.line.servos.write(2, 64, b"\1")
-    with pytest.raises(VerificationFailed, match=r"elbow \(ID 2\): torque is on"):
+    with raises(VerificationFailed, "elbow (ID 2)", "dynsim hw stop"):
         nudged(run, "shoulder")
     assert run.line.servos.registers[2]["torque_enable"] == 1
     run.line.servos.dead.add(7)
     run.line.servos.write(2, 64, b"\0")
-    with pytest.raises(VerificationFailed, match="wheel: ID 7: no answer"):
+    with raises(VerificationFailed, "wheel", "ID 7"):
         nudged(run, "shoulder")
 
 
 def test_a_joint_held_fast_is_let_go_before_the_nudge_is_at_its_end(rig) -> None:
     """The map's own bound of 0.2 rad would never be reached."""
     run = rig.prepare({"kind": "stuck", "id": 1})
-    with pytest.raises(ReplayAborted, match="shoulder: following error in REPLAY"):
+    with raises(ReplayAborted, "shoulder", "following error", "REPLAY"):
         nudged(run, "shoulder")
     furthest = max(abs(run.map.servos[0].to_angle(value) - 0.1) for _, _, value in run.goals())
     assert furthest < 0.9 * ANGLE
@@ -109,7 +110,7 @@ def test_ctrl_c_leaves_the_joint_limp(rig) -> None:
             super().check()
 
     run = rig.prepare()
-    with pytest.raises(ReplayInterrupted, match="shoulder: interrupted in REPLAY"):
+    with raises(ReplayInterrupted, "shoulder", "interrupted", "REPLAY"):
         nudged(run, "shoulder", stop=Late())
     assert run.line.servos.registers[1]["torque_enable"] == 0
 
@@ -125,7 +126,7 @@ def test_signs_of_swapped_joints_are_written_and_limits_that_turn_with_them_are_
     assert [servo.zero_tick for servo in again.servos] == [2048, 1900, 2048]
     assert "# left" in path.read_text(encoding="utf-8")
     lopsided = write_map(("zero_tick: 1900", "zero_tick: 3900"), ("[-60, 60]", "[-10, 160]"))
-    with pytest.raises(ServoMapError, match="elbow: with sign 1 and zero at tick 3900 its limits reach ticks 3786 to"):
+    with raises(ServoMapError, "elbow", "1", "3900", "3786", "5720", "0", "4095"):
         write_into_map(load_servo_map(lopsided), "sign", {"elbow": 1}, lopsided)
 
 
@@ -156,7 +157,7 @@ def test_the_command_asks_about_each_joint_and_writes_on_request(answering, writ
     code, out, _ = answering("y\nagain\nperhaps\nn\ny\nn\n", *command)
     assert code == 0
     assert out.count("elbow (ID 2): +3") == 2
-    assert "elbow: turns against the map; its sign should be 1" in out
+    assert lines_with(out, "elbow", re.compile(r"\b1$"))
     assert load_servo_map(path).servos[1].sign == -1, "not without a yes"
     code, out, _ = answering("n\n", *command, "--joint", "elbow", "--write")
     assert code == 0
@@ -164,16 +165,16 @@ def test_the_command_asks_about_each_joint_and_writes_on_request(answering, writ
     assert [servo.sign for servo in load_servo_map(path).servos] == [1, 1, 1]
     code, _, error = answering("", *command)
     assert code == 130
-    assert "no answer about shoulder; torque is off, nothing was written" in error
+    assert mentions(error, "shoulder")
 
 
 def test_options_of_the_nudge_are_nothing_for_zero_ticks(answering, write_map) -> None:
     code, _, error = answering("", "hw", "calibrate", "--map", write_map(), "--port", "virtual", "--live")
     assert code == 2
-    assert "are for --nudge" in error
+    assert mentions(error, "--live", "--nudge")
     code, _, error = answering("", "hw", "calibrate", "--map", "arm", "--port", "virtual", "--nudge", "--write")
     assert code == 2
-    assert "write your own map with --out" in error
+    assert mentions(error, "--out")
 
 
 @pytest.fixture
@@ -194,15 +195,15 @@ def test_on_a_real_port_nothing_is_nudged_without_live_or_without_a_yes(on_the_r
     command = ("hw", "calibrate", "--map", write_map(), "--port", "/dev/ttyRobot", "--nudge")
     code, out, _ = answering("", *command)
     assert code == 0
-    assert "dry run: nothing was moved; --live moves" in out
-    assert out.count("fit to move") == 3
+    assert mentions(out, "--live")
+    assert len(lines_with(out, re.compile(r"\(ID \d\): "))) == 3
     code, out, error = answering("n\n", *command, "--live")
     assert code == 130
-    assert "not confirmed; nothing was moved" in error
+    check_message(error, re.compile("^error: "))
     assert not run.goals()
     code, out, _ = answering("y\ny\n", *command, "--live", "--joint", "elbow")
     assert code == 0
-    assert "power cut within reach" in out
+    assert mentions(out, "y/N")
     assert {id_ for _, id_, _ in run.goals()} == {2}
 
 
@@ -226,17 +227,17 @@ def test_a_replay_asks_with_the_way_to_its_start_and_again_where_it_is_far(
         run.line.servos.plant.position[0] += 0.8
     monkeypatch.setattr(sys, "stdin", io.StringIO(answers))
     motion = rig.motion()
-    with nullcontext() if agreed else pytest.raises(ReplayInterrupted, match="nothing was moved"):
+    with nullcontext() if agreed else raises(ReplayInterrupted):
         hardware.confirm_replay(Terminal(soft_wrap=True), rig.map, motion, "/dev/ttyRobot", asked=asked)
     out = capsys.readouterr().out
     now, start = (0.9 if far else 0.1), motion.path.position[0][0]
-    assert f"furthest from its start: shoulder {abs(now - start):.2f}" in out
-    assert f"after {1.875 * abs(now - start) / 0.3:.1f} s to the start" in out
-    assert ("further than safety.start_distance, 0.5 rad" in out) is (far and (not asked or answers[0] == "y"))
-    assert ("(asked with --yes too)" in out) is (far and not asked)
+    assert lines_with(out, "shoulder", f"{abs(now - start):.3f} rad")
+    assert mentions(out, f"{1.875 * abs(now - start) / 0.3:.1f} s")
+    assert mentions(out, "safety.start_distance, 0.5 rad") is (far and (not asked or answers[0] == "y"))
+    assert ("--yes" in out) is (far and not asked)
 
 
 def test_who_does_not_answer_is_named_before_anything_is_asked(on_the_rig, rig) -> None:
     on_the_rig.line.servos.dead.add(2)
-    with pytest.raises(VerificationFailed, match=r"no answer from elbow \(ID 2\)"):
+    with raises(VerificationFailed, "elbow (ID 2)"):
         hardware.confirm_replay(Terminal(), rig.map, rig.motion(), "/dev/ttyRobot", asked=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -15,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from dynamixel_sdk import COMM_SUCCESS, PortHandler, Protocol2PacketHandler
+from support.messages import check_message, lines_with, mentions, raises
 from support.processes import Child, started, wait_for
 
 from dynsim.hardware.bus.control_table import MX_106
@@ -22,6 +24,7 @@ from dynsim.hardware.bus.dynamixel_bus import DynamixelBus, open_serial_port
 from dynsim.hardware.bus.protocol import NoAnswer
 from dynsim.hardware.errors import PortError
 from dynsim.hardware.replay.output import ReplayState
+from dynsim.hardware.replay.rules import Cause
 from dynsim.hardware.virtual.line import PseudoTerminal, line_for_map
 from dynsim.record import Record
 
@@ -108,7 +111,7 @@ class Servos:
 def virtual_servos(folder: Path, faults: str = "") -> Iterator[Servos]:
     servos = Servos(folder, faults)
     try:
-        assert "3 virtual servos at 1000000 bit/s" in servos.greeting
+        assert mentions(servos.greeting, "3", "1000000")
         yield servos
     finally:
         servos.process.kill()
@@ -127,7 +130,7 @@ def servos(tmp_path: Path) -> Iterator[Servos]:
 def replaying(servos: Servos) -> Iterator[Child]:
     """A slow replay in a process of its own, in the middle of its motion."""
     with started(servos.replay("--live", "--yes", "--speed", "0.1"), servos.folder / "stderr") as child:
-        wait_for(lambda: "REPLAY         enter" in servos.log)
+        wait_for(lambda: lines_with(servos.log, "REPLAY"))
         yield child
 
 
@@ -142,13 +145,13 @@ def test_the_stock_client_library_finds_the_servos(servos: Servos) -> None:
     port.closePort()
     scan = run("hw", "scan", "--port", servos.device, "--map", servos.map)
     assert scan.returncode == 0, scan.stderr
-    assert "all 3 servos" in scan.stdout
+    assert mentions(scan.stdout, "3")
 
 
 def test_without_live_a_real_port_is_a_dry_run(servos: Servos) -> None:
     dry = subprocess.run(servos.replay(), capture_output=True, text=True, timeout=60, check=False)
     assert dry.returncode == 0, dry.stderr
-    assert "nothing was moved" in dry.stdout
+    assert "--live" in dry.stdout
     assert servos.torque() == [0, 0, 0]
     assert (servos.folder / "out" / "registers.json").exists()
 
@@ -169,14 +172,14 @@ def test_replay_over_a_serial_device(servos: Servos) -> None:
 
 def test_a_second_replay_is_refused_and_stop_works_beside_the_first(servos: Servos) -> None:
     first = open_serial_port(str(servos.device), 1_000_000)
-    with pytest.raises(PortError, match="in use by another process"):
+    with raises(PortError, str(servos.device)):
         open_serial_port(str(servos.device), 1_000_000)
     first.closePort()
     with replaying(servos) as running:
         again = servos.replay("--live", "--yes")
         second = subprocess.run(again, capture_output=True, text=True, timeout=60, check=False)
         assert second.returncode == 3
-        assert "in use by another process" in second.stderr
+        check_message(second.stderr, re.compile("^error: "), str(servos.device))
         stop = run("hw", "stop", "--port", servos.device, "--map", servos.map)
         assert running.end() == 4, running.stderr
     assert servos.torque() == [0, 0, 0]
@@ -192,7 +195,7 @@ def test_ctrl_c_in_a_running_replay(servos: Servos, presses: int, left: list[int
             time.sleep(0.2)
             os.kill(running.process.pid, signal.SIGINT)
         assert running.end() == 130, running.stderr
-    assert running.stderr.startswith("error: interrupted in REPLAY")
+    check_message(running.stderr, re.compile("^error: "), Cause.INTERRUPTED, "REPLAY")
     assert servos.torque() == left
 
 
@@ -203,14 +206,13 @@ def test_a_replay_that_was_stopped_for_longer_than_the_watchdogs_names_it(
     with started(
         servos.replay("--live", "--yes", "--speed", "0.1", "--policy", policy), servos.folder / "stderr"
     ) as running:
-        wait_for(lambda: "REPLAY         enter" in servos.log)
+        wait_for(lambda: lines_with(servos.log, "REPLAY"))
         os.kill(running.process.pid, signal.SIGSTOP)
         time.sleep(2.5)
         os.kill(running.process.pid, signal.SIGCONT)
         assert running.end() == 4, running.stderr
-    assert running.stderr.startswith("error: stall in REPLAY: stalled for ")
-    assert "bus watchdogs (2.00 s) have tripped" in running.stderr
-    assert f"robot left {'holding' if policy == 'hold' else 'off'}" in running.stderr
+    left_as = "holding" if policy == "hold" else "off"
+    check_message(running.stderr, re.compile("^error: "), Cause.STALL, "REPLAY", "2.00 s", left_as)
     assert servos.torque() == left
 
 
@@ -219,15 +221,14 @@ def test_an_adapter_pulled_out_ends_the_replay(tmp_path: Path) -> None:
         slowly = servos.replay("--live", "--yes", "--speed", "0.1")
         live = subprocess.run(slowly, capture_output=True, text=True, timeout=60, check=False)
         assert live.returncode == 4, live.stderr
-        assert "the port died" in live.stderr
-        assert "robot left unreachable" in live.stderr
+        check_message(live.stderr, re.compile("^error: "), Cause.PORT, "unreachable")
         assert servos.process.wait(timeout=20) == 0
 
 
 def test_the_link_of_running_servos_is_neither_taken_over_nor_removed(rig: Rig, tmp_path: Path) -> None:
     link = tmp_path / "ttyDXL"
     first = PseudoTerminal(line_for_map(rig.map), link)
-    with pytest.raises(PortError, match=f"leads to {first.device}, which is in use"):
+    with raises(PortError, str(first.device)):
         PseudoTerminal(line_for_map(rig.map), link)
     assert os.readlink(link) == first.device
     # Somebody else's by the time it ends.

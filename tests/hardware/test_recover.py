@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.messages import check_message, mentions, raises
 
 from dynsim.errors import RecordError
 from dynsim.hardware.errors import OutputsFailed, PortError, ReplayAborted
@@ -69,7 +70,7 @@ def test_the_whole_stream_is_the_whole_record_but_incomplete(streamed, tmp_path:
     assert not loaded.complete
     same(record, loaded, len(record))
     summary = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
-    assert summary["end_state"] == "not known: the program died"
+    assert summary["end_state"] == measured.END_STATE
     assert not (tmp_path / PART).exists()
 
 
@@ -89,7 +90,7 @@ def test_a_stream_cut_anywhere_keeps_its_whole_rows(streamed, rig: Rig, tmp_path
         (tmp_path / "measured.h5").unlink()
     for cut in (1, head // 2, head - 2):
         (tmp_path / PART).write_bytes(stream[:cut])
-        with pytest.raises(RecordError, match="is no streamed record of a replay"):
+        with raises(RecordError, "measured.part"):
             recover(tmp_path)
         assert (tmp_path / PART).exists()
 
@@ -112,15 +113,13 @@ def test_a_record_that_is_whole_stays(streamed, tmp_path: Path) -> None:
 
 
 def test_nothing_to_recover(tmp_path: Path) -> None:
-    with pytest.raises(RecordError, match="nothing to recover"):
+    with raises(RecordError, str(tmp_path), "measured.part"):
         recover(tmp_path)
 
 
 def test_an_empty_stream_is_said_to_be_empty(tmp_path: Path) -> None:
     (tmp_path / PART).touch()
-    with pytest.raises(
-        RecordError, match=r"measured\.part: is empty, the replay died before its first cycle: nothing to"
-    ):
+    with raises(RecordError, "measured.part"):
         recover(tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == [PART]
 
@@ -141,7 +140,7 @@ def test_a_refused_start_leaves_no_empty_files(rig: Rig, tmp_path: Path, monkeyp
     run = rig.prepare()
     (tmp_path / "notes.txt").write_text("mine", encoding="utf-8")
     monkeypatch.setattr(owner, method, fault)
-    with pytest.raises(PortError, match="nothing was moved"):
+    with raises(PortError, str(tmp_path)):
         run_replay(rig.motion(), rig.map, nullcontext((run.replay.bus, run.clock)), tmp_path, live=True)
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
     assert not run.sent
@@ -152,21 +151,21 @@ def test_a_stream_of_another_version_is_refused(streamed, tmp_path: Path) -> Non
     header = json.loads(line)
     for change in ({"format": 2}, {"row": header["row"][1:]}, {"layout": {}}):
         (tmp_path / PART).write_bytes(json.dumps(header | change).encode() + b"\n" + rows)
-        with pytest.raises(RecordError, match="is no streamed record"):
+        with raises(RecordError, "measured.part"):
             recover(tmp_path)
 
 
 def test_who_looks_for_the_record_is_told_to_recover_it(streamed, tmp_path: Path) -> None:
     (tmp_path / PART).write_bytes(streamed[1])
-    with pytest.raises(RecordError, match=f"no such record; .* died: dynsim hw recover {tmp_path}"):
+    with raises(RecordError, "measured.h5", "measured.part", f"dynsim hw recover {tmp_path}"):
         Record.load(tmp_path / "measured.h5")
 
 
 def test_a_stream_in_use_is_left_alone(tmp_path: Path) -> None:
     growing = GrowingFile(tmp_path / PART)
-    with pytest.raises(RecordError, match="still running"):
+    with raises(RecordError, "measured.part"):
         recover(tmp_path)
-    with pytest.raises(PortError, match="another replay is writing there"):
+    with raises(PortError, str(tmp_path), "--out"):
         move_away(tmp_path)
     growing.close()
     assert move_away(tmp_path) == tmp_path / "previous_1"
@@ -185,7 +184,7 @@ def test_an_old_result_is_moved_away_whole_and_before_anything_is_written(rig: R
     moved = tmp_path / "previous_2"
     assert {path.name for path in moved.iterdir()} == {*names, *others, "figures"}
     assert all((moved / name).read_text(encoding="utf-8") == f"old {name}" for name in (*names, *others))
-    assert f"the result of an earlier replay is now in {moved}" in (tmp_path / "replay.log").read_text(encoding="utf-8")
+    assert mentions((tmp_path / "replay.log").read_text(encoding="utf-8"), str(moved))
 
 
 def test_where_the_old_result_cannot_go_nothing_is_moved(rig: Rig, tmp_path: Path, monkeypatch) -> None:
@@ -196,7 +195,7 @@ def test_where_the_old_result_cannot_go_nothing_is_moved(rig: Rig, tmp_path: Pat
         raise PermissionError(13, "Permission denied")
 
     monkeypatch.setattr(os, "rename", refuse)
-    with pytest.raises(PortError, match=r"cannot be written \(Permission denied\); nothing was moved"):
+    with raises(PortError, str(tmp_path), "Permission denied"):
         run_replay(rig.motion(), rig.map, nullcontext((run.replay.bus, run.clock)), tmp_path, live=True)
     assert not run.sent
     assert (tmp_path / "measured.h5").read_text(encoding="utf-8") == "old"
@@ -237,7 +236,7 @@ def test_the_end_that_a_replay_has_told_is_kept(rig: Rig, tmp_path: Path, monkey
 
     with monkeypatch.context() as patch:
         patch.setattr(measured, "replace_together", refuse)
-        with pytest.raises(ReplayAborted, match="measured record failed"):
+        with raises(ReplayAborted, "elbow (ID 2)", "measured record", "No space left on device", "dynsim hw recover"):
             replay(rig, tmp_path, faults=[{"kind": "overload", "id": 2, "at": 1.7}])
     kept = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
     recovered = recover(tmp_path)
@@ -264,15 +263,16 @@ def test_a_complete_record_is_not_called_failed(rig: Rig, tmp_path: Path, monkey
         patch.setattr(Path, "unlink", refuse)
         with pytest.raises(OutputsFailed) as error:
             replay(rig, tmp_path / "left")
-    assert "removal of measured.part failed: [Errno 13]" in str(error.value)
-    assert str(error.value).endswith(f"{tmp_path / 'left' / 'measured.h5'} is complete")
+    check_message(error.value, "measured.part", "[Errno 13]", str(tmp_path / "left" / "measured.h5"))
     assert "recover" not in str(error.value)
     summary = json.loads((tmp_path / "left/summary.json").read_text(encoding="utf-8"))
     assert summary["outputs_failed"].keys() == {"removal of measured.part"}
     assert summary["timing"]["cycles"] == len(Record.load(tmp_path / "left/measured.h5"))
     with monkeypatch.context() as patch:
         patch.setattr(output.RowStream, "pump", no_room)
-        with pytest.raises(OutputsFailed, match=r"streamed record failed: .*; .*measured\.h5 is complete$"):
+        with raises(
+            OutputsFailed, "streamed record", "No space left on device", str(tmp_path / "streamed" / "measured.h5")
+        ):
             replay(rig, tmp_path / "streamed")
     assert recover(tmp_path / "left").complete
 
@@ -286,7 +286,7 @@ def test_what_is_recovered_may_go_elsewhere(streamed, tmp_path: Path) -> None:
     assert not Record.load(out / "measured.h5").complete
     assert {path.name for path in out.iterdir()} == {"measured.h5", "summary.json"}
     before = (out / "measured.h5").read_bytes()
-    with pytest.raises(RecordError, match=r"has measured\.h5, summary\.json already; give another folder \(--out\)"):
+    with raises(RecordError, str(out), "measured.h5, summary.json", "--out"):
         recover(source, out)
     assert (out / "measured.h5").read_bytes() == before
 
@@ -294,4 +294,4 @@ def test_what_is_recovered_may_go_elsewhere(streamed, tmp_path: Path) -> None:
 def test_a_summary_that_was_cut_off_says_nothing(streamed, tmp_path: Path) -> None:
     (tmp_path / PART).write_bytes(streamed[1])
     (tmp_path / "summary.json").write_text('{"end_state": "hol', encoding="utf-8")
-    assert recover(tmp_path).summary["end_state"] == "not known: the program died"
+    assert recover(tmp_path).summary["end_state"] == measured.END_STATE

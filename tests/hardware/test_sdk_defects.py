@@ -7,6 +7,7 @@ can be removed.
 from __future__ import annotations
 
 import os
+import re
 import termios
 import time
 import tty
@@ -23,6 +24,7 @@ from dynamixel_sdk import (
     PortHandler,
     Protocol2PacketHandler,
 )
+from support.messages import raises
 
 from dynsim.hardware.bus.control_table import BROADCAST_ID, MX_106, STATE_BLOCK
 from dynsim.hardware.bus.dynamixel_bus import WRITE_TIMEOUT, DynamixelBus, open_serial_port
@@ -133,9 +135,9 @@ def test_4_a_request_that_needs_stuffing_is_sent_without(stock) -> None:
     assert list(Decoder().feed(port.written)) == []
 
     bus = DynamixelBus(ScriptedPort())
-    with pytest.raises(ValueError, match="FF FF FD"):
+    with raises(ValueError, "FF FF FD"):
         bus.sync_write(F["goal_position"], {1: 0x00FDFFFF})
-    with pytest.raises(ValueError, match="FF FF FD"):
+    with raises(ValueError, "FF FF FD"):
         bus.write(1, F["goal_position"], 0x00FDFFFF)
 
 
@@ -198,9 +200,9 @@ def test_6_a_dead_terminal_raises_more_than_serial_errors() -> None:
     os.close(master)
     with pytest.raises((termios.error, OSError)):
         stock_port.clearPort()
-    with pytest.raises(PortError, match="died"):
+    with raises(PortError, re.compile(r"^/dev/\S+: "), "Input/output error"):
         DynamixelBus(port).torque_off_all()
-    with pytest.raises(PortError, match="died"):
+    with raises(PortError, re.compile(r"^/dev/\S+: "), "Input/output error"):
         DynamixelBus(port).sync_read((1,), *STATE_BLOCK)
     stock_port.ser.close()
     DynamixelBus(port).close()
@@ -247,10 +249,10 @@ def _fill(bus: DynamixelBus) -> None:
 
 
 def test_6_missing_ports_and_bit_rates_are_one_clear_line() -> None:
-    with pytest.raises(PortError, match="no such port"):
+    with raises(PortError, "/dev/ttyDoesNotExist"):
         open_serial_port("/dev/ttyDoesNotExist", 1_000_000)
     master, slave = os.openpty()
-    with pytest.raises(PortError, match="refuses 4500000"):
+    with raises(PortError, "4500000"):
         open_serial_port(os.ttyname(slave), 4_500_000)
     with pytest.raises(serial.SerialException):
         serial.Serial("/dev/ttyDoesNotExist")

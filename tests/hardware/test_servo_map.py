@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from jsonschema import Draft202012Validator
 from ruamel.yaml import YAML
+from support.messages import raises
 
 from dynsim.hardware.errors import ServoMapError, VerificationFailed
 from dynsim.hardware.servo_map import json_schema, load_servo_map, read_zero_ticks, write_into_map
@@ -55,139 +56,116 @@ def test_sense_zero_and_limits(rig) -> None:
     assert wheel.position_limits == (-math.inf, math.inf)
 
 
-# What is replaced in the rig's map, by what, and the error.
+# What is replaced in the rig's map, by what, and the names in the error; a JSON schema refuses it too.
 MISTAKES = [
-    ("robot: rig", "robott: rig", r"map.yaml:1: robott: unknown key; did you mean .robot.\?"),
-    ("id: 7", "id: 2", r"map.yaml:\d+: servos.wheel.id = 2: is also the ID of elbow"),
+    ("robot: rig", "robott: rig", ["map.yaml:1: robott", "'robot'"]),
+    ("baud: 1000000", "baud: 1234", ["map.yaml:2: bus.baud = 1234", "9600, 57600, 115200"]),
+    ("position_deg: [-60, 60], ", "", ["map.yaml:9: kinds.joint.limits", "limits.position_deg"]),
+    ("sign: -1", "sign: true", ["map.yaml:19: servos.elbow.sign = True", "1", "-1"]),
+    ("sign: -1", "sign: 2", ["map.yaml:19: servos.elbow.sign = 2", "1", "-1"]),
     (
-        "kind: wheel, id: 7",
-        "kind: whel, id: 7",
-        r"servos.wheel.kind = .whel.: is not one of joint, wheel; did you mean .wheel.\?",
+        "velocity: 3.0, torque: 6.0}",
+        "velocity: -3.0, torque: 6.0}",
+        ["map.yaml:9: kinds.joint.limits.velocity = -3.0", "0"],
     ),
-    ("baud: 1000000", "baud: 1234", r"map.yaml:2: bus.baud = 1234: is not one of 9600, 57600"),
-    ("[-60, 60]", "[60, -60]", r"map.yaml:\d+: kinds.joint.limits.position_deg: 60.0 is not below -60.0"),
-    ("position_deg: [-60, 60], ", "", r"a servo in position mode needs limits.position_deg"),
-    ("sign: -1", "sign: true", r"map.yaml:19: servos.elbow.sign = True: must be 1 or -1"),
-    ("sign: -1", "sign: 2", r"map.yaml:19: servos.elbow.sign"),
-    ("velocity: 3.0, torque: 6.0}", "velocity: -3.0, torque: 6.0}", r"map.yaml:9: kinds.joint.limits.velocity"),
-    ("policy: decelerate", "policy: panic", r"map.yaml:3: safety.policy"),
-    ("torque: 6.0}", "torque: 6.0, torqe: 1}", r"torqe: unknown key; did you mean .torque.\?"),
-    ("kinds:", "kinds: [", r"map.yaml:\d+: not YAML"),
-    ("id: 1}", "id: 254}", r"servos.shoulder.id"),
-    ("run_up: 20", "run_up: 20, watchdog: 60", r"map.yaml:3: safety.watchdog = 60"),
-    ("run_up: 20", "run_up: 20, missed_cycles: 100000", r"map.yaml:3: safety.missed_cycles = 100000"),
-    ("run_up: 20", "run_up: 20, stop_time: 60", r"map.yaml:3: safety.stop_time = 60"),
+    ("policy: decelerate", "policy: panic", ["map.yaml:3: safety.policy = 'panic'", "'hold'", "'decelerate'", "'off'"]),
+    ("torque: 6.0}", "torque: 6.0, torqe: 1}", ["map.yaml:9: kinds.joint.limits.torqe", "'torque'"]),
+    ("id: 1}", "id: 254}", ["map.yaml:18: servos.shoulder.id = 254", "252"]),
+    ("run_up: 20", "run_up: 20, watchdog: 60", ["map.yaml:3: safety.watchdog = 60", "2.54"]),
+    ("run_up: 20", "run_up: 20, missed_cycles: 100000", ["map.yaml:3: safety.missed_cycles = 100000", "100"]),
+    ("run_up: 20", "run_up: 20, stop_time: 60", ["map.yaml:3: safety.stop_time = 60", "3"]),
     (
         "torque: 6.0",
         "torque: 6.0, acceleration: 1e300",
-        r"limits.acceleration = 1e\+300: .*; use 0.01 to 100000 rad/s²",
+        ["map.yaml:9: kinds.joint.limits.acceleration = 1e+300", "0.01", "100000 rad/s²"],
     ),
     (
         "torque: 6.0",
         "torque: 6.0, jerk: 1.0e+8",
-        r"map.yaml:9: kinds.joint.limits.jerk = .*; use 0.01 to 1e\+07 rad/s³",
+        ["map.yaml:9: kinds.joint.limits.jerk = 100000000.0", "0.01", "1e+07 rad/s³"],
     ),
     (
         "torque: 6.0",
         "torque: 6.0, shaking: 1e3",
-        r"map.yaml:9: kinds.joint.limits.shaking = 1000.0: .* 0.01 to 100 rad/s",
+        ["map.yaml:9: kinds.joint.limits.shaking = 1000.0", "0.01", "100 rad/s"],
     ),
-    (
-        "run_up: 20",
-        "start_distance: 1e9",
-        r"map.yaml:3: safety.start_distance = 1.* no joint would .* 0.001 to 6.28319 rad",
-    ),
-    ("run_up: 20", "approach_velocity: 50", r"map.yaml:3: safety.approach_velocity = 50: .*; use 0.001 to 1 rad/s"),
-    (
-        "run_up: 20",
-        "run_up: 1e12",
-        r"map.yaml:3: safety.run_up = 1.*: takes minutes, or is a knock; use 0.01 to 100000",
-    ),
-    ("run_up: 20", "run_up: 1e-12", r"map.yaml:3: safety.run_up = 1e-12: takes minutes, .*; use 0.01 to 100000 rad/s²"),
-    ("rate: 100", "rate: 100, latency: 1e-12", r"map.yaml:2: bus.latency = 1e-12: no adapter .*; use 0.0001 to 2.54 s"),
+    ("run_up: 20", "start_distance: 1e9", ["map.yaml:3: safety.start_distance = 1000000000.0", "0.001", "6.28319 rad"]),
+    ("run_up: 20", "approach_velocity: 50", ["map.yaml:3: safety.approach_velocity = 50", "0.001", "1 rad/s"]),
+    ("run_up: 20", "run_up: 1e12", ["map.yaml:3: safety.run_up = 1000000000000.0", "0.01", "100000 rad/s²"]),
+    ("run_up: 20", "run_up: 1e-12", ["map.yaml:3: safety.run_up = 1e-12", "0.01", "100000 rad/s²"]),
+    ("rate: 100", "rate: 100, latency: 1e-12", ["map.yaml:2: bus.latency = 1e-12", "0.0001", "2.54 s"]),
 ]
-# What a data sheet says, or another entry.
-ABSURD = [
-    ("id: 2, sign", "id: 2, label: shoulder, sign", r"map.yaml:19: servos.elbow.label.*: shoulder already follows"),
-    (
-        "velocity: 3.0",
-        "velocity: 0.2",
-        r"map.yaml:3: safety.approach_velocity: is above kinds.* 0.2",
-    ),
-    ("run_up: 20", "run_up: 3000", r"map.yaml:3: safety.run_up = 3000: is above kinds.joint.limits.acceleration, 2000"),
-    (
-        "run_up: 20",
-        "stop_time: 0.02",
-        r"map.yaml:3: safety.stop_time = 0.02: is less than 3 cycles of 100 Hz; use 0.03",
-    ),
+# What ties entries together, or to a data sheet, is beyond a schema.
+TIED = [
+    ("id: 7", "id: 2", ["map.yaml:20: servos.wheel.id = 2", "elbow"]),
+    ("kind: wheel, id: 7", "kind: whel, id: 7", ["map.yaml:20: servos.wheel.kind = 'whel'", "joint, wheel", "'wheel'"]),
+    ("[-60, 60]", "[60, -60]", ["map.yaml:9: kinds.joint.limits.position_deg", "60.0", "-60.0"]),
+    ("kinds:", "kinds: [", ["map.yaml:6", "YAML"]),
+    ("id: 2, sign", "id: 2, label: shoulder, sign", ["map.yaml:19: servos.elbow.label = 'shoulder'", "'q'"]),
+    ("velocity: 3.0", "velocity: 0.2", ["map.yaml:3: safety.approach_velocity", "kinds.joint.limits.velocity", "0.2"]),
     (
         "run_up: 20",
-        "late_cycles: 51",
-        r"map.yaml:3: safety.late_cycles = 51: takes 0.51 s at 100 Hz, .*; use 50 or less",
+        "run_up: 3000",
+        ["map.yaml:3: safety.run_up = 3000", "kinds.joint.limits.acceleration", "2000 rad/s²"],
     ),
-    ("run_up: 20", "following_cycles: 51", r"safety.following_cycles = 51: takes 0.51 s at 100 Hz.*; use 50 or less"),
-    ("run_up: 20", "torque_cycles: 51", r"map.yaml:3: safety.torque_cycles = 51: takes 0.51 s at 100 Hz.*; use 50 or"),
-    ("run_up: 20", "missed_cycles: 51, watchdog: 1", r"safety.missed_cycles = 51: takes 0.51 s at 100 Hz.*; use 50 or"),
+    ("run_up: 20", "stop_time: 0.02", ["map.yaml:3: safety.stop_time = 0.02", "3", "100 Hz", "0.03"]),
+    ("run_up: 20", "late_cycles: 51", ["map.yaml:3: safety.late_cycles = 51", "0.51 s", "100 Hz", "50"]),
+    ("run_up: 20", "following_cycles: 51", ["map.yaml:3: safety.following_cycles = 51", "0.51 s", "100 Hz", "50"]),
+    ("run_up: 20", "torque_cycles: 51", ["map.yaml:3: safety.torque_cycles = 51", "0.51 s", "100 Hz", "50"]),
+    (
+        "run_up: 20",
+        "missed_cycles: 51, watchdog: 1",
+        ["map.yaml:3: safety.missed_cycles = 51", "0.51 s", "100 Hz", "50"],
+    ),
     (
         "run_up: 20",
         "missed_cycles: 20",
-        r"map.yaml:3: safety.missed_cycles = 20: takes 0.2 s .* watchdogs would trip first",
+        ["map.yaml:3: safety.missed_cycles = 20", "0.2 s", "100 Hz", "safety.watchdog"],
     ),
-    ("rate: 100", "rate: 1", r"map.yaml:3: safety.missed_cycles: takes 3 s at 1 Hz, .*; use a higher bus.rate"),
-    (
-        "run_up: 20",
-        "temperature_max: 1e-9",
-        r"map.yaml:3: safety.temperature_max = 1e-09: is no more than the 20 °C of a",
-    ),
-    (
-        "torque: 6.0",
-        "torque: 1e-9",
-        r"map.yaml:9: kinds.joint.limits.torque = 1e-09: is below what .*; use 0.0055 N",
-    ),
-    ("error: 0.2", "error: 1e-12", r"kinds.joint.following_error = 1e-12: is below what .*; use 0.0016 rad or more"),
-    ("error: 1.0", "error: 0.02", r"kinds.wheel.following_error = 0.02: is below what .*; use 0.024 rad/s or more"),
+    ("rate: 100", "rate: 1", ["map.yaml:3: safety.missed_cycles", "3 s", "1 Hz", "bus.rate"]),
+    ("run_up: 20", "temperature_max: 1e-9", ["map.yaml:3: safety.temperature_max = 1e-09", "20 °C"]),
+    ("torque: 6.0", "torque: 1e-9", ["map.yaml:9: kinds.joint.limits.torque = 1e-09", "MX-106", "0.0055 N m"]),
+    ("error: 0.2", "error: 1e-12", ["map.yaml:10: kinds.joint.following_error = 1e-12", "0.0016 rad"]),
+    ("error: 1.0", "error: 0.02", ["map.yaml:16: kinds.wheel.following_error = 0.02", "0.024 rad/s"]),
     (
         "{velocity: 5.0",
         "{position_deg: [-9, 9], velocity: 5.0",
-        r"map.yaml:15: kinds.wheel.limits.position_deg: .* leave it",
+        ["map.yaml:15: kinds.wheel.limits.position_deg", "mode: position"],
     ),
     (
         "id: 1}",
         "id: 1, hold_at_deg: 61}",
-        r"map.yaml:18: servos.shoulder.hold_at_deg = 61: is beyond .*; use -60 to 60",
+        ["map.yaml:18: servos.shoulder.hold_at_deg = 61", "limits.position_deg", "-60", "60"],
     ),
     (
         "id: 1}",
         "id: 1, zero_tick: 4779}",
-        r"map.yaml:18: servos.shoulder.zero_tick = 4779: leaves no tick of 0 to 4095",
+        ["map.yaml:18: servos.shoulder.zero_tick = 4779", "0", "4095", "dynsim hw calibrate"],
     ),
     (
         "id: 1}",
         "id: 1, zero_tick: -684}",
-        r"map.yaml:18: servos.shoulder.zero_tick = -684: leaves .*`dynsim hw",
+        ["map.yaml:18: servos.shoulder.zero_tick = -684", "0", "4095", "dynsim hw calibrate"],
     ),
+    ("robot: rig", "robot: ../rig", ["map.yaml:1: robot = '../rig'", "'_rig'"]),
+    ("robot: rig", "robot: ''", ["map.yaml:1: robot = ''", "'unnamed'"]),
+    ("run_up: 20", "temperature_max: 500", ["map.yaml:3: safety.temperature_max = 500", "MX-106", "80 °C"]),
+    ("lowest: 10.5", "lowest: 5.0", ["map.yaml:3: safety.supply.lowest = 5.0", "MX-106", "9.5 V"]),
+    ("highest: 14.0", "highest: 24.0", ["map.yaml:3: safety.supply.highest = 24.0", "MX-106", "16 V"]),
+    ("lowest: 10.5", "lowest: 14.0", ["map.yaml:3: safety.supply.lowest = 14.0", "supply.highest"]),
     (
-        "robot: rig",
-        "robot: ../rig",
-        r"map.yaml:1: robot = '../rig': names the folder of results; use .* such as '_rig'",
+        "run_up: 20",
+        "stop_time: 0.001",
+        ["map.yaml:3: safety.stop_time = 0.001", "kinds.joint", "3000 rad/s²", "0.0015"],
     ),
-    ("robot: rig", "robot: ''", r"map.yaml:1: robot = '': names the folder of results; .* such as 'unnamed'"),
-    ("run_up: 20", "temperature_max: 500", r"map.yaml:3: safety.temperature_max = 500: a MX-106 goes limp at 80 °C"),
-    ("lowest: 10.5", "lowest: 5.0", r"safety.supply.lowest = 5.0: a MX-106 does not work below 9.5 V"),
-    ("highest: 14.0", "highest: 24.0", r"safety.supply.highest = 24.0: a MX-106 does not work above 16 V"),
-    ("lowest: 10.5", "lowest: 14.0", r"safety.supply.lowest = 14.0: is not below supply.highest"),
-    ("run_up: 20", "stop_time: 0.001", r"safety.stop_time = 0.001: stops kinds.joint with 3000 rad/s², above"),
-    ("rate: 100", "rate: 100, latency: 0.3", r"bus.latency = 0.3: is not below safety.watchdog"),
-    ("velocity: 3.0", "velocity: 30.0", r"kinds.joint.limits.velocity = 30.0: a MX-106 turns this joint at 5.81 rad/s"),
-    ("torque: 6.0", "torque: 60.0", r"kinds.joint.limits.torque = 60.0: a MX-106 stalls at 10.4 N m here"),
-    ("torque: 1.8", "torque: 6.0", r"kinds.wheel.limits.torque = 6.0: a MX-28 stalls at 3.08 N m here"),
-    ("[-60, 60]", "[-600, 60]", r"kinds.joint.limits.position_deg.*: position mode knows one turn of the servo, 360°"),
-    ("error: 0.2", "error: 2.0", r"kinds.joint.following_error = 2.0: is more than 1 rad"),
-    ("error: 1.0", "error: 9.0", r"kinds.wheel.following_error = 9.0: is more than limits.velocity"),
+    ("rate: 100", "rate: 100, latency: 0.3", ["map.yaml:2: bus.latency = 0.3", "safety.watchdog"]),
+    ("velocity: 3.0", "velocity: 30.0", ["map.yaml:9: kinds.joint.limits.velocity = 30.0", "MX-106", "5.81 rad/s"]),
+    ("torque: 6.0", "torque: 60.0", ["map.yaml:9: kinds.joint.limits.torque = 60.0", "MX-106", "10.4 N m"]),
+    ("torque: 1.8", "torque: 6.0", ["map.yaml:15: kinds.wheel.limits.torque = 6.0", "MX-28", "3.08 N m"]),
+    ("[-60, 60]", "[-600, 60]", ["map.yaml:9: kinds.joint.limits.position_deg", "360°"]),
+    ("error: 0.2", "error: 2.0", ["map.yaml:10: kinds.joint.following_error = 2.0", "1 rad"]),
+    ("error: 1.0", "error: 9.0", ["map.yaml:16: kinds.wheel.following_error = 9.0", "limits.velocity"]),
 ]
-MISTAKES += ABSURD
-# What ties entries together, or to a data sheet, is beyond a schema.
-UNSEEN = ("is also the ID of", "is not one of joint, wheel", "is not below", "not YAML", *(row[2] for row in ABSURD))
 
 
 def test_values_just_within_the_bounds_load(write_map) -> None:
@@ -212,10 +190,10 @@ def test_values_just_within_the_bounds_load(write_map) -> None:
 def test_a_gear_moves_what_a_joint_can_do(write_map) -> None:
     """Ten servo turns to a joint turn: a tenth of the speed, ten times the torque, 36° in a turn of the servo."""
     load_servo_map(write_map(("error: 0.2", "error: 0.2\n    gear: 1.9")))
-    with pytest.raises(ServoMapError, match=r"turns this joint at 0\.581 rad/s"):
+    with raises(ServoMapError, "kinds.joint.limits.velocity = 3.0", "0.581 rad/s"):
         load_servo_map(write_map(("error: 0.2", "error: 0.2\n    gear: 10")))
     slow = ("[-60, 60], velocity: 3.0, torque: 6.0", "[-60, 60], velocity: 0.5, torque: 100")
-    with pytest.raises(ServoMapError, match="36° of this joint"):
+    with raises(ServoMapError, "kinds.joint.limits.position_deg", "36°"):
         load_servo_map(write_map(("error: 0.2", "error: 0.2\n    gear: 10"), slow))
     slow = (slow[0], slow[1].replace("60", "18"))
     servo_map = load_servo_map(write_map(("error: 0.2", "error: 0.2\n    gear: 10"), slow))
@@ -237,23 +215,23 @@ def test_the_schema_is_one_and_every_shipped_map_follows_it(write_map) -> None:
         assert invalid(path) == []
 
 
-@pytest.mark.parametrize(("old", "new", "message"), MISTAKES)
-def test_mistakes_are_named_with_file_and_line(write_map, old: str, new: str, message: str) -> None:
+@pytest.mark.parametrize(("old", "new", "names"), MISTAKES + TIED)
+def test_mistakes_are_named_with_file_and_line(write_map, old: str, new: str, names: list[str]) -> None:
     """The schema refuses them too, where it can."""
     path = write_map((old, new))
-    with pytest.raises(ServoMapError, match=message):
+    with raises(ServoMapError, *names):
         load_servo_map(path)
-    assert any(words in message for words in UNSEEN) or invalid(path)
+    assert (old, new, names) in TIED or invalid(path)
 
 
 def test_missing_empty_and_binary_files(tmp_path: Path) -> None:
-    with pytest.raises(ServoMapError, match="no such file"):
+    with raises(ServoMapError, "nowhere.yaml"):
         load_servo_map(tmp_path / "nowhere.yaml")
     (tmp_path / "empty.yaml").touch()
-    with pytest.raises(ServoMapError, match="expected a mapping"):
+    with raises(ServoMapError, "empty.yaml", "robot, bus, safety, lifts, kinds, servos"):
         load_servo_map(tmp_path / "empty.yaml")
     (tmp_path / "binary.yaml").write_bytes(b"\x89HDF\r\n\x1a\n\xff")
-    with pytest.raises(ServoMapError, match=r"binary.yaml:1: byte 0x89 is not UTF-8"):
+    with raises(ServoMapError, "binary.yaml:1", "0x89"):
         load_servo_map(tmp_path / "binary.yaml")
 
 
@@ -271,14 +249,14 @@ def test_calibration_writes_zero_ticks_and_keeps_the_rest(rig, write_map) -> Non
 def test_calibration_refuses_torque_movement_and_impossible_zeros(rig, write_map) -> None:
     run = rig.prepare()
     run.line.servos.write(1, 64, b"\1")
-    with pytest.raises(VerificationFailed, match="torque is on"):
+    with raises(VerificationFailed, "shoulder (ID 1)", "dynsim hw stop"):
         read_zero_ticks(run.replay.bus, rig.map.servos[:2])
     run = rig.prepare()
     run.line.servos.plant.velocity[0] = 2.0
-    with pytest.raises(VerificationFailed, match="shoulder moves"):
+    with raises(VerificationFailed, "shoulder", "2116", "2149"):
         read_zero_ticks(run.replay.bus, rig.map.servos[:2])
     path = write_map()
     before = path.read_text(encoding="utf-8")
-    with pytest.raises(ServoMapError, match="position mode ends at 0 and 4095"):
+    with raises(ServoMapError, "shoulder", "200", "-483", "883", "0", "4095"):
         write_into_map(load_servo_map(path), "zero_tick", {"shoulder": 200}, path)
     assert path.read_text(encoding="utf-8") == before

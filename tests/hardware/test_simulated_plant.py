@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from support.documented_arm import plant
+from support.messages import lines_with, raises
 
 import dynsim
 from dynsim import cli
@@ -410,15 +411,15 @@ def test_a_posture_in_ticks_starts_on_the_floor_and_a_deeper_one_is_refused(capl
         np.testing.assert_allclose(after[gap < 0.0], 0.0, rtol=0, atol=1e-9)
         assert (after > -1e-9).all()
         assert np.abs(arm.joint_positions - seen).max() < START_CHANGE
-        assert ("contact points on their surfaces" in caplog.text) == bool((gap < 0.0).any())
+        assert bool(lines_with(caplog.text, "rad")) == bool((gap < 0.0).any())
         caplog.clear()
     assert deepest < -1e-4
-    with pytest.raises(ModelError, match=r"elbow_4: its point starts -0\.0\d+ m from surface 'floor'"):
+    with raises(ModelError, "elbow_4", re.compile(r"-0\.0\d+ m\b"), "floor"):
         simulated_arm(str(ARM), "two_elbows", servo_map, {"joint_2": float(start[1]) + 0.05})
 
 
 def test_a_map_of_other_joints_is_refused(rig) -> None:
-    with pytest.raises(ServoMapError, match="has servos for shoulder, elbow, wheel; the plant's joints are joint_1"):
+    with raises(ServoMapError, "shoulder, elbow, wheel", "joint_1"):
         simulated_arm(str(SCENARIOS / "elbow_comparison.yaml"), "two_elbows", rig.map, {})
 
 

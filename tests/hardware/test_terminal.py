@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import pty
+import re
 import signal
 import subprocess
 import time
@@ -13,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.messages import check_message, lines_with, says
 from support.processes import wait_for
 
 from dynsim.hardware.replay.output import PART, ReplayState
@@ -53,7 +55,7 @@ class Terminal:
             preexec_fn=enter,
         )
         os.close(slave)
-        wait_for(lambda: "REPLAY         enter" in servos.log or self.process.poll() is not None)
+        wait_for(lambda: lines_with(servos.log, "REPLAY") or self.process.poll() is not None)
         assert self.process.poll() is None, os.read(self.master, 65536).decode(errors="replace")
 
     def close(self) -> None:
@@ -101,7 +103,7 @@ def test_a_window_that_is_closed_is_a_controlled_stop(servos: Servos) -> None:
 def test_a_terminal_that_is_held_does_not_delay_the_motion(servos: Servos) -> None:
     terminal = Terminal(servos, controls=False)
     os.write(terminal.master, b"\x13")  # Ctrl-S: from here on every write waits
-    wait_for(lambda: "SETTLE         enter" in servos.log.split("REPLAY         enter")[1])
+    wait_for(lambda: lines_with(servos.log[servos.log.index(" REPLAY ") :], "SETTLE"))
     terminal.close()
     assert terminal.end() == 1
     # The bar, too, where it was still waiting at the end.
@@ -150,7 +152,7 @@ def test_nohup_is_heeded(servos: Servos) -> None:
         process = subprocess.Popen(
             ["nohup", *servos.replay("--live", "--yes", "--speed", "0.4")], stdin=file, stdout=file, stderr=file
         )
-    wait_for(lambda: "REPLAY         enter" in servos.log)
+    wait_for(lambda: lines_with(servos.log, "REPLAY"))
     process.send_signal(signal.SIGHUP)
     assert process.wait(120) == 0, out.read_text()
     assert completed(servos) == {}
@@ -169,11 +171,11 @@ def test_a_killed_replay_keeps_its_cycles(servos: Servos) -> None:
     assert f"dynsim hw recover {folder}" in " ".join(plot.stderr.split())
     recovery = subprocess.run(command("hw", "recover", folder), capture_output=True, text=True, check=False)
     assert recovery.returncode == 0, recovery.stderr
-    assert ", incomplete: " in recovery.stdout
+    assert says(recovery.stdout, "incomplete")
     recovered = Record.load(folder / "measured.h5")
     again = subprocess.run(command("hw", "recover", folder), capture_output=True, text=True, check=False)
     assert again.returncode == 2
-    assert "nothing to recover" in again.stderr
+    check_message(again.stderr, re.compile("^error: "), PART)
     assert not recovered.complete
     assert recovered["state"][-1] == ReplayState.REPLAY
     assert np.isfinite(recovered["record_time"][-1])

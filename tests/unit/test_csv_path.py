@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 from pydantic import ValidationError
+from support.messages import raises
 
 from dynsim.library.paths.csv import Config
 
@@ -39,24 +41,24 @@ def test_a_path_goes_through_its_rows_and_rests_beyond_them(content: str, tmp_pa
 )
 def test_what_is_no_decimal_number_is_refused_with_its_line(cell: str, tmp_path: Path) -> None:
     """Python alone would take the first three for numbers."""
-    with pytest.raises(ValidationError, match=r"path.csv:3: .* is not 4 numbers"):
+    with raises(ValidationError, "path.csv:3", "4"):
         path_of(tmp_path, f"{HEADER}0,1,2,3\n1,{cell},2,3\n")
 
 
 @pytest.mark.parametrize(
-    ("content", "message"),
+    ("content", "names"),
     [
-        (HEADER + "0,1,2,3\n1,1,2,3\n1,1,2,3\n", r"path.csv:4: t_s = 1 after 1; it must increase"),
-        (HEADER + "0,1,2,3\n", "1 rows below the header"),
-        ("time,x,y,z\n0,1,2,3\n", "path.csv:1: the first line is 'time,x,y,z'"),
-        (HEADER + "0,1,2,3\n0.1,1e308,2,3\n0.2,-1e308,2,3\n", "numbers too large"),
-        (HEADER + "0,1,2,3\n5e-324,1,3,3\n", "too close in time"),
-        (HEADER.encode() + b"0,1,2,3\n1,1,\xff2,3\n", r"path.csv:3: byte 0xff is not UTF-8"),
-        (b"\x1b[31m" * 50, r"the first line is '.{1,130}…'; it must be"),
+        (HEADER + "0,1,2,3\n1,1,2,3\n1,1,2,3\n", ("path.csv:4", "t_s = 1", "1")),
+        (HEADER + "0,1,2,3\n", ("path.csv", "1")),
+        ("time,x,y,z\n0,1,2,3\n", ("path.csv:1", "'time,x,y,z'", "t_s,x_m,y_m,z_m")),
+        (HEADER + "0,1,2,3\n0.1,1e308,2,3\n0.2,-1e308,2,3\n", ("path.csv",)),
+        (HEADER + "0,1,2,3\n5e-324,1,3,3\n", ("path.csv",)),
+        (HEADER.encode() + b"0,1,2,3\n1,1,\xff2,3\n", ("path.csv:3", "0xff")),
+        (b"\x1b[31m" * 50, ("path.csv:1", re.compile(r"'.{1,130}…'"), "t_s,x_m,y_m,z_m")),
     ],
 )
-def test_a_table_without_a_path_is_refused(content: str | bytes, message: str, tmp_path: Path) -> None:
-    with pytest.raises(ValidationError, match=message) as refused:
+def test_a_table_without_a_path_is_refused(content: str | bytes, names: tuple, tmp_path: Path) -> None:
+    with raises(ValidationError, *names) as refused:
         path_of(tmp_path, content)
     assert "\x1b" not in str(refused.value)
 

@@ -13,6 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
+from support.messages import lines_with, mentions, raises, says
 
 import dynsim
 from dynsim.draw import figures
@@ -162,7 +163,7 @@ def test_drawing_leaves_matplotlib_settings_alone(pendulum: Record, tmp_path: Pa
 def test_a_record_of_signals_that_nobody_draws_is_refused(tmp_path: Path) -> None:
     record = Record([0.0, 1.0])
     record.add("pressure", [1.0, 2.0], "Pa")
-    with pytest.raises(RecordError, match="no figures for a record of these signals: pressure"):
+    with raises(RecordError, "pressure"):
         figures.draw(record, tmp_path)
 
 
@@ -187,14 +188,14 @@ def test_figures_as_pdf_and_svg(pendulum: Record, tmp_path: Path, kind: str, sta
 
 def test_a_folder_that_cannot_be_written_is_a_record_error(pendulum: Record, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(RecordError, match="cannot write"):
+    with raises(RecordError, "file"):
         figures.draw(pendulum, tmp_path / "file")
 
 
 def test_contact_figure_states_the_pulling_fraction(braced: Record) -> None:
     figure = drawn(contacts.forces(braced))
     for contact in braced.summary["contacts"]:
-        assert f"{contact['name']}: pulling {100 * contact['pulling_fraction']:.1f} % of the run" in texts(figure)
+        assert lines_with(texts(figure), contact["name"], f"{100 * contact['pulling_fraction']:.1f} %")
     # elbow 4 is the brace that the floor would have to hold down.
     assert braced.summary["contacts"][0]["pulling_fraction"] > 0.8
     lines = figure.axes[-1].get_lines()
@@ -208,7 +209,7 @@ def test_contact_figures_show_the_extremes_of_all_steps(braced: Record) -> None:
             levels = [line.get_ydata()[0] for line in axes.get_lines() if len(line.get_xdata()) == 2]
             assert {low, high} <= set(levels)
             assert axes.get_ylim()[0] < low < high < axes.get_ylim()[1]
-        assert "sampled every 5 ms" in figure.axes[-1].get_xlabel()
+        assert mentions(figure.axes[-1].get_xlabel(), "5 ms")
 
 
 def test_ledger_stack_adds_up_to_the_electrical_energy(braced: Record) -> None:
@@ -264,7 +265,7 @@ def test_target_that_is_held_is_a_mark(braced: Record) -> None:
 
 
 def test_tracking_error_states_the_rms_of_the_summary(braced: Record) -> None:
-    assert f"rms {1e3 * braced.summary['hand_error_rms_m']:.3g} mm" in texts(drawn(energy.error(braced)))
+    assert mentions(texts(drawn(energy.error(braced))), f"{1e3 * braced.summary['hand_error_rms_m']:.3g} mm")
 
 
 def test_every_variant_has_its_colour_everywhere(braced: Record, free: Record) -> None:
@@ -283,7 +284,7 @@ def test_many_motors_are_an_envelope_and_the_largest(braced: Record) -> None:
     for name, unit in (("current", "A"), ("voltage", "V")):
         record.add(name, values, unit, labels=tuple(f"joint_{k}" for k in range(count)))
     shown = texts(drawn(energy.motors(record))).splitlines()
-    assert shown == ["all 40 motors", *(f"joint_{k}" for k in range(34, 40))]
+    assert (lines_with(shown[0], "40"), shown[1:]) == ([shown[0]], [f"joint_{k}" for k in range(34, 40)])
 
 
 def test_transient_has_a_panel_and_the_rest_its_own_range() -> None:
@@ -483,10 +484,10 @@ def test_real_contacts_have_bands_that_end_at_their_events(real: Record) -> None
 
 def test_real_contact_figure_names_modes_and_marks_events(real: Record) -> None:
     figure = drawn(contacts.forces(real))
-    assert "surface pulls" not in texts(figure)
+    assert not says(texts(figure), "pulls")
     for contact in real.summary["contacts"]:
-        assert f"{contact['name']}: closed {100 * contact['closed_fraction']:.1f} % of the run" in texts(figure)
-        assert f"slides {100 * contact['sliding_fraction']:.1f} %" in texts(figure)
+        assert lines_with(texts(figure), contact["name"], f"{100 * contact['closed_fraction']:.1f} %")
+        assert lines_with(texts(figure), f"{100 * contact['sliding_fraction']:.1f} %", phrase="slides")
     kinds = {event.kind for event in real.events}
     assert {"lift_off", "landing"} <= kinds
     explained = figure.axes[-1].get_xlabel()
@@ -604,15 +605,15 @@ def test_contacts_that_never_touch_are_not_drawn(real: Record) -> None:
     assert {axes.get_ylabel().split("\n")[0] for axes in mixed.axes} - {""} == {
         "elbow_4", "elbow_7", "joint_4", "joint_7",
     }  # fmt: skip
-    assert "surface pulls" not in texts(mixed)
+    assert not says(texts(mixed), "pulls")
 
 
 @pytest.mark.long
 def test_glued_beside_real(real: Record, braced: Record, tmp_path: Path) -> None:
     figure = drawn(contacts.forces_comparison({"glued": braced, "real": real}))
-    assert "glued: pulling" in texts(figure)
-    assert "real: closed" in texts(figure)
-    assert "surface pulls" in texts(figure)
+    assert lines_with(texts(figure), "glued")
+    assert lines_with(texts(figure), "real")
+    assert says(texts(figure), "pulls")
     assert_pngs(figures.draw_comparison({"glued": braced, "real": real}, tmp_path), tmp_path, COMPARISONS)
 
 
@@ -627,7 +628,7 @@ def test_drawn_energy_is_a_curve_where_it_differs_from_net(braced: Record, more:
 
 def test_ten_motors_are_an_envelope_and_six(braced: Record) -> None:
     shown = texts(drawn(energy.motors(braced))).splitlines()
-    assert shown[0] == "all 10 motors"
+    assert mentions(shown[0], "10")
     assert len(shown) == 1 + energy.LARGEST
 
 
@@ -647,15 +648,15 @@ def test_what_lies_below_a_surface_is_marked(braced: Record) -> None:
     lowest = -body.segments(len(sunk) - 1)[..., 2].min()
     assert max(penetration.depth.max() for penetration in marked) == pytest.approx(lowest, rel=1e-12)
     assert {penetration.surface for penetration in marked} == {"floor"}
-    assert "below floor, up to" in texts(drawn(posture.posture(sunk)))
-    assert "below" not in texts(drawn(posture.posture(braced)))
+    assert lines_with(texts(drawn(posture.posture(sunk))), "floor", "250 mm")
+    assert not lines_with(texts(drawn(posture.posture(braced))), "floor")
 
 
 @pytest.mark.parametrize(("angle", "read"), [(-1e-9, "0"), (-0.4, "0"), (-30.2, "-30"), (180.0, "180")])
 def test_the_azimuth_of_the_side_plane_has_no_minus_zero(angle: float, read: str) -> None:
     turn = np.radians(angle)
     plane = posture.SidePlane(np.zeros(3), np.array([np.cos(turn), np.sin(turn), 0.0]))
-    assert f"azimuth {read}°" in plane.label
+    assert f" {read}°" in plane.label
 
 
 def test_a_figure_for_a_paper_has_no_title() -> None:
@@ -667,9 +668,9 @@ def test_a_figure_for_a_paper_has_no_title() -> None:
     assert len(bare.axes) == len(titled.axes) > 0
     both = dynsim.figure({"one": record, "two": record}, "compare_energy", title=False)
     assert both.axes
-    with pytest.raises(RecordError, match="no figure 'enrgy' of such a record; figures: hand_path, tracking_error"):
+    with raises(RecordError, "enrgy", "hand_path, tracking_error"):
         dynsim.figure(record, "enrgy")
-    with pytest.raises(RecordError, match="no data for the figure 'base'"):
+    with raises(RecordError, "base"):
         dynsim.figure(record, "base")
-    with pytest.raises(RecordError, match="no records to draw"):
+    with raises(RecordError):
         dynsim.figure({}, "compare_energy")

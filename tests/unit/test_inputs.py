@@ -9,6 +9,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from support.messages import raises
 
 from dynsim.errors import RecordError, ScenarioError
 from dynsim.hardware.errors import ServoMapError
@@ -47,47 +48,47 @@ def test_yaml_becomes_plain_values(text: str, value: object):
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
+    ("text", "names"),
     [
-        ("a: !!python/object:os.system x", ":1: tag '!!python/object:os.system' is not known"),
-        ("a:\n  !!binary eA==", ":2: tag '!!binary' is not known"),
-        ("a: !!set {x}", ":1: tag '!!set' is not known"),
-        ("a: !!omap [x: 1]", ":1: tag '!!omap' is not known"),
-        ("a: !own 1", ":1: tag '!own' is not known"),
-        ("a: 1\n!!merge b: {c: 1}", ":2: tag '!!merge' is not known"),
-        ("!!int 1: 2", ":1: tag '!!int' is not known"),
-        ("a: !!int x", ":1: 'x' is no !!int"),
-        ("a: " + "9" * 5000, ":1: a number of 5000 digits"),
-        ("a: 0x" + "f" * 300, ":1: a number of 302 digits"),
-        ("a: " + "[" * 10_000, f":1: more than {DEPTH_LIMIT} mappings and lists within each other"),
+        ("a: !!python/object:os.system x", "1 !!python/object:os.system"),
+        ("a:\n  !!binary eA==", "2 !!binary"),
+        ("a: !!set {x}", "1 !!set"),
+        ("a: !!omap [x: 1]", "1 !!omap"),
+        ("a: !own 1", "1 !own"),
+        ("a: 1\n!!merge b: {c: 1}", "2 !!merge"),
+        ("!!int 1: 2", "1 !!int"),
+        ("a: !!int x", "1 x !!int"),
+        ("a: " + "9" * 5000, "1 5000"),
+        ("a: 0x" + "f" * 300, "1 302"),
+        ("a: " + "[" * 10_000, f"1 {DEPTH_LIMIT}"),
         (
             "a0: &a0 [1]\n" + "".join(f"a{k}: &a{k} [*a{k - 1}]\n" for k in range(1, 60)),
-            f":50: more than {DEPTH_LIMIT} mappings",
+            f"50 {DEPTH_LIMIT}",
         ),
-        ("a: &self\n  <<: *self", ":2: alias *self is within &self itself"),
-        ("a: &self [*self]", ":1: alias *self is within &self itself"),
-        ("a: *gone", ":1: alias *gone: there is no anchor &gone before it"),
-        ("a: {<<: 1}", ":1: << takes a mapping"),
-        ("b: 1\na: x\x07", ":2: not YAML: character U+0007 is not allowed"),
-        ("a: x\0y", ":1: not YAML: character U+0000"),
-        ('a: "\\x1b[31m"', ":1: character U+001B is not allowed"),
-        ('a: "\\ud800"', ":1: "),
-        ("a: \ud800", ":1: not YAML: character U+D800"),
-        ("a: 1\nb: 2\na: 3", ":3: duplicate key 'a' (first in line 1)"),
-        ("[1]: 2", ":1: a list is no key"),
-        ("{a: 1}: 2", ":1: a mapping is no key"),
-        ("a: 1\n---\nb: 2", ":2: a second document begins"),
-        ("a: [1", ": not YAML: "),
-        ("%YAML 3.0\n---\na: 1", ":1: not YAML: "),
-        ("a: @x", ":1: not YAML: found character"),
-        ("a:\n\tb: 1", ":2: not YAML: a tab; indent with spaces"),
+        ("a: &self\n  <<: *self", "2 *self &self"),
+        ("a: &self [*self]", "1 *self &self"),
+        ("a: *gone", "1 *gone &gone"),
+        ("a: {<<: 1}", "1 <<"),
+        ("b: 1\na: x\x07", "2 U+0007"),
+        ("a: x\0y", "1 U+0000"),
+        ('a: "\\x1b[31m"', "1 U+001B"),
+        ('a: "\\ud800"', "1"),
+        ("a: \ud800", "1 U+D800"),
+        ("a: 1\nb: 2\na: 3", "3 a 1"),
+        ("[1]: 2", "1 list"),
+        ("{a: 1}: 2", "1 mapping"),
+        ("a: 1\n---\nb: 2", "2"),
+        ("a: [1", "YAML"),
+        ("%YAML 3.0\n---\na: 1", "1 YAML"),
+        ("a: @x", "1 YAML"),
+        ("a:\n\tb: 1", "2 YAML"),
     ],
 )
-def test_every_fault_of_yaml_is_one_line_with_its_place(text: str, message: str):
-    with pytest.raises(ScenarioError) as caught:
+def test_every_fault_of_yaml_is_one_line_with_its_place(text: str, names: str):
+    with raises(ScenarioError, *names.split()) as caught:
         parse(text)
-    assert str(caught.value).startswith("case.yaml:")
-    assert message in str(caught.value)
+    line = names.split()[0]
+    assert str(caught.value).startswith(f"case.yaml:{line}: " if line.isdigit() else "case.yaml:")
     assert str(caught.value).isprintable()
 
 
@@ -99,7 +100,7 @@ def test_whatever_the_parser_stumbles_over_is_an_error_of_the_text(monkeypatch: 
         yield
 
     monkeypatch.setattr(YAML, "parse", stumble)
-    with pytest.raises(ScenarioError, match=r"^case.yaml: not YAML: string index out of range$"):
+    with raises(ScenarioError, "string index out of range"):
         parse("a: 1")
 
 
@@ -109,7 +110,7 @@ def test_aliases_are_copies_of_a_bounded_number():
     assert shared["y"] == {"a": [1]}
     # Every line holds ten of the line before it: 10^9 values.
     bomb = "a0: &a0 1\n" + "".join(f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 10)}]\n" for k in range(1, 10))
-    with pytest.raises(ScenarioError, match=f"case.yaml:\\d+: more than {NODE_LIMIT:,} values".replace(",", " ")):
+    with raises(ScenarioError, re.compile(r"^case\.yaml:\d+: "), f"{NODE_LIMIT:,}".replace(",", " ")):
         parse(bomb)
 
 
@@ -130,30 +131,30 @@ def special_files(folder: Path) -> dict[str, Path]:
     with socket.socket(socket.AF_UNIX) as server:
         server.bind(os.path.relpath(folder / "socket"))
     return {
-        "is a pipe": folder / "pipe",
-        "is a device or socket": folder / "socket",
-        "is a device": Path("/dev/zero"),
-        "is a folder": folder,
+        "pipe": folder / "pipe",
+        "socket": folder / "socket",
+        "device": Path("/dev/zero"),
+        "folder": folder,
         "File name too long": folder / ("x" * 300),
-        "no such": folder / "missing" / "file",
-        "cannot be the name of a file": folder / "a\0b",
+        "missing/file": folder / "missing" / "file",
+        r"a\x00b": folder / "a\0b",
     }
 
 
 def test_only_regular_files_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)  # names of sockets are short
-    for expected, path in special_files(tmp_path).items():
-        with pytest.raises(ScenarioError, match=expected):
+    for name, path in special_files(tmp_path).items():
+        with raises(ScenarioError, name):
             find_scenario(path)
-        with pytest.raises(RecordError, match=expected):
+        with raises(RecordError, name):
             Record.load(path)
-        with pytest.raises(ServoMapError, match=expected):
+        with raises(ServoMapError, name):
             load_servo_map(path)
-        with pytest.raises(ServoMapError, match=expected):
+        with raises(ServoMapError, name):
             load_fault_script(path)
-        with pytest.raises(ScenarioError, match=f"controller.hand.path.file|controller.hand.path: .*{expected}"):
+        with raises(ScenarioError, re.compile(rf"controller\.hand\.path(\.file|: .*{re.escape(name)})")):
             load_scenario("elbow_comparison", overrides={"controller.hand.path": {"type": "csv", "file": str(path)}})
-        with pytest.raises(Exception, match=expected):
+        with raises(Exception, name):
             build_model(load_scenario("six_axis_arm", overrides={"plant.file": str(path)}))
 
 
@@ -163,7 +164,7 @@ def test_a_file_that_may_not_be_looked_up_is_refused(tmp_path: Path, monkeypatch
         raise PermissionError(13, "Permission denied")
 
     monkeypatch.setattr("dynsim.system.inputs.os", SimpleNamespace(stat=refuse))
-    with pytest.raises(ScenarioError, match=r"cannot be read \(Permission denied\)"):
+    with raises(ScenarioError, "case.yaml", "Permission denied"):
         check_file(tmp_path / "closed" / "case.yaml", ScenarioError)
     # The name of a shipped scenario still means it.
     assert find_scenario("single_pendulum").name == "single_pendulum.yaml"
@@ -173,7 +174,7 @@ def test_a_file_is_read_up_to_a_size(tmp_path: Path):
     path = tmp_path / "case.yaml"
     with path.open("wb") as file:
         file.truncate(SIZE_LIMIT + 1)
-    with pytest.raises(ScenarioError, match=re.escape(f"is larger than {SIZE_LIMIT / 1e6:g} MB")):
+    with raises(ScenarioError, "case.yaml", f"{SIZE_LIMIT / 1e6:g} MB"):
         read_text(path, ScenarioError)
 
 

@@ -8,6 +8,7 @@ import jsonschema
 import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
+from support.messages import raises
 
 from dynsim.compile.model import Model
 from dynsim.engine import check
@@ -151,51 +152,50 @@ def test_a_payload_without_mass_adds_nothing(tmp_path: Path, shape: str) -> None
 
 
 @pytest.mark.parametrize(
-    ("load", "expected"),
+    ("load", "names"),
     [
-        ("{type: constant, body: link_9}", "case.yaml:6: loads.push.body: no body 'link_9'; did you mean 'link_"),
-        ("{type: payload, body: link_9, mass_kg: 1}", "case.yaml:6: loads.push.body: no body 'link_9'"),
-        ("{type: constnat, body: link_1}", "case.yaml:6: loads.push.type: unknown type 'constnat'; did you mean"),
-        ("{type: constant, body: link_1, force: [1, 0, 0]}", "loads.push.force: unknown key; did you mean 'force_N'?"),
-        ("{type: constant, body: link_1, force_N: [1, 0]}", "case.yaml:6: loads.push.force_N: "),
-        ("{type: constant, body: link_1, frame: tool}", "loads.push.frame = 'tool': "),
-        ("{type: samples, body: link_1, times_s: [0, 1]}", "loads.push: has neither force_N nor torque_N_m"),
+        ("{type: constant, body: link_9}", "case.yaml:6: loads.push.body link_9"),
+        ("{type: payload, body: link_9, mass_kg: 1}", "case.yaml:6: loads.push.body link_9"),
+        ("{type: constnat, body: link_1}", "case.yaml:6: loads.push.type constnat constant"),
+        ("{type: constant, body: link_1, force: [1, 0, 0]}", "case.yaml:6: loads.push.force force_N"),
+        ("{type: constant, body: link_1, force_N: [1, 0]}", "case.yaml:6: loads.push.force_N"),
+        ("{type: constant, body: link_1, frame: tool}", "case.yaml:6: loads.push.frame 'tool'"),
+        ("{type: samples, body: link_1, times_s: [0, 1]}", "case.yaml:6: loads.push force_N torque_N_m"),
         (
             "{type: samples, body: link_1, times_s: [0, 1], force_N: [[0, 0, 0]]}",
-            "loads.push.force_N: 1 vectors and 2 times_s: there must be as many",
+            "case.yaml:6: loads.push.force_N 1 2 times_s",
         ),
         (
             "{type: samples, body: link_1, times_s: [1, 1], force_N: [[0, 0, 0], [0, 0, 0]]}",
-            "loads.push.times_s: must increase",
+            "case.yaml:6: loads.push.times_s",
         ),
-        ("{type: csv, body: link_1, file: steep.csv}", "steep.csv: numbers too large, or samples too close in time"),
-        ("{type: payload, body: link_1}", "loads.push.mass_kg: is missing"),
-        ("{type: payload, body: link_1, mass_kg: -1}", "loads.push.mass_kg = -1: must be "),
-        ("{type: payload, body: link_9, mass_kg: 0}", "case.yaml:6: loads.push.body: no body 'link_9'"),
+        ("{type: csv, body: link_1, file: steep.csv}", "case.yaml:6: loads.push steep.csv"),
+        ("{type: payload, body: link_1}", "case.yaml:6: loads.push.mass_kg"),
+        ("{type: payload, body: link_1, mass_kg: -1}", "case.yaml:6: loads.push.mass_kg -1"),
+        ("{type: payload, body: link_9, mass_kg: 0}", "case.yaml:6: loads.push.body link_9"),
         (
             "{type: payload, body: link_1, mass_kg: 0, inertia_kg_m2: [1, 1, 1]}",
-            "loads.push.inertia_kg_m2: cannot be that of mass_kg = 0",
+            "case.yaml:6: loads.push.inertia_kg_m2 mass_kg 0",
         ),
         (
             "{type: payload, body: link_1, mass_kg: 1, radius_m: 1, inertia_kg_m2: [1, 1, 1]}",
-            "loads.push.inertia_kg_m2: cannot be given together with radius_m",
+            "case.yaml:6: loads.push.inertia_kg_m2 radius_m",
         ),
         (
             "{type: payload, body: link_1, mass_kg: 1, inertia_kg_m2: [1, 1, 3]}",
-            "case.yaml:6: loads.push.inertia_kg_m2: principal moments of inertia",
+            "case.yaml:6: loads.push.inertia_kg_m2",
         ),
-        ("{type: csv, body: link_1, file: none.csv}", "none.csv: no such file"),
-        ("{type: csv, body: link_1, file: bad.csv}", "bad.csv:1: the first line is 't,fx,fy,fz'; it must be 't_s,fx_N"),
-        ("{type: csv, body: link_1, file: row.csv}", "row.csv:3: 5 values; there must be 4: t_s,fx_N,fy_N,fz_N"),
+        ("{type: csv, body: link_1, file: none.csv}", "none.csv"),
+        ("{type: csv, body: link_1, file: bad.csv}", "bad.csv:1 't,fx,fy,fz' t_s,fx_N,fy_N,fz_N"),
+        ("{type: csv, body: link_1, file: row.csv}", "row.csv:3 5 4 t_s,fx_N,fy_N,fz_N"),
     ],
 )
-def test_errors_are_one_line_that_names_the_place(tmp_path: Path, load: str, expected: str) -> None:
+def test_errors_are_one_line_that_names_the_place(tmp_path: Path, load: str, names: str) -> None:
     (tmp_path / "bad.csv").write_text("t,fx,fy,fz\n0,1,2,3\n1,1,2,3\n", encoding="utf-8")
     (tmp_path / "steep.csv").write_text("t_s,fx_N,fy_N,fz_N\n0,1,2,3\n1e-200,1e200,2,3\n1,2,3,4\n", encoding="utf-8")
     (tmp_path / "row.csv").write_text("t_s,fx_N,fy_N,fz_N\n0,1,2,3\n1,1,2,3,4\n", encoding="utf-8")
-    with pytest.raises((ScenarioError, ModelError)) as caught:
+    with raises((ScenarioError, ModelError), *names.split()) as caught:
         check(read(tmp_path, f"  push: {load}\n"))
-    assert expected in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
@@ -212,7 +212,7 @@ def test_a_resolved_scenario_has_its_loads_and_no_key_without_them(tmp_path: Pat
 
 def test_a_kinematic_plant_takes_no_loads() -> None:
     load = {"type": "constant", "body": "head", "force_N": [1, 0, 0]}
-    with pytest.raises(ModelError, match=r"snake_circle.*: plant 'snake' \(kinematic\) takes no loads"):
+    with raises(ModelError, "snake_circle.yaml", "snake", "kinematic"):
         check(load_scenario("snake_circle", overrides={"loads": {"push": load}}))
 
 

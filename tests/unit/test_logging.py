@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import logging
+import re
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from support.messages import check_message, lines_with
 
 import dynsim
 from dynsim.errors import SimulationStopped
@@ -27,11 +29,13 @@ def test_a_run_logs_what_takes_long_and_its_warnings(caplog: pytest.LogCaptureFi
     }
     messages = [entry.getMessage() for entry in caplog.records if entry.levelno == logging.INFO]
     title = "elbow_comparison (two_elbows): "
-    assert messages[:2] == [f"{title}planning references over 0.3 s", messages[1]]
-    assert messages[1].startswith(f"{title}planned references in 0.")
-    assert messages[-3].split(" in ")[0] in ("loaded the kernels", "compiled the kernels")
-    assert messages[-2] == f"{title}integrating 0.3 s by radau5"
-    assert messages[-1].startswith(f"{title}integrated 0.3 s in {record.summary['steps']} steps, ")
+    planning, planned, kernels, integrating, integrated = *messages[:2], *messages[-3:]
+    assert all(message.startswith(title) for message in (planning, planned, integrating, integrated))
+    check_message(planning, "0.3 s")
+    check_message(planned, re.compile(r"\b0\.\d+ s$"))
+    check_message(kernels, re.compile(r"\b\d+\.\d s$"))
+    check_message(integrating, "0.3 s", "radau5")
+    check_message(integrated, "0.3 s", str(record.summary["steps"]))
     warned = [entry.getMessage() for entry in caplog.records if entry.levelno == logging.WARNING]
     assert warned == [title + warning for warning in record.summary["warnings"]]
     assert warned
@@ -41,14 +45,16 @@ def test_the_snake_logs_too(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO, "dynsim")
     dynsim.simulate(load_scenario("snake_operator", overrides={"duration_s": 0.05}))
     messages = [entry.getMessage() for entry in caplog.records if entry.name == "dynsim.engine.kinematic"]
-    assert messages[-2] == "snake_operator: integrating 0.05 s in 10 control periods"
-    assert messages[-1].startswith("snake_operator: integrated 10 control periods in ")
+    check_message(messages[-2], "snake_operator", "0.05 s", "10")
+    check_message(messages[-1], "snake_operator", "10")
 
 
 def test_a_run_that_stops_logs_why(caplog: pytest.LogCaptureFixture) -> None:
-    with pytest.raises(SimulationStopped):
+    with pytest.raises(SimulationStopped) as stop:
         dynsim.simulate(load_scenario("elbow_comparison", overrides={"integrator.step_max_s": 1e-13}))
-    assert caplog.records[-1].getMessage().startswith("elbow_comparison (two_elbows): incomplete: stopped at t = ")
+    message = caplog.records[-1].getMessage()
+    assert message.startswith("elbow_comparison (two_elbows): ")
+    assert str(stop.value) in message
 
 
 def test_workers_log_in_their_parent(caplog: pytest.LogCaptureFixture) -> None:
@@ -57,7 +63,7 @@ def test_workers_log_in_their_parent(caplog: pytest.LogCaptureFixture) -> None:
     messages = [entry.getMessage() for entry in caplog.records]
     for variant, record in records.items():
         title = f"elbow_comparison ({variant}): "
-        assert f"{title}integrating 0.3 s by radau5" in messages
+        assert lines_with(messages, f"elbow_comparison ({variant})", "0.3 s", "radau5")
         for warning in record.summary["warnings"]:
             assert title + warning in messages
 
@@ -75,6 +81,6 @@ def test_only_verbose_shows_it_and_only_on_stderr(tmp_path: Path, verbose: bool)
     command += ["--quiet", "--set", "duration_s=0.3", "--set", "metrics.settle_s=0.1"]
     result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300, check=True)
     assert result.stdout == ""
-    assert ("INFO elbow_comparison (two_elbows): integrating 0.3 s" in result.stderr) is verbose
-    assert ("WARNING elbow_comparison (two_elbows): elbow_4: the floor pulls" in result.stderr) is verbose
+    assert bool(lines_with(result.stderr, "INFO elbow_comparison (two_elbows)", "0.3 s", "radau5")) is verbose
+    assert bool(lines_with(result.stderr, "WARNING elbow_comparison (two_elbows)", "elbow_4", "floor")) is verbose
     assert bool(result.stderr) is verbose

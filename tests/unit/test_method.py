@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.messages import check_message
 
 from dynsim import Scenario, load_scenario, simulate
 from dynsim.dynamics.derivative import derivative
@@ -55,7 +56,7 @@ def test_the_fastest_rate_is_that_of_the_right_hand_side(variant: str) -> None:
 def test_motors_are_integrated_implicitly_and_the_summary_says_why() -> None:
     record = simulate(shipped("elbow_comparison", "two_elbows"))
     assert record.summary["method"] == "radau5"
-    assert "fastest rate 1.93e+03 1/s, steps of 20 ms" in record.summary["method_reason"]
+    check_message(record.summary["method_reason"], "1.93e+03 1/s", "20 ms")
 
 
 def test_what_is_named_is_taken() -> None:
@@ -69,7 +70,8 @@ def test_passive_systems_keep_their_energy(links: int, rtol: float, within: floa
     """Chains that tumble for 10 s. At the tolerance itself they are off by up to 34 rtol."""
     record = simulate(chain(links, joint={"initial_deg": 120}, integrator={"rtol": rtol}, duration_s=10))
     assert record.summary["method"] == "dopri5"
-    assert record.summary["method_reason"].startswith("no drive and no loss")
+    check_message(record.summary["method_reason"])
+    assert "1/s" not in record.summary["method_reason"]
     assert record.summary["energy_residual_relative"] <= within * rtol
 
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from support.messages import raises
 
 import dynsim
 from dynsim.errors import ModelError, ScenarioError
@@ -89,10 +90,10 @@ def test_a_box_beside_a_snake():
 
 
 def test_names_and_sizes_are_checked():
-    with pytest.raises(ModelError, match=r"objects.link_1: the robot has a body, joint or frame of that name"):
+    with raises(ModelError, "objects.link_1"):
         dynsim.simulate(scene({"link_1": BOX}))
     for name in ("", "world"):
-        with pytest.raises(ModelError, match=f"{name!r} cannot be the name of an object"):
+        with raises(ModelError, "objects", repr(name)):
             dynsim.simulate(scene({name: BOX}))
     for change, says in (({"radius_m": 0.1}, "radius_m"), ({"size_m": None}, "size_m"), ({"mass_kg": 0.0}, "mass_kg")):
         with pytest.raises((ScenarioError, ValueError), match=says):
@@ -209,5 +210,5 @@ def test_candidates_of_the_robot_are_none_of_objects(kind):
 def test_a_tie_with_the_name_of_a_spring_is_refused():
     door = {"mass_kg": 1.0, "size_m": [0.02, 0.4, 0.4], "position_m": [1, 0, 0], "hinge": {"spring_N_m_per_rad": 1.0}}
     tie = {"type": "torsion", "body": "door", "other": "world", "axis": [0, 0, 1], "stiffness_N_m_per_rad": 1.0}
-    with pytest.raises(ModelError, match=r"ties\.door\.spring: an object has a tie of that name"):
+    with raises(ModelError, "ties.door.spring"):
         build.robot(scene({"door": door}, ties={"door.spring": tie}))

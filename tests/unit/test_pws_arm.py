@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.messages import check_message
 
 import dynsim
 from dynsim.cli import main
@@ -50,28 +51,28 @@ def command(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "message"),
+    ("old", "new", "names"),
     [
-        ("track_m: 0.3", "track_m: 0", "5: plant.base.track_m = 0: "),
-        ("track_m: 0.3", "inertia_kg_m2: [1, 0, 0, 1, 0, 5]", "5: plant.base: principal moments of inertia [1. 1. 5.]"),
-        ("[0.15, 0, 0]", "[0, 0.1, 0]", "6: plant.base.caster_m: it lies on the axle's line"),
-        ("[0.15, 0, 0]", "[0.1, 0, 0.2]", "6: plant.base.caster_m: it touches the floor: its third coordinate"),
-        ("radius_m: 0.05", "radius_m: 0", "8: plant.base.wheel.radius_m = 0: "),
-        ("radius_m: 0.05", "inertia_axle_kg_m2: 1", "8: plant.base.wheel.inertia_axle_kg_m2 = 1: 1 about the axle is"),
-        ("type: serial_arm", "type: snake", "11: plant.arm.type: unknown type 'snake'; known: serial_arm, urdf_arm"),
+        ("track_m: 0.3", "track_m: 0", ("5: plant.base.track_m = 0",)),
+        ("track_m: 0.3", "inertia_kg_m2: [1, 0, 0, 1, 0, 5]", ("5: plant.base", "[1. 1. 5.]")),
+        ("[0.15, 0, 0]", "[0, 0.1, 0]", ("6: plant.base.caster_m",)),
+        ("[0.15, 0, 0]", "[0.1, 0, 0.2]", ("6: plant.base.caster_m",)),
+        ("radius_m: 0.05", "radius_m: 0", ("8: plant.base.wheel.radius_m = 0",)),
+        ("radius_m: 0.05", "inertia_axle_kg_m2: 1", ("8: plant.base.wheel.inertia_axle_kg_m2 = 1", "1")),
+        ("type: serial_arm", "type: snake", ("11: plant.arm.type", "snake", "serial_arm, urdf_arm")),
         (
             "type: serial_arm",
             "base: {yaw_deg: 3}\n    type: serial_arm",
-            "11: plant.arm.base: on a mobile base the arm",
+            ("11: plant.arm.base",),
         ),
     ],
 )
-def test_what_no_base_can_be_is_refused_in_one_line(case, old, new, message, monkeypatch, capsys):
+def test_what_no_base_can_be_is_refused_in_one_line(case, old, new, names, monkeypatch, capsys):
     case.write_text(GOOD.replace(old, new))
     assert command(monkeypatch, "check", str(case)) == 2
     said = capsys.readouterr().err
     assert said.startswith("error: ")
-    assert f"case.yaml:{message}" in said
+    check_message(said, f"case.yaml:{names[0]}", *names[1:])
     assert said.count("\n") == 1
 
 
@@ -87,7 +88,7 @@ def test_a_name_of_the_base_in_a_file_is_refused(case, old, name, monkeypatch, c
     urdf(case, ARM.replace(f'"{old}"', f'"{name}"'))
     assert command(monkeypatch, "check", str(case)) == 2
     said = capsys.readouterr().err
-    assert f"case.yaml:10: plant.arm: {name!r} is a name of the mobile base too; rename it in the arm\n" in said
+    check_message(said, "case.yaml:10: plant.arm", repr(name))
 
 
 def test_the_base_carries_what_a_file_fixes_to_its_root(case):

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
+from support.messages import check_message, mentions, raises
 
 import dynsim
 from dynsim.dynamics import tables as ka
@@ -44,9 +44,7 @@ def load(folder: Path, text: str, **overrides: Any) -> Scenario:
 
 
 def test_time_stepping_on_a_mobile_base_is_refused_with_line_and_fix(tmp_path: Path) -> None:
-    with pytest.raises(
-        ModelError, match=r"case\.yaml:5: integrator\.method: a mobile base .*requires integrator\.method: auto"
-    ):
+    with raises(ModelError, "case.yaml:5", "integrator.method: auto", "time_stepping"):
         check(load(tmp_path, BASE + "integrator: {method: time_stepping}\n"))
 
 
@@ -65,21 +63,21 @@ def test_chatter_names_flagged_contacts_else_those_that_changed_else_those_near_
     assert len(names) == 2
     assert law is not None
     said = _reason(scenario, prepared)
-    assert ": a contact opens and closes" in said
+    check_message(said, "0 s", "time_stepping", "integrator.atol")
     assert not any(name in said for name in names)
     prepared.workspace.contacts[1, ka.GAP] = -1e-9
-    assert f"the contact at {names[1]} opens" in _reason(scenario, prepared)
+    assert [name for name in names if mentions(_reason(scenario, prepared), name)] == [names[1]]
     law.mode[0, ku.WANTED] = ka.STICKING
-    assert f"the contact at {names[0]} opens" in _reason(scenario, prepared)
+    assert [name for name in names if mentions(_reason(scenario, prepared), name)] == [names[0]]
     law.tally[1, ku.CHATTERED] = 1.0
-    assert f"the contact at {names[1]} opens" in _reason(scenario, prepared)
+    assert [name for name in names if mentions(_reason(scenario, prepared), name)] == [names[1]]
 
 
 def test_chatter_on_a_mobile_base_does_not_advise_what_is_refused_there(tmp_path: Path) -> None:
     assert "time_stepping" in _reason(*chattering(tmp_path, ARM))
     said = _reason(*chattering(tmp_path, BASE))
     assert "time_stepping" not in said
-    assert said.endswith("take a larger integrator.atol")
+    assert mentions(said, "integrator.atol")
 
 
 def beyond(robot: dynsim.model.description.Robot, degrees: float) -> Record:
@@ -96,14 +94,10 @@ def beyond(robot: dynsim.model.description.Robot, degrees: float) -> Record:
 def test_stops_that_are_enforced_are_not_advised_to_be(tmp_path: Path) -> None:
     robot = build.robot(load(tmp_path, ARM))
     (glued,), (real,) = (warnings._passed_limits(beyond(robot, -10.5), robot, law) for law in (False, True))
-    both = (
-        "joint_1: passes its lower position limit of -10° (-0.1745 rad) by up to 0.5° (0.00873 rad), first at t = 0.5 s"
-    )
-    assert glued == f"{both}; stops are enforced under contacts.law: unilateral"
-    assert real == (
-        f"{both}; it is still 0.5° (0.00873 rad) beyond its stop at the end; "
-        "a shorter integrator.step_s lets it pass less"
-    )
+    both = ("joint_1", "-10°", "-0.1745 rad", "0.5°", "0.00873 rad", "0.5 s")
+    check_message(glued, *both, "contacts.law: unilateral")
+    check_message(real, *both, "integrator.step_s")
+    assert real.count("0.5°") == 2  # it is still beyond its stop at the end
 
 
 def test_a_joint_that_is_back_at_its_stop_is_not_called_beyond(tmp_path: Path) -> None:
@@ -111,10 +105,8 @@ def test_a_joint_that_is_back_at_its_stop_is_not_called_beyond(tmp_path: Path) -
     record = beyond(robot, -10.5)
     record["q"][:] = record["q"][::-1]
     (real,) = warnings._passed_limits(record, robot, True)
-    assert real == (
-        "joint_1: passes its lower position limit of -10° (-0.1745 rad) by up to 0.5° (0.00873 rad), first at t = 0 s; "
-        "time stepping has moved it back to its stop; a shorter integrator.step_s lets it pass less"
-    )
+    check_message(real, "joint_1", "-10°", "-0.1745 rad", "0.5°", "0.00873 rad", "0 s", "integrator.step_s")
+    assert real.count("0.5°") == 1
 
 
 def test_a_fall_of_nanometres_does_not_alarm_the_ledger(tmp_path: Path) -> None:

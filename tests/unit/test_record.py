@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.messages import mentions, raises
 
 from dynsim.engine.recording import save_drive, save_run
 from dynsim.errors import RecordError
@@ -34,9 +35,9 @@ def test_round_trip(record: Record, tmp_path: Path):
 
 
 def test_wrong_length_and_labels_are_refused(record: Record):
-    with pytest.raises(RecordError, match="samples"):
+    with raises(RecordError, "x", "4", "5"):
         record.add("x", np.zeros(4), "m")
-    with pytest.raises(RecordError, match="labels"):
+    with raises(RecordError, "x", "2", "1"):
         record.add("x", np.zeros((5, 2)), "m", labels=("only",))
 
 
@@ -46,29 +47,29 @@ def test_signals_on_further_time_axes(record: Record):
     assert record.times("marker").tolist() == [0.05, 0.4, 0.9]
     assert record.times("q") is record.time
     assert (len(record), record["marker"].shape) == (5, (3, 2))
-    with pytest.raises(RecordError, match="signal 'x' has 5 samples, its time axis 'camera' has 3"):
+    with raises(RecordError, "x", "5", "camera", "3"):
         record.add("x", np.zeros(5), "m", axis="camera")
-    with pytest.raises(RecordError, match="on time axis 'kamera'; this record has: time, camera"):
+    with raises(RecordError, "x", "kamera", "time, camera"):
         record.add("x", np.zeros(3), "m", axis="kamera")
-    with pytest.raises(RecordError, match="no signal 'markr'"):
+    with raises(RecordError, "markr", "marker"):
         record.times("markr")
-    with pytest.raises(RecordError, match="a time axis has that name"):
+    with raises(RecordError, "camera"):
         record.add("camera", np.zeros(5), "m")
 
 
 @pytest.mark.parametrize(
-    ("name", "times", "expected"),
+    ("name", "times", "names"),
     [
-        ("time", [0.0], "taken"),
-        ("q", [0.0], "taken"),
-        ("a/b", [0.0], "slash"),
-        ("late", [0.0, -1.0], "backwards after sample 0"),
-        ("late", [0.0, np.nan], "not finite"),
-        ("late", [[0.0]], "shape"),
+        ("time", [0.0], ("time",)),
+        ("q", [0.0], ("q",)),
+        ("a/b", [0.0], ("a/b",)),
+        ("late", [0.0, -1.0], ("late", "0")),
+        ("late", [0.0, np.nan], ("late", "1")),
+        ("late", [[0.0]], ("late", "(1, 1)")),
     ],
 )
-def test_a_time_axis_that_is_none_is_refused(record: Record, name: str, times: list, expected: str):
-    with pytest.raises(RecordError, match=expected):
+def test_a_time_axis_that_is_none_is_refused(record: Record, name: str, times: list, names: tuple[str, ...]):
+    with raises(RecordError, *names):
         record.add_axis(name, times)
     assert record.axes == {}
 
@@ -81,8 +82,8 @@ def test_events_are_in_the_order_of_their_times(record: Record):
         (0.5, "b", 2.0),
         (0.5, "c", 2.0),
     ]
-    assert "3 events" in repr(record)
-    with pytest.raises(RecordError, match="event 'x' at nan s"):
+    assert mentions(repr(record), "3")
+    with raises(RecordError, "x", "nan s"):
         record.add_event(np.nan, "x")
 
 
@@ -97,7 +98,7 @@ def test_tables_take_one_time_axis_and_data_sets_all(record: Record):
     frame = record.to_dataframe("camera")
     assert list(frame.columns) == ["marker.m.w", "marker.m.x", "marker.m.y", "marker.m.z"]
     assert (frame.index.name, frame.index.tolist()) == ("camera [s]", [0.05, 0.4])
-    with pytest.raises(RecordError, match="no time axis 'kamera'; this record has: time, camera"):
+    with raises(RecordError, "kamera", "time, camera"):
         record.to_dataframe("kamera")
     dataset = record.to_xarray()
     assert dataset["marker"].dims == ("camera", "marker_label", "axis_4")
@@ -106,9 +107,8 @@ def test_tables_take_one_time_axis_and_data_sets_all(record: Record):
 
 
 def test_unknown_signal_lists_what_there_is(record: Record):
-    with pytest.raises(KeyError) as error:
+    with raises(KeyError, "qq", "'q'", "q, force") as error:
         record["qq"]
-    assert str(error.value) == "no signal 'qq' (did you mean 'q'?); this record has: q, force"
     assert isinstance(error.value, RecordError)
 
 
@@ -120,17 +120,17 @@ def test_full_disk_leaves_the_old_record(record: Record, tmp_path: Path, monkeyp
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("os.fsync", fail)
-    with pytest.raises(RecordError, match="No space left"):
+    with raises(RecordError, "record.h5", "No space left on device"):
         record.save(path)
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
 
 
 def test_what_is_no_record_is_refused(tmp_path: Path):
-    with pytest.raises(RecordError, match="no such record"):
+    with raises(RecordError, "none.h5"):
         Record.load(tmp_path / "none.h5")
     (tmp_path / "text.h5").write_text("hello")
-    with pytest.raises(RecordError, match="not a readable HDF5"):
+    with raises(RecordError, "text.h5", "HDF5"):
         Record.load(tmp_path / "text.h5")
 
 
@@ -148,7 +148,7 @@ def test_files_of_a_run_are_replaced_all_or_none(record: Record, tmp_path: Path,
             raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("os.fsync", fail_at_the_third)
-    with pytest.raises(RecordError, match="No space left"):
+    with raises(RecordError, "scenario.yaml", "No space left on device"):
         save_run(record, tmp_path)
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
@@ -156,9 +156,9 @@ def test_files_of_a_run_are_replaced_all_or_none(record: Record, tmp_path: Path,
 def test_files_of_a_run_that_died_while_saving_are_not_taken_for_whole(record: Record, tmp_path: Path):
     save_run(record, tmp_path)
     (tmp_path / INCOMPLETE).touch()  # killed before it could write which files
-    with pytest.raises(RecordError, match=f"record.h5: may be of another run than .*{INCOMPLETE}"):
+    with raises(RecordError, "record.h5", INCOMPLETE):
         Record.load(tmp_path / "record.h5")
-    with pytest.raises(RecordError, match=f"scenario.yaml: may be of another run than .*{INCOMPLETE}"):
+    with raises(RecordError, "scenario.yaml", INCOMPLETE):
         load_scenario(tmp_path / "scenario.yaml")
     save_run(record, tmp_path)
     assert Record.load(tmp_path / "record.h5").summary == record.summary
@@ -172,34 +172,34 @@ def test_thousands_of_labels(tmp_path: Path):
 
 
 def test_what_could_not_be_read_again_is_not_saved(record: Record, tmp_path: Path):
-    for data, expected in (
-        (["a"] * 5, "not real numbers"),
-        (np.zeros(5, dtype=complex), "not real numbers"),
-        (np.zeros((5, 1, 1, 1)), "4 axes"),
-        (0.0, "0 axes"),
+    for data, names in (
+        (["a"] * 5, ("x", "<U1")),
+        (np.zeros(5, dtype=complex), ("x", "complex128")),
+        (np.zeros((5, 1, 1, 1)), ("x", "4")),
+        (0.0, ("x", "0")),
     ):
-        with pytest.raises(RecordError, match=expected):
+        with raises(RecordError, *names):
             record.add("x", data, "m", labels=("a",))
     for name in ("", ".", "a/b"):
-        with pytest.raises(RecordError, match="a name must not"):
+        with raises(RecordError, f"'{name}'"):
             record.add(name, np.zeros(5), "m")
-    with pytest.raises(RecordError, match="runs backwards after sample 1"):
+    with raises(RecordError, "1"):
         Record([0.0, 1.0, 0.5]).save(tmp_path / "record.h5")
-    with pytest.raises(RecordError, match="not finite at sample 1"):
+    with raises(RecordError, "1"):
         Record([0.0, np.nan]).save(tmp_path / "record.h5")
     record.add("x", np.zeros((5, 1)), "m", labels=("a\0b",))
-    with pytest.raises(RecordError, match="signal 'x' cannot be saved"):
+    with raises(RecordError, "x"):
         record.save(tmp_path / "record.h5")
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_record_introduces_itself(record: Record):
-    assert repr(record) == "<Record x: 5 samples, 0 to 1 s, 2 signals (q, force)>"
+    assert mentions(repr(record), "<Record x", "5", "1 s", "2", "(q, force)")
     assert list(record.keys()) == list(record) == ["q", "force"]
     assert set(dict(record)) == {"q", "force"}
     empty = Record([])
     empty.complete = False
-    assert repr(empty) == "<Record 0 samples, 0 signals, incomplete>"
+    assert mentions(repr(empty), "<Record", "0", "incomplete")
 
 
 def test_as_pandas_data_frame(record: Record):
@@ -233,9 +233,8 @@ def test_a_missing_package_is_one_line_with_the_way_out(
     record: Record, monkeypatch: pytest.MonkeyPatch, method: str, package: str
 ):
     monkeypatch.setitem(sys.modules, package, None)
-    with pytest.raises(RecordError) as error:
+    with raises(RecordError, f"pip install {package}"):
         getattr(record, method)()
-    assert str(error.value) == f"{package} is not installed: pip install {package}"
 
 
 def test_a_drive_that_has_no_room_leaves_its_script(tmp_path: Path, simulated, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -245,7 +244,7 @@ def test_a_drive_that_has_no_room_leaves_its_script(tmp_path: Path, simulated, m
         raise RecordError("record.h5: No space left on device")
 
     monkeypatch.setattr("dynsim.engine.recording.replace_together", full)
-    with pytest.raises(RecordError, match=r"No space left.*the script is kept.*dynsim run .*scenario\.yaml"):
+    with raises(RecordError, "record.h5", "No space left on device", "dynsim run", "scenario.yaml"):
         save_drive(record, tmp_path)
     assert [file.name for file in tmp_path.iterdir()] == ["scenario.yaml"]
     assert load_scenario(tmp_path / "scenario.yaml").name == record.provenance["scenario"]["name"]

@@ -16,6 +16,7 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
+from support.messages import raises
 
 from dynsim.errors import RecordError
 from dynsim.record import Record, reader
@@ -97,18 +98,18 @@ def test_one_changed_byte_is_found(tmp_path: Path):
     whole = path.read_bytes()
     offset = whole.index(np.array([7.0, 8.0]).tobytes())
     path.write_bytes(whole[:offset] + b"\x01" + whole[offset + 1 :])
-    with pytest.raises(RecordError, match=r"record.h5: damaged, or changed since .* its digest .*--trust reads it"):
+    with raises(RecordError, "record.h5", "--trust"):
         Record.load(path)
     offset = whole.index(b"dynsim-record")
     path.write_bytes(whole[:offset] + b"D" + whole[offset + 1 :])
-    with pytest.raises(RecordError, match="do not agree with its digest"):
+    with raises(RecordError, "record.h5", "SHA-256"):
         Record.load(path)
 
 
 def test_a_file_without_digest_is_read_where_it_is_trusted(tmp_path: Path):
     path = sample().save(tmp_path / "record.h5")
     path.write_bytes(path.read_bytes()[:-80])
-    with pytest.raises(RecordError, match=r"record.h5: it has no digest .* its end: .*Record.load\(path, trust=True"):
+    with raises(RecordError, "record.h5", "SHA-256", "trust=True"):
         Record.load(path)
     assert same(Record.load(path, trust=True), sample())
 
@@ -117,7 +118,7 @@ def test_a_file_changed_by_another_program_is_read_where_it_is_trusted(tmp_path:
     path = sample().save(tmp_path / "record.h5")
     with h5py.File(path, "r+") as file:
         file["signals/q"][0, 0] = 42.0
-    with pytest.raises(RecordError, match="--trust reads it"):
+    with raises(RecordError, "record.h5", "--trust"):
         Record.load(path)
     assert Record.load(path, trust=True)["q"][0, 0] == 42.0
 
@@ -126,7 +127,7 @@ def test_another_format_is_named(tmp_path: Path):
     path = sample().save(tmp_path / "record.h5")
     with h5py.File(path, "r+") as file:
         file.attrs["format"] = "dynsim-record-1"
-    with pytest.raises(RecordError, match="of another format, 'dynsim-record-1'; this version of dynsim reads dynsim-"):
+    with raises(RecordError, "dynsim-record-1", "dynsim-record-2"):
         Record.load(path, trust=True)
 
 
@@ -226,91 +227,97 @@ def many_labels(file: h5py.File, _: Path) -> None:
 
 
 FOREIGN: list[tuple[Change, str]] = [
-    (attribute("/", "format", "dynsim-record-9"), "of another format"),
-    (attribute("/", "format", np.arange(3)), "not a dynsim record"),
-    (attribute("/", "complete", None), "lacks parts: no attribute complete"),
-    (attribute("/", "complete", "yes"), "neither true nor false"),
-    (removed("time"), "lacks parts: no time"),
-    (removed("summary"), "lacks parts: no summary"),
-    (replaced("time", "soon"), "not real numbers"),
-    (replaced("time", 1.0), "must have one axis"),
-    (replaced("time", np.zeros((5, 1))), "must have one axis"),
-    (replaced("time", [0.0, 0.25, np.nan, 0.75, 1.0]), "not finite at sample 2"),
-    (replaced("time", [0.0, 0.25, np.inf, 0.75, 1.0]), "not finite at sample 2"),
-    (replaced("time", [0.0, 0.25, 0.2, 0.75, 1.0]), "backwards after sample 1"),
-    (replaced("time", np.arange(4.0)), "samples, the record has 4"),
-    (replaced("time", h5py.Empty("f8")), "empty"),
-    (replaced("summary", 3.0), "summary is not a text"),
-    (replaced("summary", ["{}"]), "summary is not a text"),
-    (replaced("summary", "{"), "summary is not JSON"),
-    (replaced("summary", "[1]"), "summary is list, not a mapping"),
-    (replaced("summary", "[" * 100_000), "summary is not JSON"),
-    (replaced("summary", "1" * 5000), "summary is not JSON"),
-    (replaced("provenance", "null"), "provenance is NoneType, not a mapping"),
-    (replaced("provenance", b"\xff\xfe"), "not a text|can't decode"),
-    (replaced("signals", 1.0), "group signals is no group"),
-    (replaced("signals/q", "text"), "not real numbers"),
-    (replaced("signals/q", np.zeros((5, 2), dtype=complex)), "not real numbers"),
-    (replaced("signals/q", np.zeros((5, 2), dtype=[("x", "f8")])), "not real numbers"),
-    (replaced("signals/q", np.zeros((4, 2))), "has 4 samples"),
-    (replaced("signals/q", np.zeros((5, 3))), "3 columns and 2 labels"),
-    (replaced("signals/q", np.zeros((5, 2, 1, 1))), "4 axes"),
-    (replaced("signals/q", np.zeros((5, 2)), labels=[1.0, 2.0]), "labels that are no texts"),
-    (replaced("signals/q", np.zeros((5, 2)), labels=[["a", "b"]]), "labels that are no list"),
-    (replaced("signals/q", np.zeros((5, 2)), unit=3), "no text as unit"),
-    (nested, "signal 'q' is no data set"),
-    (attribute("signals/q", "unit", None), "no text as unit"),
-    (attribute("signals/q", "labels", None), "lacks parts: no labels"),
-    (attribute("signals/q", "labels", h5py.Empty("f8")), "labels that are no list"),
-    (attribute("signals/q", "description", [1, 2]), "no text as description"),
-    (external, "is a link to somewhere else"),
-    (soft, "is a link to somewhere else"),
-    (soft_group, "is a link to somewhere else"),
-    (circle, "is no data set"),
-    (raw_file, "lies in other files"),
-    (virtual, "lies in other files"),
-    (bomb, "would unpack to"),
-    (no_gzip, "not a readable HDF5 file"),
-    (huge_contiguous, "claims"),
-    (shuffled, "HDF5 filters"),
-    (type_as_signal, "is no data set"),
-    (many_labels, "labels that are no texts"),
+    (attribute("/", "format", "dynsim-record-9"), "dynsim-record-9 dynsim-record-2"),
+    (attribute("/", "format", np.arange(3)), "HDF5 dynsim-record-2"),
+    (attribute("/", "complete", None), "complete"),
+    (attribute("/", "complete", "yes"), "complete"),
+    (removed("time"), "time"),
+    (removed("summary"), "summary"),
+    (replaced("time", "soon"), "time object"),
+    (replaced("time", 1.0), "time ()"),
+    (replaced("time", np.zeros((5, 1))), "time (5, 1)"),
+    (replaced("time", [0.0, 0.25, np.nan, 0.75, 1.0]), "time 2"),
+    (replaced("time", [0.0, 0.25, np.inf, 0.75, 1.0]), "time 2"),
+    (replaced("time", [0.0, 0.25, 0.2, 0.75, 1.0]), "time 1"),
+    (replaced("time", np.arange(4.0)), "closed 5 4"),
+    (replaced("time", h5py.Empty("f8")), "time"),
+    (replaced("summary", 3.0), "summary"),
+    (replaced("summary", ["{}"]), "summary"),
+    (replaced("summary", "{"), "summary JSON"),
+    (replaced("summary", "[1]"), "summary list"),
+    (replaced("summary", "[" * 100_000), "summary JSON"),
+    (replaced("summary", "1" * 5000), "summary JSON"),
+    (replaced("provenance", "null"), "provenance"),
+    (replaced("provenance", b"\xff\xfe"), ""),
+    (replaced("signals", 1.0), "signals"),
+    (replaced("signals/q", "text"), "q object"),
+    (replaced("signals/q", np.zeros((5, 2), dtype=complex)), "q complex128"),
+    (replaced("signals/q", np.zeros((5, 2), dtype=[("x", "f8")])), "q <f8"),
+    (replaced("signals/q", np.zeros((4, 2))), "q 4 5"),
+    (replaced("signals/q", np.zeros((5, 3))), "q 3 2"),
+    (replaced("signals/q", np.zeros((5, 2, 1, 1))), "q 4"),
+    (replaced("signals/q", np.zeros((5, 2)), labels=[1.0, 2.0]), "q labels"),
+    (replaced("signals/q", np.zeros((5, 2)), labels=[["a", "b"]]), "q labels"),
+    (replaced("signals/q", np.zeros((5, 2)), unit=3), "q unit"),
+    (nested, "q"),
+    (attribute("signals/q", "unit", None), "q unit"),
+    (attribute("signals/q", "labels", None), "q labels"),
+    (attribute("signals/q", "labels", h5py.Empty("f8")), "q labels"),
+    (attribute("signals/q", "description", [1, 2]), "q description"),
+    (external, "q"),
+    (soft, "q"),
+    (soft_group, "signals"),
+    (circle, "again"),
+    (raw_file, "s"),
+    (virtual, "s"),
+    (bomb, "s 43980465111040 2147483648"),
+    (no_gzip, "HDF5"),
+    (huge_contiguous, "time 281474976710656"),
+    (shuffled, "s HDF5 [2]"),
+    (type_as_signal, "s"),
+    (many_labels, "q labels"),
 ]
 
 
 TOLD: list[tuple[Change, str]] = [
-    (replaced("axes", 1.0), "group axes is no group"),
-    (replaced("axes/camera", [0.2, 0.1]), "time axis 'camera' runs backwards"),
-    (replaced("axes/camera", [0.1, 0.2, 0.3]), "has 2 samples, its time axis 'camera' has 3"),
-    (replaced("axes/time", [0.1]), "name of the record's own axis"),
-    (removed("axes/camera"), "is on time axis 'camera'; this record has: time"),
-    (attribute("signals/marker", "axis", "moon"), "is on time axis 'moon'; this record has: time, camera"),
-    (attribute("signals/marker", "axis", 3), "no text as axis"),
-    (replaced("events", 1.0), "group events is no group"),
-    (removed("events/kind"), "lacks parts: no kind of the events"),
-    (replaced("events/time", [0.1]), "kind of the events has 2 entries, their times 1"),
-    (replaced("events/time", [0.1, np.nan]), "time of the events is not finite"),
-    (replaced("events/name", [1.0, 2.0]), "events has name that are no texts"),
-    (replaced("events/value", ["x", "y"]), "not real numbers"),
-    (replaced("scene", 1.0), "scene is not a text"),
-    (replaced("scene", "{"), "scene: Invalid JSON"),
-    (replaced("scene", "[]"), "scene: Input should be an object"),
-    (replaced("scene", "[" * 100_000), "scene: Invalid JSON"),
-    (replaced("scene", '{"points": [{"name": "p", "role": "hand", "body": 0, "position": [0, 0, 0]}]}'), "on body 0"),
-    (replaced("scene", '{"points": [{"name": "p", "role": "x", "body": -1, "position": [0, 0, 0]}]}'), "points.0.role"),
-    (replaced("scene", '{"points": [{"name": "p", "role": "hand", "body": -1, "position": [0, 1]}]}'), "position.2"),
-    (replaced("scene", '{"fixed": [{"kind": "box", "size": [1, 2]}]}'), "a box has 3 numbers as its size, not 2"),
-    (replaced("scene", '{"fixed": [{"kind": "sphere", "size": [NaN]}]}'), "finite number"),
-    (replaced("scene", '{"fixed": [{"kind": "sphere", "size": [1e999]}]}'), "finite number"),
+    (replaced("axes", 1.0), "axes"),
+    (replaced("axes/camera", [0.2, 0.1]), "camera 0"),
+    (replaced("axes/camera", [0.1, 0.2, 0.3]), "marker 2 camera 3"),
+    (replaced("axes/time", [0.1]), "time"),
+    (removed("axes/camera"), "marker camera time"),
+    (attribute("signals/marker", "axis", "moon"), "marker moon time camera"),
+    (attribute("signals/marker", "axis", 3), "marker axis"),
+    (replaced("events", 1.0), "events"),
+    (removed("events/kind"), "kind events"),
+    (replaced("events/time", [0.1]), "kind events 2 1"),
+    (replaced("events/time", [0.1, np.nan]), "time events"),
+    (replaced("events/name", [1.0, 2.0]), "events name"),
+    (replaced("events/value", ["x", "y"]), "value events object"),
+    (replaced("scene", 1.0), "scene"),
+    (replaced("scene", "{"), "scene JSON"),
+    (replaced("scene", "[]"), "scene"),
+    (replaced("scene", "[" * 100_000), "scene JSON"),
+    (replaced("scene", '{"points": [{"name": "p", "role": "hand", "body": 0, "position": [0, 0, 0]}]}'), "p 0"),
+    (
+        replaced("scene", '{"points": [{"name": "p", "role": "x", "body": -1, "position": [0, 0, 0]}]}'),
+        "scene points.0.role",
+    ),
+    (
+        replaced("scene", '{"points": [{"name": "p", "role": "hand", "body": -1, "position": [0, 1]}]}'),
+        "scene points.0.position.2",
+    ),
+    (replaced("scene", '{"fixed": [{"kind": "box", "size": [1, 2]}]}'), "box 3 2"),
+    (replaced("scene", '{"fixed": [{"kind": "sphere", "size": [NaN]}]}'), "scene fixed.0.size.0"),
+    (replaced("scene", '{"fixed": [{"kind": "sphere", "size": [1e999]}]}'), "scene fixed.0.size.0"),
 ]
 
 
-@pytest.mark.parametrize(("change", "expected"), TOLD, ids=itertools.count())
-def test_axes_events_and_scenes_that_are_none_are_refused(tmp_path: Path, change: Change, expected: str):
+@pytest.mark.parametrize(("change", "names"), TOLD, ids=itertools.count())
+def test_axes_events_and_scenes_that_are_none_are_refused(tmp_path: Path, change: Change, names: str):
     path = telling().save(tmp_path / "record.h5")
     with h5py.File(path, "r+") as file:
         change(file, tmp_path)
-    with pytest.raises(RecordError, match=expected) as error:
+    with raises(RecordError, *names.split()) as error:
         reader.decode(path, path)
     assert str(error.value).startswith(f"{path}: ")
     assert "\n" not in str(error.value)
@@ -324,10 +331,10 @@ def foreign(change: Change, folder: Path) -> Path:
     return path
 
 
-@pytest.mark.parametrize(("change", "expected"), FOREIGN, ids=itertools.count())
-def test_a_file_that_is_no_record_is_refused_with_the_reason(tmp_path: Path, change: Change, expected: str):
+@pytest.mark.parametrize(("change", "names"), FOREIGN, ids=itertools.count())
+def test_a_file_that_is_no_record_is_refused_with_the_reason(tmp_path: Path, change: Change, names: str):
     path = foreign(change, tmp_path)
-    with pytest.raises(RecordError, match=expected) as error:
+    with raises(RecordError, *names.split()) as error:
         Record.load(path, trust=True)
     assert str(error.value).startswith(f"{path}: ")
     assert "\n" not in str(error.value)
@@ -335,20 +342,20 @@ def test_a_file_that_is_no_record_is_refused_with_the_reason(tmp_path: Path, cha
 
 def test_what_is_no_file_is_refused(tmp_path: Path):
     for path in (tmp_path, Path("/dev/zero")):
-        with pytest.raises(RecordError, match="a regular file is needed"):
+        with raises(RecordError, str(path)):
             Record.load(path)
     if hasattr(os, "mkfifo"):
         os.mkfifo(tmp_path / "pipe")
-        with pytest.raises(RecordError, match="a regular file is needed"):
+        with raises(RecordError, "pipe"):
             Record.load(tmp_path / "pipe")
     for path in (tmp_path / "none.h5", tmp_path / "none" / "none.h5"):
-        with pytest.raises(RecordError, match="no such record"):
+        with raises(RecordError, str(path)):
             Record.load(path)
-    with pytest.raises(RecordError, match="cannot be read"):
+    with raises(RecordError, "x" * 300):
         Record.load(tmp_path / ("x" * 300))
     for content in (b"", b"hello", b"\x89HDF\r\n\x1a\n"):
         (tmp_path / "text.h5").write_bytes(content)
-        with pytest.raises(RecordError, match="not a readable HDF5 file"):
+        with raises(RecordError, "text.h5", "HDF5"):
             Record.load(tmp_path / "text.h5", trust=True)
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import jsonschema
 import numpy as np
 import pytest
+from support.messages import raises
 
 import dynsim
 from dynsim.engine import check
@@ -90,9 +91,8 @@ def test_nulls_in_whose_place_defaults_would_come_are_resolved(tmp_path: Path):
 def test_a_scenario_of_another_version_is_refused_in_one_line():
     resolved = load_scenario("elbow_comparison").resolved
     resolved["integrator"]["newer"] = 1
-    with pytest.raises(ScenarioError) as caught:
+    with raises(ScenarioError, "integrator.newer", "step_max_s") as caught:
         scenario_from_resolved(resolved)
-    assert str(caught.value).startswith("the scenario in this record: integrator.newer: unknown key")
     assert "\n" not in str(caught.value)
 
 
@@ -103,57 +103,54 @@ def test_null_removes_a_key(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    ("text", "expected"),
+    ("text", "names"),
     [
-        ("", ["case.yaml", "empty"]),
-        ("- 1\n", ["must be a mapping"]),
-        ("a: [1\n", ["case.yaml:2", "not YAML"]),
-        ("duration_s: 1\nduration_s: 2\n", ["case.yaml:2", "duplicate key"]),
-        (MINIMAL + "integrater: {}\n", ["case.yaml:3", "integrater", "did you mean 'integrator'"]),
-        (MINIMAL + "integrator:\n  rtoll: 1\n", ["case.yaml:4", "integrator.rtoll", "did you mean 'rtol'"]),
-        (MINIMAL.replace("duration_s: 1", "duration_s: soon"), ["case.yaml:1", "duration_s = 'soon'", "number"]),
-        (MINIMAL.replace("duration_s: 1\n", ""), ["duration_s", "is missing"]),
-        (MINIMAL.replace("serial_arm", "serial_amr"), ["plant.type", "unknown type 'serial_amr'", "serial_arm"]),
-        (MINIMAL.replace("axis: y", "mass_kg: -1"), ["case.yaml:2", "plant.chain.0.mass_kg = -1", "greater"]),
+        ("", ["case.yaml", "duration_s", "plant"]),
+        ("- 1\n", ["case.yaml"]),
+        ("a: [1\n", ["case.yaml:2", "YAML"]),
+        ("duration_s: 1\nduration_s: 2\n", ["case.yaml:2", "duration_s", "1"]),
+        (MINIMAL + "integrater: {}\n", ["case.yaml:3", "integrater", "integrator"]),
+        (MINIMAL + "integrator:\n  rtoll: 1\n", ["case.yaml:4", "integrator.rtoll", "rtol"]),
+        (MINIMAL.replace("duration_s: 1", "duration_s: soon"), ["case.yaml:1", "duration_s = 'soon'"]),
+        (MINIMAL.replace("duration_s: 1\n", ""), ["case.yaml", "duration_s"]),
+        (MINIMAL.replace("serial_arm", "serial_amr"), ["plant.type", "serial_amr", "serial_arm"]),
+        (MINIMAL.replace("axis: y", "mass_kg: -1"), ["case.yaml:2", "plant.chain.0.mass_kg = -1"]),
         (MINIMAL.replace("axis: y", "axis: w"), ["plant.chain.0.axis"]),
-        (MINIMAL.replace("duration_s: 1", "duration_s: .nan"), ["duration_s", "finite"]),
+        (MINIMAL.replace("duration_s: 1", "duration_s: .nan"), ["case.yaml:1", "duration_s = nan"]),
         (MINIMAL + "integrator: {step_s: 0}\n", ["integrator.step_s = 0"]),
-        (MINIMAL + "varaints: {}\n", ["case.yaml:3", "did you mean 'variants'"]),
-        (MINIMAL + "name: a/b\n", ["case.yaml:3: name = 'a/b': names a folder"]),
-        (MINIMAL + "variants:\n  ..: {}\n", ["variant = '..': names a folder"]),
-        (SHARED.replace("mass_kg", "mas_kg"), ["case.yaml:4: plant.link.mas_kg: unknown key; did you mean 'mass_kg'?"]),
-        (SHARED.replace("0.2", "heavy"), ["case.yaml:4: plant.link.mass_kg = 'heavy'", "number"]),
-        (SHARED.replace("[{axis: y}]", "[]"), ["case.yaml:5: plant.chain: has 0 entries; it must have at least 1"]),
-        (SHARED.replace("{mass_kg: 0.2}", "3"), ["case.yaml:4: plant.link = 3: must be a mapping"]),
+        (MINIMAL + "varaints: {}\n", ["case.yaml:3", "varaints", "variants"]),
+        (MINIMAL + "name: a/b\n", ["case.yaml:3: name = 'a/b'"]),
+        (MINIMAL + "variants:\n  ..: {}\n", ["variant = '..'"]),
+        (SHARED.replace("mass_kg", "mas_kg"), ["case.yaml:4: plant.link.mas_kg", "mass_kg"]),
+        (SHARED.replace("0.2", "heavy"), ["case.yaml:4: plant.link.mass_kg = 'heavy'"]),
+        (SHARED.replace("[{axis: y}]", "[]"), ["case.yaml:5: plant.chain", "0", "1"]),
+        (SHARED.replace("{mass_kg: 0.2}", "3"), ["case.yaml:4: plant.link = 3"]),
         (
             SHARED.replace("mass_kg: 0.2", "motor: {type: wang_minami, inductance_H: 0}"),
-            ["case.yaml:4: plant.link.motor.inductance_H = 0: must be positive", "1e-6", "radau5"],
+            ["case.yaml:4: plant.link.motor.inductance_H = 0", "1e-6", "radau5"],
         ),
         (
             SHARED.replace("mass_kg: 0.2", "motor: {type: wang_minami, inductance_H: -1}"),
-            ["case.yaml:4: plant.link.motor.inductance_H = -1: must be greater than 0"],
+            ["case.yaml:4: plant.link.motor.inductance_H = -1"],
         ),
         (
             SHARED.replace("axis: y", "mass_kg: 1"),
-            ["case.yaml:4: plant.link.mass_kg = 0.2: has no effect", "set plant.chain.0.mass_kg instead"],
+            ["case.yaml:4: plant.link.mass_kg = 0.2", "plant.chain.0.mass_kg"],
         ),
         (
             SHARED.replace("mass_kg", "damping_N_s_per_m"),
-            ["case.yaml:4: plant.link.damping_N_s_per_m = 0.2: has no effect", "set damping_N_m_s_per_rad instead"],
+            ["case.yaml:4: plant.link.damping_N_s_per_m = 0.2", "damping_N_m_s_per_rad"],
         ),
         (
             MINIMAL.replace("axis: y", "kind: prismatic, damping_N_m_s_per_rad: 1"),
-            ["case.yaml:2: plant.chain.0.damping_N_m_s_per_rad = 1: a prismatic joint has damping_N_s_per_m"],
+            ["case.yaml:2: plant.chain.0.damping_N_m_s_per_rad = 1", "damping_N_s_per_m"],
         ),
     ],
 )
-def test_errors_are_one_line_that_names_the_place(tmp_path: Path, text: str, expected: list[str]):
-    with pytest.raises(ScenarioError) as caught:
+def test_errors_are_one_line_that_names_the_place(tmp_path: Path, text: str, names: list[str]):
+    with raises(ScenarioError, *names) as caught:
         load_scenario(write(tmp_path, text))
-    message = str(caught.value)
-    assert "\n" not in message
-    for part in expected:
-        assert part in message
+    assert "\n" not in str(caught.value)
 
 
 def test_all_unknown_keys_of_a_file_are_in_one_answer(tmp_path: Path):
@@ -162,15 +159,16 @@ def test_all_unknown_keys_of_a_file_are_in_one_answer(tmp_path: Path):
         + "integrater: {}\nrecord: {rate: 5, size_limit_GB: -1}\nvariants:\n  a: {}\n  b:\n    metrics: {settle: 1}\n"
     )
     path = write(tmp_path, text)
-    with pytest.raises(ScenarioError) as caught:
+    with raises(ScenarioError, "axis", "rate_hz", "integrator", "settle_s") as caught:
         load_scenario(path)
-    assert str(caught.value) == (
-        f"{path}:2: plant.chain.0.axs: unknown key; did you mean 'axis'?; "
-        f"{path}:4: record.rate: unknown key; did you mean 'rate_hz'?; "
-        f"{path}:3: integrater: unknown key; did you mean 'integrator'?; "
-        f"{path}:8: metrics.settle: unknown key; did you mean 'settle_s'?; "
-        f"{path}:4: record.size_limit_GB = -1: must be greater than 0"
-    )
+    places = re.findall(rf"{re.escape(str(path))}:\d+: [\w.]+(?: = -1)?", str(caught.value))
+    assert [place.removeprefix(f"{path}:") for place in places] == [
+        "2: plant.chain.0.axs",
+        "4: record.rate",
+        "3: integrater",
+        "8: metrics.settle",
+        "4: record.size_limit_GB = -1",
+    ]
 
 
 def test_every_problem_is_told_with_its_place(tmp_path: Path):
@@ -178,29 +176,28 @@ def test_every_problem_is_told_with_its_place(tmp_path: Path):
         "surfaces:\n  floor: {typ: plane}\nintegrator: {rtol: x}\nrecord: {rate_hz: -1}\nmetrics: {settle_s: -1}\n"
     )
     path = write(tmp_path, text)
-    with pytest.raises(ScenarioError) as caught:
+    with raises(
+        ScenarioError, f"{path}:2: plant.chain.0.kind = 'prismatik'", "'prismatic'", "'revolute'", "3"
+    ) as caught:
         load_scenario(path)
-    assert str(caught.value) == (
-        f"{path}:2: plant.chain.0.kind = 'prismatik': must be 'revolute' or 'prismatic'; did you mean 'prismatic'?; "
-        f"{path}:2: plant.chain.0.axis = 'q': must be 'x', 'y' or 'z'; "
-        f"{path}:2: plant.chain.0.length_m = -1: must be greater than or equal to 0; "
-        f"{path}:4: surfaces.floor.typ: unknown key; did you mean 'type'?; and 3 more problems"
-    )
+    message = str(caught.value)
+    places = [f"{path}:2: plant.chain.0.{key}" for key in ("kind", "axis = 'q'", "length_m = -1")]
+    positions = [message.index(place) for place in (*places, f"{path}:4: surfaces.floor.typ")]
+    assert positions == sorted(positions)
+    assert "integrator" not in message
 
 
 def test_of_very_many_unknown_keys_the_first_are_named(tmp_path: Path):
-    with pytest.raises(ScenarioError, match=r"k19: unknown key.*; and more$") as caught:
+    with raises(ScenarioError, "k19") as caught:
         load_scenario(write(tmp_path, MINIMAL + "".join(f"k{k}: 1\n" for k in range(5000))))
     assert "k20:" not in str(caught.value)
 
 
 def test_errors_of_a_choice_are_about_the_type_that_is_named(tmp_path: Path):
     text = MINIMAL + "surfaces:\n  floor:\n    type: sphere\n    center_m: [0, 0, 0]\n    normal: [0, 0, 1]\n"
-    with pytest.raises(ScenarioError) as caught:
+    with raises(ScenarioError, "case.yaml:7: surfaces.floor.normal", "type, center_m, radius_m, inside"):
         load_scenario(write(tmp_path, text))
-    message = str(caught.value)
-    assert "case.yaml:7: surfaces.floor.normal: unknown key; known here: type, center_m, radius_m, inside" in message
-    with pytest.raises(ScenarioError, match=r"case.yaml:5: surfaces.floor.type: unknown type \['sphere'\]"):
+    with raises(ScenarioError, "case.yaml:5: surfaces.floor.type", "['sphere']", "'sphere'"):
         load_scenario(write(tmp_path, text.replace("type: sphere", "type: [sphere]")))
 
 
@@ -234,52 +231,47 @@ contacts:
 
 
 @pytest.mark.parametrize(
-    ("change", "expected"),
+    ("change", "names"),
     [
         (
             ("surface: floor", "surface: flor"),
-            ":9: contacts.points.tip.surface = 'flor': no such surface; did you mean",
+            [":9: contacts.points.tip.surface = 'flor'", "floor"],
         ),
-        (("body: link_1", "body: link_2"), ":7: contacts.points.tip.body: "),
-        (("initial_deg: 90", "initial_deg: 80"), ":6: contacts.points.tip: its point starts +0.05209 m from surface"),
+        (("body: link_1", "body: link_2"), [":7: contacts.points.tip.body", "link_2", "link_1"]),
+        (("initial_deg: 90", "initial_deg: 80"), [":6: contacts.points.tip", "+0.05209 m", "floor"]),
     ],
 )
-def test_errors_of_contacts_name_key_and_line(tmp_path: Path, change: tuple[str, str], expected: str):
+def test_errors_of_contacts_name_key_and_line(tmp_path: Path, change: tuple[str, str], names: list[str]):
     path = write(tmp_path, CONTACT)
     check(load_scenario(path))
     write(tmp_path, CONTACT.replace(*change))
-    with pytest.raises(ModelError, match=f"^{re.escape(f'{path}{expected}')}"):
+    with raises(ModelError, f"{path}{names[0]}", *names[1:]):
         check(load_scenario(path))
 
 
 def test_errors_of_overridden_contacts_say_so(tmp_path: Path):
     path = write(tmp_path, CONTACT + "variants: {one: {}}\n")
     overrides = SetOptions({"contacts.points.tip.surface": "flor"})
-    expected = f"{path} (one): --set: contacts.points.tip.surface = 'flor'"
-    with pytest.raises(ModelError, match=f"^{re.escape(expected)}"):
+    with raises(ModelError, f"{path} (one): --set: contacts.points.tip.surface = 'flor'"):
         check(load_scenario(path, overrides=overrides))
 
 
 def test_error_in_a_variant_names_the_variants_line(tmp_path: Path):
     text = MINIMAL + "variants:\n  good: {}\n  bad:\n    metrics:\n      settle: 1\n"
-    with pytest.raises(ScenarioError, match=r"case.yaml:7: metrics.settle: unknown key; did you mean 'settle_s'"):
+    with raises(ScenarioError, "case.yaml:7: metrics.settle", "settle_s"):
         load_scenario(write(tmp_path, text), "bad")
 
 
 def test_error_beside_a_variant_names_the_line_that_has_the_key(tmp_path: Path):
     text = SHARED.replace("mass_kg", "mas_kg") + "variants:\n  a: {plant: {base: {yaw_deg: 1}}}\n"
-    with pytest.raises(ScenarioError, match=r"case.yaml:4: plant.link.mas_kg"):
+    with raises(ScenarioError, "case.yaml:4: plant.link.mas_kg"):
         load_scenario(write(tmp_path, text), "a")
 
 
 def test_shared_keys_of_a_resolved_scenario_are_refused_with_the_keys_to_set(tmp_path: Path):
     path = write(tmp_path, to_yaml(load_scenario("elbow_comparison").resolved))
-    with pytest.raises(ScenarioError) as caught:
+    with raises(ScenarioError, "overrides: plant.link.mass_kg = 0.5", "plant.chain.0.mass_kg, plant.chain.1.mass_kg"):
         load_scenario(path, overrides={"plant.link.mass_kg": 0.5})
-    assert str(caught.value) == (
-        "overrides: plant.link.mass_kg = 0.5: has no effect on any entry of plant.chain; "
-        "set plant.chain.0.mass_kg, plant.chain.1.mass_kg instead, or take it away"
-    )
     # What the entries do not have still reaches them.
     com = build_model(load_scenario(path, overrides={"plant.link.com_m": [0, 0, 0.1]})).robot.links[3].inertia.com
     assert list(com) == [0, 0, 0.1]
@@ -296,72 +288,69 @@ def test_each_kind_of_joint_takes_the_shared_loss_of_its_own_unit(tmp_path: Path
 
 
 @pytest.mark.parametrize(
-    ("overrides", "error", "expected"),
+    ("overrides", "error", "names"),
     [
-        ({"plant.initial_deg.1": 40}, ModelError, "starts +0.03698 m from surface 'floor'"),
-        ({"contacts.points.elbow_4.surface": "flor"}, ModelError, "did you mean 'floor'"),
-        ({"contacts.points.elbow_4.body": "link_44"}, ModelError, "link_44"),
-        ({"controller.hand.path.center_m": [3, 3, 0.4]}, UnreachableReference, "at t = 0.000 s it stays 2.0"),
-        ({"controller.hand.path.radius_m": 0.6}, UnreachableReference, "at t = "),
-        ({"controller.hand.joints": ["joint_99"]}, ModelError, "joint_99"),
-        ({"controller.k_p_V_per_rad": [1, 2]}, ModelError, "2 values, there are 10 motors"),
+        ({"plant.initial_deg.1": 40}, ModelError, "contacts.points.elbow_4 +0.03698 floor"),
+        ({"contacts.points.elbow_4.surface": "flor"}, ModelError, "contacts.points.elbow_4.surface floor"),
+        ({"contacts.points.elbow_4.body": "link_44"}, ModelError, "contacts.points.elbow_4.body link_44 link_4"),
+        ({"controller.hand.path.center_m": [3, 3, 0.4]}, UnreachableReference, "controller.hand.path 0.000 2.06"),
+        ({"controller.hand.path.radius_m": 0.6}, UnreachableReference, "controller.hand.path 0.000 0.34"),
+        ({"controller.hand.joints": ["joint_99"]}, ModelError, "controller.hand.joints joint_99 joint_9"),
+        ({"controller.k_p_V_per_rad": [1, 2]}, ModelError, "k_p_V_per_rad 2 10"),
         ({"record.rate_hz": 1e7}, ScenarioError, "record.rate_hz"),
-        ({"controller.knot_spacing_s": 1e-10}, ModelError, "controller.knot_spacing_s = 1e-10: 1e+11 knots in 10 s"),
+        ({"controller.knot_spacing_s": 1e-10}, ModelError, "controller.knot_spacing_s 1e-10 1e+11 10"),
     ],
 )
-def test_what_no_simulation_can_be_made_of_is_refused_by_check(overrides, error, expected):
-    with pytest.raises(error) as caught:
+def test_what_no_simulation_can_be_made_of_is_refused_by_check(overrides, error, names):
+    with raises(error, *names.split()) as caught:
         check(load_scenario("elbow_comparison", overrides=overrides))
-    assert expected in str(caught.value)
     # Which of several scenarios and variants it was.
     assert re.match(rf"{find_scenario('elbow_comparison')}(:\d+)? \(two_elbows\): ", str(caught.value))
 
 
-KNOWN = "known: switching, fixing, 1, 2, 3, 4, 5, 6"
+KNOWN = "switching, fixing, 1, 2, 3, 4, 5, 6"
 
 
 @pytest.mark.parametrize(
-    ("command", "expected"),
+    ("command", "names"),
     [
-        ({"mode": 9}, f"mode = 9: no mode 9; {KNOWN}"),
-        ({"mode": 0}, f"mode = 0: no mode 0; {KNOWN}"),
-        ({"mode": -1}, f"mode = -1: no mode -1; {KNOWN}"),  # inside the engine -1 and -2 are the states
-        ({"mode": -2}, f"mode = -2: no mode -2; {KNOWN}"),
-        ({"mode": -7}, f"mode = -7: no mode -7; {KNOWN}"),
-        ({"at_s": 1e6, "mode": 44}, f"mode = 44: no mode 44; {KNOWN}"),  # after the end of the run
-        ({"mode": True}, "mode = True: no such mode; known: switching, fixing, or the number of a mode"),
-        ({"mode": 3.0}, "mode = 3.0: no such mode"),
-        ({"mode": [1]}, "mode: no such mode"),
-        ({"mode": "swithcing"}, "mode = 'swithcing': no such mode; did you mean 'switching'?; known: switching"),
-        ({"velocity": [0.1, 0, 0, 0, 0]}, "velocity: has 5 entries, 6 are needed"),
-        ({"velocity": [0.1, 0]}, "velocity: has 2 entries, 6 are needed"),
-        ({"velocity": [0, 0, 0, 0, 0, 0, 0]}, "at most 6"),
+        ({"mode": 9}, ("mode = 9", KNOWN)),
+        ({"mode": 0}, ("mode = 0", KNOWN)),
+        ({"mode": -1}, ("mode = -1", KNOWN)),  # inside the engine -1 and -2 are the states
+        ({"mode": -2}, ("mode = -2", KNOWN)),
+        ({"mode": -7}, ("mode = -7", KNOWN)),
+        ({"at_s": 1e6, "mode": 44}, ("mode = 44", KNOWN)),  # after the end of the run
+        ({"mode": True}, ("mode = True", "switching, fixing")),
+        ({"mode": 3.0}, ("mode = 3.0", "switching, fixing")),
+        ({"mode": [1]}, ("mode", "switching, fixing")),
+        ({"mode": "swithcing"}, ("mode = 'swithcing'", "'switching'", "switching, fixing")),
+        ({"velocity": [0.1, 0, 0, 0, 0]}, ("velocity", "5", "6")),
+        ({"velocity": [0.1, 0]}, ("velocity", "2", "6")),
+        ({"velocity": [0, 0, 0, 0, 0, 0, 0]}, ("velocity", "7", "6")),
     ],
 )
-def test_commands_that_no_snake_can_carry_out(command, expected):
-    with pytest.raises(ScenarioError) as caught:
+def test_commands_that_no_snake_can_carry_out(command, names):
+    with raises(ScenarioError, f"overrides: controller.commands.1.{names[0]}", *names[1:]) as caught:
         load_scenario("snake_operator", overrides={"controller.commands": [{"at_s": 1.0}, {"at_s": 2.0} | command]})
-    assert str(caught.value).startswith("overrides: controller.commands.1.")
-    assert expected in str(caught.value)
     assert "\n" not in str(caught.value)
     assert "; overrides" not in str(caught.value), "one problem is told once"
 
 
 def test_an_unknown_mode_in_a_file_is_named_with_its_line(tmp_path: Path):
     text = "duration_s: 1\nplant: {type: snake}\ncontroller:\n  type: task_space\n  commands:\n    - at_s: 0\n"
-    with pytest.raises(ScenarioError, match=r"case.yaml:7: controller.commands.0.mode = -1: no mode -1; known: "):
+    with raises(ScenarioError, "case.yaml:7: controller.commands.0.mode = -1", KNOWN):
         load_scenario(write(tmp_path, text + "      mode: -1\n"))
 
 
 @pytest.mark.parametrize("key", ["controller.fixing_mode", "controller.switching.order.0"])
 def test_true_is_no_mode_number(key):
-    with pytest.raises(ScenarioError, match=f"{key} = True: must be a valid integer"):
+    with raises(ScenarioError, f"{key} = True"):
         load_scenario("snake_operator", overrides={"controller.switching.order": [2], key: True})
 
 
 def test_a_robot_too_short_for_the_default_modes_is_told_to_bring_its_own():
     short = {"plant.yaw_joints": 4}
-    with pytest.raises(ModelError, match=r"controller.modes is not given.* needs 7 wheel pairs; this robot has 2"):
+    with raises(ModelError, "controller.modes", "7", "2"):
         check(load_scenario("snake_operator", overrides=short))
     own = {"controller.modes": {"1": []}, "controller.switching.order": [1]}
     check(load_scenario("snake_operator", overrides=short | own))
@@ -370,22 +359,24 @@ def test_a_robot_too_short_for_the_default_modes_is_told_to_bring_its_own():
 def test_a_file_that_is_not_utf_8_is_named_with_its_line(tmp_path: Path):
     path = tmp_path / "case.yaml"
     path.write_bytes("duration_s: 1\nname: café\n".encode("latin-1"))
-    with pytest.raises(ScenarioError, match=r"case.yaml:2: byte 0xe9 is not UTF-8; save it as UTF-8"):
+    with raises(ScenarioError, "case.yaml:2", "0xe9"):
         load_scenario(path)
 
 
 def test_a_folder_is_no_scenario(tmp_path: Path):
-    with pytest.raises(ScenarioError, match="is a folder; a regular file is needed"):
+    with raises(ScenarioError, str(tmp_path)):
         load_scenario(tmp_path)
 
 
 def test_a_record_of_10_GB_is_refused_with_a_rate_that_fits():
-    with pytest.raises(ScenarioError, match=r"need 10\.\d GB, the limit .* is 2 GB; \S+ Hz would fit"):
+    with raises(
+        ScenarioError, "record.rate_hz = 920000", re.compile(r"\b10\.\d GB"), "2 GB", "Hz", "record.size_limit_GB"
+    ):
         check(load_scenario("elbow_comparison", overrides={"record.rate_hz": 9.2e5}))
 
 
 def test_missing_file_lists_what_is_shipped():
-    with pytest.raises(ScenarioError, match=r"did you mean 'elbow_comparison'.*single_pendulum"):
+    with raises(ScenarioError, "elbow_comparision.yaml", "'elbow_comparison'", "single_pendulum"):
         find_scenario("elbow_comparision.yaml")
 
 
@@ -397,42 +388,41 @@ def test_parse_override():
 
 
 @pytest.mark.parametrize(
-    ("text", "expected"),
+    ("text", "names"),
     [
-        (".=1", "--set .: a part of the key is empty"),
-        ("plant..x=1", "--set plant..x: a part of the key is empty"),
-        ("=1", "--set =1: must look like"),
-        ("plant.chain.²=1", "--set plant.chain.²: '²' is no index of a list of 2"),
-        ("plant.chain.٠=1", "'٠' is no index"),
-        ("plant.chain.-1.mass_kg=1", "'-1' is no index"),
-        ("plant.chain." + "9" * 5000 + "=1", "is no index of a list of 2"),
-        ("variants={a: {}}", "--set variants: which variant runs is chosen by its name"),
-        ("variants.two_elbows=1", "--set variants.two_elbows: which variant runs"),
-        ("variant=x", "--set variant: which variant runs"),
-        ("duration_s=*a", "--set duration_s: alias *a: there is no anchor"),
-        ("duration_s=&a [*a]", "--set duration_s: alias *a is within"),
-        ("duration_s=" + "9" * 5000, "--set duration_s: a number of 5000 digits"),
-        ("duration_s=" + "9" * 308, "--set: duration_s = 99999"),
-        ("duration_s=1e-300", "--set: duration_s = 1e-300: its size must be between 1e-30 and 1e+30"),
-        ("duration_s=2024-99-99", "--set: duration_s = '2024-99-99'"),
-        ("duration_s=._", "--set: duration_s = '._'"),
-        ("duration_s='\"", "--set duration_s: not YAML"),
-        ("duration_s=\"'1'\"", "--set: duration_s = \"'1'\""),
-        ("duration_s=!!python/name:os.system", "--set duration_s: tag '!!python/name:os.system' is not known"),
-        ("duration_s=" + "{a: " * 100, "--set duration_s: more than 50 mappings"),
-        ("duration_s=a\ud800", "--set duration_s: not YAML: character U+D800"),
-        ("a" + ".a" * 100 + "=1", "has 101 parts; no key of a scenario has more than 50"),
-        ("a\nb=1", "--set: a\\nb: unknown key"),
-        ("a" * 5000 + "=1", "aaa…: unknown key"),
-        ("name=" + "x" * 300, "must not be longer than 255 bytes"),
-        ("name='a\tb'", "must be printable in one line"),
-        ("plant.type=[1]", "--set: plant.type: unknown type [1]"),
+        (".=1", ("--set .",)),
+        ("plant..x=1", ("--set plant..x",)),
+        ("=1", ("--set =1", "integrator.rtol=1e-8")),
+        ("plant.chain.²=1", ("--set plant.chain.²", "'²'", "2")),
+        ("plant.chain.٠=1", ("--set plant.chain.٠", "'٠'", "2")),
+        ("plant.chain.-1.mass_kg=1", ("--set plant.chain.-1.mass_kg", "'-1'", "2")),
+        ("plant.chain." + "9" * 5000 + "=1", (re.compile(r"--set plant\.chain\.9+…"), "2")),
+        ("variants={a: {}}", ("--set variants", "dynsim run --variant")),
+        ("variants.two_elbows=1", ("--set variants.two_elbows", "dynsim run --variant")),
+        ("variant=x", ("--set variant", "dynsim run --variant")),
+        ("duration_s=*a", ("--set duration_s", "*a", "&a")),
+        ("duration_s=&a [*a]", ("--set duration_s", "*a", "&a")),
+        ("duration_s=" + "9" * 5000, ("--set duration_s", "5000", "308")),
+        ("duration_s=" + "9" * 308, (re.compile(r"--set: duration_s = 9+…"), "1e-30", "1e+30")),
+        ("duration_s=1e-300", ("--set: duration_s = 1e-300", "1e-30", "1e+30")),
+        ("duration_s=2024-99-99", ("--set: duration_s = '2024-99-99'",)),
+        ("duration_s=._", ("--set: duration_s = '._'",)),
+        ("duration_s='\"", ("--set duration_s", "YAML")),
+        ("duration_s=\"'1'\"", ("--set: duration_s = \"'1'\"",)),
+        ("duration_s=!!python/name:os.system", ("--set duration_s", "!!python/name:os.system")),
+        ("duration_s=" + "{a: " * 100, ("--set duration_s", "50")),
+        ("duration_s=a\ud800", ("--set duration_s", "U+D800")),
+        ("a" + ".a" * 100 + "=1", ("--set a.a", "101", "50")),
+        ("a\nb=1", ("--set: a\\nb", "duration_s, plant")),
+        ("a" * 5000 + "=1", (re.compile("--set: a+…: "), "duration_s, plant")),
+        ("name=" + "x" * 300, ("--set: name", "255")),
+        ("name='a\tb'", ("--set: name = 'a\\tb'",)),
+        ("plant.type=[1]", ("--set: plant.type", "[1]", "serial_arm")),
     ],
 )
-def test_every_override_is_one_clear_error(text: str, expected: str):
-    with pytest.raises(ScenarioError) as caught:
+def test_every_override_is_one_clear_error(text: str, names: tuple):
+    with raises(ScenarioError, *names) as caught:
         load_scenario("elbow_comparison", overrides=SetOptions([parse_override(text)]))
-    assert expected in str(caught.value)
     assert str(caught.value).isprintable()
     assert len(str(caught.value)) < 1000
 
@@ -445,21 +435,19 @@ def test_an_override_changes_nothing_but_what_it_names(tmp_path: Path):
 
 def test_numbers_that_no_result_can_be_computed_from_are_refused(monkeypatch: pytest.MonkeyPatch):
     for value in (1e31, 1e-31, -1e300):
-        with pytest.raises(ScenarioError, match=r"plant\.chain\.0\.com_m\.2 = .*: its size must be between"):
+        with raises(ScenarioError, "plant.chain.0.com_m.2", "1e-30", "1e+30"):
             load_scenario("elbow_comparison", overrides={"plant.chain.0.com_m": [0, 0, value]})
 
     def overflow(*_: object) -> None:
         raise np.linalg.LinAlgError("Singular matrix")
 
     monkeypatch.setattr("dynsim.library.controllers.joint_pd.follow", overflow)
-    with pytest.raises(
-        ModelError, match=r"numbers of very different size, no result can be computed \(Singular matrix"
-    ):
+    with raises(ModelError, "elbow_comparison.yaml", "Singular matrix"):
         check(load_scenario("elbow_comparison"))
 
 
 def test_an_axis_has_a_direction():
-    with pytest.raises(ScenarioError, match=r"plant.chain.0.axis: .*axis has no direction"):
+    with raises(ScenarioError, "plant.chain.0.axis"):
         load_scenario("single_pendulum", overrides={"plant.chain.0.axis": [0, 0, 0]})
 
 
@@ -470,36 +458,36 @@ def test_schema_knows_every_family():
 
 
 def test_overrides_are_called_as_they_were_given():
-    with pytest.raises(ScenarioError, match=r"^overrides duration_s\.x: duration_s is a value"):
+    with raises(ScenarioError, re.compile(r"^overrides duration_s\.x: ")):
         load_scenario("single_pendulum", overrides={"duration_s.x": 1})
-    with pytest.raises(ScenarioError, match=r"^--set: duration_s = -1: "):
+    with raises(ScenarioError, re.compile(r"^--set: duration_s = -1: ")):
         load_scenario("single_pendulum", overrides=SetOptions({"duration_s": -1}))
 
 
 def test_a_list_is_no_scenario(tmp_path: Path):
     (tmp_path / "list.yaml").write_text("- 1\n")
-    with pytest.raises(ScenarioError, match="must be a mapping of keys to values, not a list"):
+    with raises(ScenarioError, "list.yaml"):
         load_scenario(tmp_path / "list.yaml")
 
 
 @pytest.mark.parametrize(
-    ("row", "expected"), [("1, a, 0, 0", "'1, a, 0, 0' is not 4 numbers"), ("1, 0, 0", "3 values; there must be 4")]
+    ("row", "names"), [("1, a, 0, 0", ("'1, a, 0, 0'", "4")), ("1, 0, 0", ("3", "4", "t_s,x_m,y_m,z_m"))]
 )
-def test_a_bad_row_of_a_csv_path_is_named_with_its_line(tmp_path: Path, row: str, expected: str):
+def test_a_bad_row_of_a_csv_path_is_named_with_its_line(tmp_path: Path, row: str, names: tuple[str, ...]):
     file = tmp_path / "path.csv"
     file.write_text(f"t_s, x_m, y_m, z_m\n0, 1, 0, 0\n\n{row}\n")
-    with pytest.raises(ScenarioError, match=re.escape(f"{file}:4: {expected}")):
+    with raises(ScenarioError, f"{file}:4", *names):
         load_scenario("elbow_comparison", overrides={"controller.hand.path": {"type": "csv", "file": str(file)}})
 
 
 def test_a_record_that_does_not_fit_into_memory_is_an_error_of_the_scenario():
     overrides = {"duration_s": 1e6, "record.rate_hz": 1e9, "record.size_limit_GB": 1e12}
-    with pytest.raises(ScenarioError, match="not enough memory"):
+    with raises(ScenarioError, "single_pendulum.yaml", "PiB", "record.rate_hz", "duration_s"):
         check(load_scenario("single_pendulum", overrides=overrides))
 
 
 def test_a_name_is_no_scenario():
-    with pytest.raises(DynsimError, match="load_scenario"):
+    with raises(DynsimError, "single_pendulum", "load_scenario"):
         dynsim.simulate("single_pendulum")  # type: ignore[arg-type]
 
 
@@ -507,5 +495,5 @@ def test_a_name_is_no_scenario():
 def test_a_point_has_three_coordinates(point: list[float]):
     model = build_model(load_scenario("single_pendulum"))
     for method in (model.point_position, model.point_jacobian):
-        with pytest.raises(ModelError, match="point has shape"):
+        with raises(ModelError, f"({len(point)},)", "(3,)"):
             method(0, point, [0.0])

@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+from support.messages import raises
 
 from dynsim.compile.protocols import BuildContext
 from dynsim.draw.geometry.shapes import round_patch, surface_grids
@@ -51,11 +52,11 @@ def test_heights_of_single_points_are_those_of_many():
 
 
 def test_bodies_come_after_their_parents():
-    with pytest.raises(RecordError, match=r"body 'a' .0. does not come after its parent .0."):
+    with raises(RecordError, "a", "0"):
         Scene((Body("a", 0, HINGE),))
-    with pytest.raises(RecordError, match="point 'p' is on body 1, there are 1"):
+    with raises(RecordError, "p", "1"):
         Scene((Body("a", -1, HINGE),), points=(Point("p", "hand", 1, (0.0, 0.0, 0.0)),))
-    with pytest.raises(RecordError, match="planar and has 1 columns"):
+    with raises(RecordError, "planar", "1"):
         Joint("j", "planar", (0.0, 0.0, 1.0), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), "base", ("x",))
 
 

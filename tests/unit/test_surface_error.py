@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.messages import raises
 
 import dynsim
 from dynsim.compile.references.plane_curve import clamped_cubic
@@ -81,15 +82,15 @@ def test_joints_start_where_their_waypoints_begin() -> None:
     assert robot.initial == pytest.approx([np.deg2rad(80.0), 0.1])
     record = dynsim.simulate(arm(initial={"on_references": True}))
     assert record["q"][0] == pytest.approx([np.deg2rad(80.0), 0.1])
-    with pytest.raises(ModelError, match="no joint has waypoints"):
+    with raises(ModelError, "initial.on_references", "controller.joints"):
         build.robot(arm(initial={"on_references": True}, controller={"type": "joint_pd"}))
 
 
 def test_waypoints_name_the_unit_of_their_joint() -> None:
     wrong = {"type": "joint_pd", "joints": {"joint_1": {"times_s": [0.0, 1.0], "positions_m": [0.0, 0.1]}}}
-    with pytest.raises(ModelError, match="revolute; give its waypoints in angles_deg"):
+    with raises(ModelError, "joint_1", "revolute", "angles_deg"):
         dynsim.check(arm(controller=wrong))
-    with pytest.raises(ScenarioError, match="either angles_deg or"):
+    with raises(ScenarioError, "controller.joints.joint_1.angles_deg", "positions_m"):
         arm(controller={"type": "joint_pd", "joints": {"joint_1": {"times_s": [0.0, 1.0]}}})
     path = {"type": "line", "start_m": [0, 0, 0], "end_m": [0, 0, 1]}
     with pytest.raises(ScenarioError):

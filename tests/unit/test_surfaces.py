@@ -9,6 +9,7 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from support.messages import mentions, raises
 
 import dynsim
 from dynsim.compile.clearance import sinking
@@ -31,15 +32,15 @@ plant:
 
 
 @pytest.mark.parametrize(
-    ("Q", "b", "words"),
+    ("Q", "b", "names"),
     [
-        (np.eye(2), np.zeros(3), r"Q of shape \(3, 3\).*not \(2, 2\) and \(3,\)"),
-        (np.eye(3), np.zeros((3, 1)), r"not \(3, 3\) and \(3, 1\)"),
-        (np.eye(3, k=1), np.zeros(3), "must be symmetric"),
+        (np.eye(2), np.zeros(3), ("(3, 3)", "(2, 2)", "(3,)")),
+        (np.eye(3), np.zeros((3, 1)), ("(3, 3)", "(3, 1)")),
+        (np.eye(3, k=1), np.zeros(3), ("Q", "(Q + Qᵀ)/2")),
     ],
 )
-def test_a_quadric_of_a_wrong_shape_is_refused(Q: Any, b: Any, words: str) -> None:
-    with pytest.raises(ModelError, match=words):
+def test_a_quadric_of_a_wrong_shape_is_refused(Q: Any, b: Any, names: tuple[str, ...]) -> None:
+    with raises(ModelError, *names):
         Quadric(Q, b, 0.0)
 
 
@@ -84,38 +85,36 @@ def test_a_height_field_from_text_and_from_an_array(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "name", "reason"),
+    ("text", "name", "names"),
     [
-        ("1,2,3,4\n" * 3, "a.csv", "3 rows of 4 heights; a spline needs 4 or more each way"),
-        ("1,2,3,4\n1,2,3\n", "a.csv", "a.csv:2: 3 values; there must be 4, as in the first row"),
-        ("1,2,3,4\n1,2,x,4\n", "a.csv", "a.csv:2: '1,2,x,4' is not 4 numbers"),
-        ("# nothing\n", "a.csv", "no rows of numbers"),
-        (("1,2,3,4\n" * 3) + "1,2,3,1e9\n", "a.csv", "height 4 of row 4 is 1e+09 m; heights must be numbers of"),
-        ("text", "a.npy", "is no array of numbers"),
+        ("1,2,3,4\n" * 3, "a.csv", ("a.csv", "3", "4")),
+        ("1,2,3,4\n1,2,3\n", "a.csv", ("a.csv:2", "3", "4")),
+        ("1,2,3,4\n1,2,x,4\n", "a.csv", ("a.csv:2", "'1,2,x,4'", "4")),
+        ("# nothing\n", "a.csv", ("a.csv",)),
+        (("1,2,3,4\n" * 3) + "1,2,3,1e9\n", "a.csv", ("4", "1e+09 m", "1e+06 m")),
+        ("text", "a.npy", ("a.npy",)),
     ],
 )
-def test_wrong_files_of_heights_are_refused_with_their_place(tmp_path, text, name, reason):
+def test_wrong_files_of_heights_are_refused_with_their_place(tmp_path, text, name, names):
     file = field_file(tmp_path, text, name)
     scenario = tmp_path / "s.yaml"
     scenario.write_text(f"{BASE}surfaces:\n  hills:\n    type: height_field\n    file: {name}\n    spacing_m: [1, 1]\n")
-    with pytest.raises(ScenarioError) as error:
+    with raises(ScenarioError, "s.yaml:8: surfaces.hills.file", *names):
         dynsim.load_scenario(scenario)
-    assert "s.yaml:8: surfaces.hills.file" in str(error.value)
-    assert reason in str(error.value)
     assert Path(file).exists()
 
 
 def test_other_arrays_are_no_heights(tmp_path):
     for array in (np.zeros(4), np.zeros((4, 4), dtype=complex), np.full((4, 4), np.nan)):
         np.save(tmp_path / "a.npy", array)
-        with pytest.raises(ValueError, match=r"a\.npy"):
+        with raises(ValueError, "a.npy"):
             config(height_field, file=str(tmp_path / "a.npy"), spacing_m=[1.0, 1.0])
-    with pytest.raises(ValueError, match="no such file"):
+    with raises(ValueError, "b.npy"):
         config(height_field, file=str(tmp_path / "b.npy"), spacing_m=[1.0, 1.0])
 
 
 def test_a_box_that_is_all_rounding_is_refused():
-    with pytest.raises(ValueError, match=r"0\.3 m; it must not be more than half the shortest edge, 0\.2 m"):
+    with raises(ValueError, "0.3 m", "0.2 m"):
         config(box, center_m=[0.0, 0.0, 0.0], edges_m=[2.0, 1.0, 0.4], edge_radius_m=0.3)
 
 
@@ -126,7 +125,7 @@ def scenario_of(folder: Path, contacts: str, surfaces: str = "{floor: {type: pla
 
 
 def test_candidates_need_the_unilateral_law(tmp_path):
-    with pytest.raises(ScenarioError, match=r"s\.yaml:6: contacts\.candidates.*requires contacts\.law: unilateral"):
+    with raises(ScenarioError, "s.yaml:6: contacts.candidates", "contacts.law: unilateral"):
         scenario_of(tmp_path, "{candidates: joints}")
 
 
@@ -141,7 +140,7 @@ def test_joints_touch_each_surface_but_those_that_cannot_move_along_its_normal(t
     """The first two joints are one point on the base: of the plane's normal nothing moves it, so it is named."""
     with caplog.at_level(logging.INFO, logger="dynsim"):
         assert names(tmp_path, "joints") == ["joint_3", "joint_4", "hand"]
-    assert "contacts.candidates: left out, because nothing moves them along the normal: joint_1" in caplog.text
+    assert mentions(caplog.text, "contacts.candidates", "joint_1")
     two = "{floor: {type: plane, point_m: [0, 0, -2]}, ball: {type: sphere, center_m: [3, 0, 0], radius_m: 1}}"
     assert names(tmp_path, "joints", surfaces=two) == [
         f"{body}_{surface}" for surface in ("floor", "ball") for body in ("joint_3", "joint_4", "hand")
@@ -152,7 +151,7 @@ def test_declared_points_are_not_candidates_once_more(tmp_path, caplog):
     declared = "{law: unilateral, candidates: joints, points: {elbow: {body: link_3}}}"
     contacts = build.contacts(scenario_of(tmp_path, declared))
     assert [contact.name for contact in contacts] == ["elbow", "joint_4", "hand"]
-    assert "instead of the link" not in caplog.text
+    assert "contacts.candidates" not in caplog.text
     # A sphere about it would start a radius deep where the point starts on the floor.
     contacts = build.contacts(scenario_of(tmp_path, declared.replace("joints", "links")))
     assert [(contact.name, contact.radius) for contact in contacts] == [
@@ -160,7 +159,7 @@ def test_declared_points_are_not_candidates_once_more(tmp_path, caplog):
         ("joint_4", 0.02),
         ("link_4_end", 0.02),
     ]
-    assert "a point of less radius touches there instead of the link: elbow" in caplog.text
+    assert mentions(caplog.text, "WARNING", "contacts.candidates", "elbow")
 
 
 FLAT = ["joint_3", "joint_4", "link_4_end"]
@@ -186,7 +185,7 @@ def test_links_do_not_touch_quadrics_of_other_kinds(tmp_path):
     ellipsoid = Quadric(np.diag([1.0, 2.0, 3.0]), np.zeros(3), -1.0)
     contacts = build.candidates("joints", robot, {"egg": ellipsoid}, [])
     assert compile_shapes(robot, contacts) is None
-    with pytest.raises(ModelError, match="'egg' is a quadric of another kind, which only points can touch"):
+    with raises(ModelError, "joint_3", "egg"):
         compile_shapes(robot, build.candidates("links", robot, {"egg": ellipsoid}, []))
 
 
@@ -265,7 +264,7 @@ objects: {ball: {mass_kg: 0.5, shape: sphere, radius_m: 0.05, position_m: [0, 0,
 """
     file = tmp_path / "pipe.yaml"
     file.write_text(text.replace("HEIGHT", "0"))
-    with pytest.raises(ModelError, match=r"pipe\.yaml: contact ball\.pipe is at the centre, or on the axis"):
+    with raises(ModelError, "pipe.yaml", "ball.pipe"):
         dynsim.check(dynsim.load_scenario(file))
     file.write_text(text.replace("HEIGHT", "1e-6"))
     start = dynsim.check(dynsim.load_scenario(file))

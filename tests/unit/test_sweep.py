@@ -21,6 +21,7 @@ import scipy.stats
 from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.colors import to_rgb
+from support.messages import mentions, raises
 from support.processes import started, wait_for
 from support.sweep_work import DEADLY, REFUSED, attentive, deaf, hangs, leaves, once_deadly, slow, square, warned
 
@@ -66,29 +67,32 @@ def test_values_of_a_grid(text: str, values: tuple[Any, ...]):
 
 
 @pytest.mark.parametrize(
-    ("make", "message"),
+    ("make", "names"),
     [
-        (lambda: Axis.parse("contacts.friction"), "must look like"),
-        (lambda: Axis.parse("a=0:1:1"), "2 or more"),
-        (lambda: Axis.parse("a=1,1"), "a value twice"),
-        (lambda: Axis.parse("a=0:0.5"), "must be start:stop:count with a whole count, such as a=0:0.5:5"),
-        (lambda: Axis.parse("a=0:0.5:0.1"), "must be start:stop:count with a whole count, such as a=0:0.5:5"),
-        (lambda: Law.parse("a=cauchy(0,1)"), r"laws: normal\(mean, standard deviation\), uniform"),
-        (lambda: Law.parse("a=normal(1,0)"), "spread that is positive"),
-        (lambda: Law.parse("a=uniform(2,1)"), "spread that is positive"),
-        (lambda: plan(), "nothing to sweep"),
+        (lambda: Axis.parse("contacts.friction"), "--grid contacts.friction contacts.friction=0:1:5"),
+        (lambda: Axis.parse("a=0:1:1"), "--grid a=0:1:1 2 10000000"),
+        (lambda: Axis.parse("a=1,1"), "--grid a=1,1"),
+        (lambda: Axis.parse("a=0:0.5"), "--grid a=0:0.5 start:stop:count a=0:0.5:5"),
+        (lambda: Axis.parse("a=0:0.5:0.1"), "--grid a=0:0.5:0.1 start:stop:count a=0:0.5:5"),
+        (lambda: Law.parse("a=cauchy(0,1)"), "--sample a=cauchy(0,1) normal uniform"),
+        (lambda: Law.parse("a=normal(1,0)"), "--sample a=normal(1,0)"),
+        (lambda: Law.parse("a=uniform(2,1)"), "--sample a=uniform(2,1)"),
+        (lambda: plan(), "--grid --sample --variants"),
         (
             lambda: plan(MASSES, MASSES),
-            "--grid plant.chain.0.mass_kg: replaces what --grid plant.chain.0.mass_kg gives",
+            "--grid plant.chain.0.mass_kg",
         ),
-        (lambda: plan(MASSES, count=3), "all runs would be the same"),
-        (lambda: list(plan(laws=(Law.parse("loads.*.mass_kg=uniform(1,2)"),)).points()), "no entries"),
-        (lambda: Law.parse("k=uniform(-1e308,1e308)"), "numbers of that size"),
-        (lambda: Axis.parse("k=0:1:999999999999"), "at most"),
+        (lambda: plan(MASSES, count=3), "--count --sample"),
+        (
+            lambda: list(plan(laws=(Law.parse("loads.*.mass_kg=uniform(1,2)"),)).points()),
+            "loads.*.mass_kg single_pendulum.yaml *",
+        ),
+        (lambda: Law.parse("k=uniform(-1e308,1e308)"), "--sample k=uniform(-1e308,1e308)"),
+        (lambda: Axis.parse("k=0:1:999999999999"), "--grid k=0:1:999999999999 2 10000000"),
     ],
 )
-def test_what_is_no_sweep_is_refused(make: Callable[[], Any], message: str):
-    with pytest.raises(ScenarioError, match=message):
+def test_what_is_no_sweep_is_refused(make: Callable[[], Any], names: str):
+    with raises(ScenarioError, *names.split()):
         make()
 
 
@@ -114,12 +118,12 @@ def test_a_key_that_replaces_another_is_refused(
 ):
     axes = tuple(Axis(key, (0.1, 0.2)) for key in grid)
     laws = tuple(Law(key, "normal", (0.1, 0.01)) for key in drawn)
-    with pytest.raises(ScenarioError) as refused:
+    with raises(ScenarioError, replacing, replaced) as refused:
         Plan(CHAIN, (None,), SetOptions(fixed), axes, laws)
     message = str(refused.value)
-    assert message.startswith(f"{replacing}: replaces what {replaced} gives ")
-    assert "take one of the two away" in message
-    assert ("write out the entries" in message) == ("*" in message)
+    assert message.startswith(f"{replacing}: ")
+    # What the other leaves of the entries that * stands for is said.
+    assert (" * " in message) == ("*" in message)
 
 
 def test_a_part_of_what_was_given_may_be_varied():
@@ -355,7 +359,7 @@ def test_a_silent_process_is_a_row_with_its_reason(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(batch, "run_in_processes", run)
     rows = run_sweep(plan(Axis.parse(f"{LENGTH}=0.5:1:3")), tmp_path, jobs=2)
     assert [row.status for row in rows] == ["ok", "lost", "ok"]
-    assert "gave no sign of life for 60 s" in rows[1].reason
+    assert mentions(rows[1].reason, "60 s")
 
 
 @pytest.mark.parametrize("listens", [True, False])
@@ -407,7 +411,7 @@ def test_resuming_runs_what_is_not_there(tmp_path: Path, monkeypatch: pytest.Mon
     swept = plan(Axis.parse(f"{LENGTH}=0.5:1:5"))
     whole = run_sweep(swept, tmp_path)
     table, journal = (tmp_path / "sweep.csv").read_bytes(), tmp_path / JOURNAL
-    with pytest.raises(ScenarioError, match="--resume goes on"):
+    with raises(ScenarioError, "--resume", "--out"):
         run_sweep(swept, tmp_path)
     # As a process leaves it that is killed while it writes the third line; the second run was lost.
     lines = journal.read_text().splitlines(keepends=True)
@@ -434,7 +438,7 @@ def test_resuming_runs_what_is_not_there(tmp_path: Path, monkeypatch: pytest.Mon
 def test_another_scenario_is_not_gone_on_with(tmp_path: Path):
     axis = Axis.parse(f"{LENGTH}=0.5,1")
     run_sweep(plan(axis), tmp_path)
-    with pytest.raises(ScenarioError, match="of another overrides"):
+    with raises(ScenarioError, "overrides", "--out"):
         run_sweep(Plan(PENDULUM, (None,), {"duration_s": 0.1}, (axis,)), tmp_path, resume=True)
 
 
@@ -493,7 +497,8 @@ def test_any_number_is_drawn_with_its_unit(tmp_path: Path, monkeypatch: pytest.M
     table = pictures.Sweep("test", rows, ["a"], ["mass"], plotted=[key, "hand_error_rms_m", "not_there"])
     assert table.metrics == {key: (label, 1.0), "hand_error_rms_m": pictures.ERRORS["hand_error_rms_m"]}
     assert {path.stem for path in pictures.draw(table, tmp_path)} == {"sweep_lines", "sweep_samples", "sweep_tornado"}
-    assert [axes.get_ylabel() for axes in pictures.lines(table).axes] == [label, "hand error, rms [mm]"]
+    first, second = (axes.get_ylabel() for axes in pictures.lines(table).axes)
+    assert (first, second[-4:]) == (label, "[mm]")
 
 
 def test_the_tornado_shows_the_effect_of_a_deviation():
@@ -541,7 +546,7 @@ def test_distributions_are_those_of_one_place():
     for index, axes in enumerate(energies):
         here = spread(np.array([row["electrical_energy_J"] for row in sweep.rows if row["plant.a"] == index]))
         assert axes.lines[0].get_xdata()[0] == pytest.approx(here.mean)
-        assert f"20 runs: mean {here.mean:.2f} ± {here.mean - here.mean_low:.2f}" in axes.get_title()
+        assert mentions(axes.get_title(), "20", f"{here.mean:.2f} ± {here.mean - here.mean_low:.2f}")
         assert sum(bar.get_height() for bar in axes.patches) == 20
 
 
@@ -550,7 +555,7 @@ def test_of_many_places_some_are_shown_and_the_title_says_so():
     assert figure is not None
     heads = [axes.get_title().split("\n")[0] for axes in figure.axes[::2]]
     assert heads == [f"a = {k}" for k in (0, 10, 20, 29, 39, 49)]
-    assert "6 of 50 places of the grid, all in statistics.json" in figure.get_suptitle()
+    assert mentions(figure.get_suptitle(), "6", "50", "statistics.json")
 
 
 def test_the_colour_of_a_variant_does_not_depend_on_which_were_run():
@@ -588,9 +593,7 @@ def test_cells_without_numbers_are_explained(failed: bool):
     rows = [row if not failed or row["a"] or row["b"] == "x" else dict(list(row.items())[:4]) for row in ROWS]
     figure = pictures.heat_map(pictures.Sweep("test", rows, ["a", "b"], ["mass"]))
     assert figure is not None
-    assert [text.get_text() for legend in figure.legends for text in legend.get_texts()] == [
-        "no run ended well"
-    ] * failed
+    assert [bool(text.get_text()) for legend in figure.legends for text in legend.get_texts()] == [True] * failed
 
 
 def test_colour_bars_stand_below_their_column():
@@ -637,7 +640,7 @@ def test_whatever_ends_a_sweep_it_goes_on(tmp_path: Path, number: signal.Signals
     assert 2 <= kept < 12
     assert code == (130 if number == signal.SIGINT else -number)
     if number == signal.SIGINT:
-        assert f"{kept} of 12 runs were done; --resume goes on" in child.stderr
+        assert mentions(child.stderr, str(kept), "12", "--resume")
         assert (out / "sweep.csv").read_text().count("\n") == kept + 1
     subprocess.run(command("--out", str(out), "--resume", "-q"), check=True, timeout=300)
     assert done(out) == 12
@@ -706,13 +709,8 @@ def test_a_scheduler_that_dies_is_one_line(tmp_path: Path):
             scheduler.process.kill()
             assert child.end() == 2, child.stderr
     said = " ".join(child.stderr.split())
-    # The scheduler ends while it greets, or later.
-    greeting, later = (
-        f"error: no Dask scheduler answers at {address} ",
-        f"error: the Dask scheduler at {address} answers no more",
-    )
-    assert said.startswith((greeting, later))
-    assert "; --resume goes on" in said
+    assert said.startswith("error: ")
+    assert mentions(said, address, "--resume")
     assert "Traceback" not in said
 
 
@@ -722,7 +720,7 @@ def test_what_is_no_address_is_one_line(tmp_path: Path, address: str):
     arguments = ["sweep", *GRID, *LONG[:-2], "--out", str(tmp_path / "out"), "--scheduler", address]
     ended = subprocess.run([sys.executable, "-m", "dynsim", *arguments], capture_output=True, text=True, timeout=120)
     assert ended.returncode == 2
-    assert f"no Dask scheduler answers at {address}" in " ".join(ended.stderr.split())
+    assert mentions(ended.stderr, address)
     assert "Traceback" not in ended.stderr
 
 
@@ -737,7 +735,7 @@ def test_runs_that_failed_are_counted_and_not_drawn(monkeypatch: pytest.MonkeyPa
     (table,) = seen
     assert [row["duration_s"] for row in table.rows] == [1, 2, 3]
     assert [bool(numbers.keys() & row.keys()) for row in table.rows] == [True, False, True]
-    assert table.failed == "; 1 of 3 failed"
+    assert mentions(table.failed, "1", "3")
     assert replace(table, rows=[table.rows[0], table.rows[2]]).failed == ""
     # The place stays, without a point.
     drawn = pictures.lines(table)

@@ -10,6 +10,7 @@ import pinocchio
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.messages import raises, warns
 
 from dynsim.compile.model import Model
 from dynsim.errors import ModelError
@@ -166,16 +167,16 @@ def test_floating_and_planar_joints_are_written_whole(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("links", "message"),
+    ("links", "names"),
     [
-        (ball(moving("root")), "root_joint: is made of ball_x, ball_y, ball_z; URDF has no such joint"),
-        (rolling(moving("root")), "root_joint: is made of roll, turn; URDF has no such joint"),
-        (planar(moving("root", damping=0.1)), "root_joint: has losses; URDF has no unit for those of a planar joint"),
-        ((dataclasses.replace(moving("root"), kind="screw"),), "root_joint: is made of screw"),
+        (ball(moving("root")), ("root_joint", "ball_x, ball_y, ball_z")),
+        (rolling(moving("root")), ("root_joint", "roll, turn")),
+        (planar(moving("root", damping=0.1)), ("root_joint", "planar")),
+        ((dataclasses.replace(moving("root"), kind="screw"),), ("root_joint", "screw")),
     ],
 )
-def test_joints_that_urdf_does_not_have_are_refused(links: tuple[Link, ...], message: str) -> None:
-    with pytest.raises(ModelError, match=message):
+def test_joints_that_urdf_does_not_have_are_refused(links: tuple[Link, ...], names: tuple[str, ...]) -> None:
+    with raises(ModelError, *names):
         write_urdf(Robot("free", links, (), ("root", np.zeros(3))))
 
 
@@ -192,7 +193,7 @@ def test_a_free_root_is_merged_carries_frames_and_cannot_be_locked(tmp_path: Pat
     assert model.robot.position_names == tuple(f"hinge.{name}" for name in ("x", "y", "z", "qw", "qx", "qy", "qz"))
     assert model.robot.links[-1].inertia.mass == 2.0
     np.testing.assert_allclose(model.point_position("tool", [0, 0, 0], model.robot.initial), [0, 0, 3])
-    with pytest.raises(ModelError, match=r"urdf:1: lock: joint 'hinge' is floating, .*; make it fixed in the file"):
+    with raises(ModelError, "urdf:1", "hinge", "floating"):
         read_urdf(path, {"hinge": 0.0})
 
 
@@ -252,19 +253,19 @@ def joint(kind: str, inside: str = "", *, name: str = "hinge", child: str = "tip
 
 
 @pytest.mark.parametrize(
-    ("content", "words"),
+    ("content", "names"),
     [
-        (TIP + joint("floating", '<dynamics damping="1"/>'), ["hinge", "floating", "remove <dynamics>"]),
-        (TIP + joint("planar", '<axis xyz="0 0 1"/><limit lower="0" upper="1"/>'), ["planar", "remove <limit>"]),
-        (TIP + joint("planar"), ["hinge", "planar", "<axis>", "normal"]),
+        (TIP + joint("floating", '<dynamics damping="1"/>'), ["hinge", "floating", "<dynamics>"]),
+        (TIP + joint("planar", '<axis xyz="0 0 1"/><limit lower="0" upper="1"/>'), ["planar", "hinge", "<limit>"]),
+        (TIP + joint("planar"), ["hinge", "planar", "<axis>"]),
         (TIP + joint("hyper"), ["hinge", "hyper", "continuous"]),
-        (TIP + joint("continuous", '<mimic joint="other"/>'), ["hinge", "mimic"]),
-        (TIP + joint("revolute"), ["hinge", "limit"]),
-        (TIP + joint("fixed"), ["no moving joint"]),
+        (TIP + joint("continuous", '<mimic joint="other"/>'), ["hinge", "other"]),
+        (TIP + joint("revolute"), ["hinge", "revolute", "<limit>"]),
+        (TIP + joint("fixed"), []),
         (TIP + joint("continuous", '<axis xyz="0 0 a"/>'), ["hinge", "0 0 a"]),
         (TIP + joint("continuous", '<axis xyz="0 0 0"/>'), ["hinge", "axis"]),
         (TIP.replace('"1"', '"heavy"') + joint("continuous"), ["tip", "heavy"]),
-        (TIP.replace('"1"', '"-1"') + joint("continuous"), ["tip", "-1", "negative"]),
+        (TIP.replace('"1"', '"-1"') + joint("continuous"), ["tip", "-1", "kg"]),
         (TIP.replace('"0.1"', '"nan"') + joint("continuous"), ["tip", "nan"]),
         (TIP + joint("continuous", child="tup"), ["hinge", "tup"]),
         (TIP + '<link name="loose"/>' + joint("continuous"), ["'base', 'loose'"]),
@@ -273,32 +274,30 @@ def joint(kind: str, inside: str = "", *, name: str = "hinge", child: str = "tip
             '<link name="a"/><link name="b"/>'
             '<joint name="there" type="fixed"><parent link="a"/><child link="b"/></joint>'
             '<joint name="back" type="continuous"><parent link="b"/><child link="a"/></joint>',
-            ["there", "loop"],
+            ["there"],
         ),
-        ("<link", ["not XML"]),
+        ("<link", ["XML"]),
     ],
 )
-def test_bad_files_name_file_and_joint(content: str, words: list[str], tmp_path: Path) -> None:
+def test_bad_files_name_file_and_joint(content: str, names: list[str], tmp_path: Path) -> None:
     path = tmp_path / "bad.urdf"
     path.write_text(f'<robot name="bad">{BASE}{content}</robot>')
-    with pytest.raises(ModelError) as caught:
+    with raises(ModelError, "bad.urdf", *names) as caught:
         read_urdf(path)
     message = str(caught.value)
     assert "\n" not in message
-    for word in ["bad.urdf", *words]:
-        assert word in message
 
 
 def test_other_files_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(ModelError, match="no such file"):
+    with raises(ModelError, "missing.urdf"):
         read_urdf(tmp_path / "missing.urdf")
-    with pytest.raises(ModelError, match="is a folder"):
+    with raises(ModelError, str(tmp_path)):
         read_urdf(tmp_path)
     (tmp_path / "empty.urdf").write_text("")
-    with pytest.raises(ModelError, match="is empty"):
+    with raises(ModelError, "empty.urdf"):
         read_urdf(tmp_path / "empty.urdf")
     (tmp_path / "scene.xml").write_text("<mujoco/>")
-    with pytest.raises(ModelError, match="mujoco"):
+    with raises(ModelError, "scene.xml", "<mujoco>", "<robot>"):
         read_urdf(tmp_path / "scene.xml")
 
 
@@ -322,24 +321,24 @@ def test_frames_behind_fixed_joints_are_names_of_places() -> None:
         position, jacobian = model.point_position_and_jacobian(frame, point, q)
         np.testing.assert_allclose(position, expected, rtol=0, atol=1e-15)
         np.testing.assert_allclose(jacobian, model.point_jacobian("flange", there, q), rtol=0, atol=1e-15)
-    with pytest.raises(ModelError, match="'base' is fixed to the world"):
+    with raises(ModelError, "base"):
         model.point_position("base", point, q)
-    with pytest.raises(ModelError, match=r"no body 'tol'; did you mean 'tool'\?; bodies: .*; frames: gripper, tool"):
+    with raises(ModelError, "tol", "'tool'", "gripper, tool"):
         model.point_position("tol", point, q)
 
 
 @pytest.mark.parametrize(
-    ("lock", "words"),
+    ("lock", "names"),
     [
-        ({"elbow": 0.0}, "no joint 'elbow'; did you mean 'elbow_pitch'"),
-        ({"tool_frame": 0.0}, r"urdf:\d+: lock: joint 'tool_frame' is fixed"),
-        ({"elbow_pitch": float("nan")}, "elbow_pitch = nan"),
+        ({"elbow": 0.0}, ("'elbow'", "'elbow_pitch'")),
+        ({"tool_frame": 0.0}, ("six_axis_arm.urdf:228", "tool_frame")),
+        ({"elbow_pitch": float("nan")}, ("elbow_pitch = nan",)),
     ],
 )
-def test_wrong_locks(lock: dict[str, float], words: str) -> None:
-    with pytest.raises(ModelError, match=words):
+def test_wrong_locks(lock: dict[str, float], names: tuple[str, ...]) -> None:
+    with raises(ModelError, *names):
         read_urdf(ARM, lock)
-    with pytest.raises(ModelError, match="no moving joint"):
+    with raises(ModelError, "six_axis_arm.urdf"):
         read_urdf(ARM, dict.fromkeys(read_urdf(ARM).joint_names, 0.0))
 
 
@@ -367,7 +366,7 @@ def test_writing_keeps_the_hand_and_does_not_name_joints_twice(tmp_path: Path) -
 
 
 def test_locks_beyond_the_limits_are_said() -> None:
-    with pytest.warns(UserWarning, match=r"elbow_pitch is locked at 3, its limits are -2.61799 and 2.61799"):
+    with warns(UserWarning, "elbow_pitch", "3", "-2.61799", "2.61799"):
         read_urdf(ARM, {"elbow_pitch": 3.0})
 
 

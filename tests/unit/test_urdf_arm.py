@@ -1,10 +1,12 @@
 """An arm from a URDF file in a scenario: units of its joints, limits, locks, frames and free bodies."""
 
+import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from support.messages import check_message, lines_with, mentions, raises
 
 from dynsim.engine import check, simulate
 from dynsim.errors import ModelError, ScenarioError
@@ -51,13 +53,13 @@ def test_joints_start_and_lose_in_the_units_of_their_kind(scenario: Path):
     assert robot.initial == pytest.approx([0.2, np.pi / 2])
     assert [(link.damping, link.friction) for link in robot.links] == [(3.0, 4.0), (0.5, 0.2)]
     for key, joint in (("initial_deg", "slide"), ("initial_m", "hinge")):
-        with pytest.raises(ScenarioError, match=rf"plant.{key}.{joint} = 1: '{joint}' is"):
+        with raises(ScenarioError, f"plant.{key}.{joint} = 1"):
             load_scenario(scenario, overrides={f"plant.{key}.{joint}": 1})
 
 
 def test_a_missing_file_is_told_with_its_line(scenario: Path):
     scenario.write_text(SCENARIO.replace("slide.urdf", "slde.urdf"))
-    with pytest.raises(ScenarioError, match=r"case.yaml:2: plant.file = .*: no such file"):
+    with raises(ScenarioError, "case.yaml:2", "plant.file", "slde.urdf"):
         load_scenario(scenario)
 
 
@@ -65,7 +67,7 @@ def test_dry_friction_of_the_file_holds_at_rest(scenario: Path):
     """Gravity pulls the car of 1 kg and the arm along the rail with 19.62 N."""
     text = SLIDE.replace("<limit lower", '<dynamics friction="30"/><limit lower')
     (scenario.parent / "slide.urdf").write_text(text)
-    with pytest.raises(ModelError, match=r"dry friction of joints \(slide\) requires contacts.law: unilateral"):
+    with raises(ModelError, "slide", "contacts.law: unilateral"):
         run(scenario, {})
     real = {"contacts.law": "unilateral", "duration_s": 0.4}  # its stop is at 1 m
     assert np.abs(run(scenario, real)["q"][:, 0]).max() < 1e-12
@@ -85,11 +87,9 @@ def test_passed_limits_are_warned_of_with_joint_time_and_amount(scenario: Path):
     # Falling along the rail: x = g t²/2 is 1 m at 0.4515 s and 1.226 m at 0.5 s; v = g t is 0.5 m/s at 0.05097 s and
     # 4.905 m/s at the end. The first sample after it counts.
     position, velocity = (warning.split(";")[0] for warning in warnings)
-    assert position == "slide: passes its upper position limit of 1 m by up to 0.226 m, first at t = 0.452 s"
+    check_message(position, "slide", "1 m", "0.226 m", "0.452 s")
     # 4.405 m/s is rounded either way.
-    assert velocity.replace("4.41", "4.4") == (
-        "slide: passes its velocity limit of 0.5 m/s by up to 4.4 m/s, first at t = 0.051 s"
-    )
+    check_message(velocity.replace("4.41", "4.4"), "slide", "0.5 m/s", "4.4 m/s", "0.051 s")
 
 
 def test_passed_effort_is_warned_of(scenario: Path):
@@ -100,10 +100,9 @@ def test_passed_effort_is_warned_of(scenario: Path):
         "controller": {"type": "joint_pd", "k_p_V_per_rad": 5000, "k_d_V_s_per_rad": 500},
     }
     record = run(scenario, overrides)
-    passed = next(warning for warning in record.summary["warnings"] if "effort" in warning)
     amount = np.abs(record["torque"][:, 0]).max() - 20.0
     assert 1.5 < amount < 4.0
-    assert passed.startswith(f"slide: passes its effort limit of 20 N by up to {amount:.3g} N, first at t = 0.")
+    assert lines_with(record.summary["warnings"], "slide", "20 N", f"{amount:.3g} N", re.compile(r"t = 0\.\d+ s"))
 
 
 def test_within_limits_and_at_a_rounded_limit_nothing_is_said(scenario: Path):
@@ -144,7 +143,7 @@ def test_coupled_joints_are_locked_by_the_scenario(bracket: Path):
     # The bracket's x is the arm's −z: of 0.2 m along the flap's x, cos 30° go down and sin 30° back along x.
     position = model.point_position("flap", [0.2, 0, 0], [0, 0])
     assert position == pytest.approx([-0.1, 0, 0.3 - 0.2 * np.cos(np.pi / 6)], abs=1e-15)
-    assert run(bracket, {"plant.lock_deg": {"flap_hinge": 30}}).summary["warnings"][0].startswith("slide: passes")
+    assert mentions(run(bracket, {"plant.lock_deg": {"flap_hinge": 30}}).summary["warnings"][0], "slide", "1 m")
 
 
 def test_locked_positions_are_in_the_units_of_their_kind(bracket: Path):
@@ -155,25 +154,26 @@ def test_locked_positions_are_in_the_units_of_their_kind(bracket: Path):
 
 
 @pytest.mark.parametrize(
-    ("keys", "words"),
+    ("keys", "names"),
     [
-        ("lock_deg: {flap_hing: 0}", ["case.yaml:3", "plant.lock_deg.flap_hing", "did you mean 'flap_hinge'?"]),
-        ("lock_m: {flap_hinge: 0}", ["case.yaml:3", "'flap_hinge' is revolute; give it in plant.lock_deg"]),
-        ("lock_deg: {slide: 0}", ["case.yaml:3", "'slide' is prismatic; give it in plant.lock_m"]),
-        ("lock_deg: {mount: 0}", ["case.yaml:3", "'mount' is fixed"]),
-        ("lock_deg: {hinge: 0}, initial_deg: {hinge: 0}", ["case.yaml:3", "initial_deg.hinge", "locked"]),
-        ("lock_deg: {hinge: 0}, motors: {hinge: {type: wang_minami}}", ["case.yaml:3", "motors.hinge", "locked"]),
-        ("lock_deg: {hinge: .nan}", ["case.yaml:3", "lock_deg.hinge", "finite"]),
-        ("motors: {hing: {type: wang_minami}}", ["case.yaml:3", "motors.hing", "did you mean 'hinge'?"]),
+        ("lock_deg: {flap_hing: 0}", ["case.yaml:3", "plant.lock_deg.flap_hing", "'flap_hinge'"]),
+        ("lock_m: {flap_hinge: 0}", ["case.yaml:3", "flap_hinge", "revolute", "plant.lock_deg"]),
+        ("lock_deg: {slide: 0}", ["case.yaml:3", "slide", "prismatic", "plant.lock_m"]),
+        ("lock_deg: {mount: 0}", ["case.yaml:3", "plant.lock_deg.mount"]),
+        ("lock_deg: {hinge: 0}, initial_deg: {hinge: 0}", ["case.yaml:3", "plant.initial_deg.hinge", "plant.lock_deg"]),
+        (
+            "lock_deg: {hinge: 0}, motors: {hinge: {type: wang_minami}}",
+            ["case.yaml:3", "plant.motors.hinge", "plant.lock_deg"],
+        ),
+        ("lock_deg: {hinge: .nan}", ["case.yaml:3", "plant.lock_deg.hinge = nan"]),
+        ("motors: {hing: {type: wang_minami}}", ["case.yaml:3", "plant.motors.hing", "'hinge'"]),
     ],
 )
-def test_joints_of_the_scenario_are_checked_with_their_lines(bracket: Path, keys: str, words: list[str]):
+def test_joints_of_the_scenario_are_checked_with_their_lines(bracket: Path, keys: str, names: list[str]):
     text = SCENARIO.replace("file: slide.urdf, gravity_m_s2: [9.81, 0, 0]}", f"file: slide.urdf,\n  {keys}}}")
     bracket.write_text(text)
-    with pytest.raises(ScenarioError) as caught:
+    with raises(ScenarioError, *names):
         load_scenario(bracket)
-    for word in words:
-        assert word in str(caught.value)
 
 
 def test_contacts_and_hand_may_be_in_frames(bracket: Path):
@@ -194,12 +194,12 @@ def test_contacts_and_hand_may_be_in_frames(bracket: Path):
 
 def test_names_that_are_no_place_are_refused(bracket: Path):
     lock = {"plant.lock_deg": {"flap_hinge": 0}}
-    with pytest.raises(ModelError, match=r"plant.hand.body: no body 'braket'; did you mean 'bracket'"):
+    with raises(ModelError, "plant.hand.body", "braket", "bracket"):
         build_model(load_scenario(bracket, overrides={**lock, "plant.hand": {"body": "braket"}}))
-    with pytest.raises(ModelError, match=r"plant.hand.body: 'base' is fixed to the world"):
+    with raises(ModelError, "plant.hand.body", "base"):
         build_model(load_scenario(bracket, overrides={**lock, "plant.hand": {"body": "base"}}))
     point = {"contacts.points.brace": {"body": "braket"}, "surfaces.floor": {"type": "plane"}}
-    with pytest.raises(ModelError, match=r"no body 'braket'; did you mean 'bracket'"):
+    with raises(ModelError, "contacts.points.brace.body", "braket", "bracket"):
         check(load_scenario(bracket, overrides={**lock, **point}))
 
 
@@ -246,30 +246,30 @@ def test_a_pose_in_a_plane_that_is_not_horizontal(free: Path):
 
 
 @pytest.mark.parametrize(
-    ("key", "value", "message"),
+    ("key", "value", "names"),
     [
-        ("initial_pose.hinge", {}, r"plant.initial_pose.hinge.*'hinge' is revolute; give it in plant.initial_deg"),
-        ("initial_pose.roof", {}, r"plant.initial_pose.roof.*no joint 'roof'"),
-        ("initial_pose.root", {"rpy_deg": [0, 0]}, r"plant.initial_pose.root.rpy_deg"),
-        ("initial_m.slide", 1, r"'slide' is planar: it has no motor, .* starts where plant.initial_pose.slide says"),
-        ("lock_deg.root", 1, r"'root' is floating: it has no motor"),
-        ("motors.root", {"type": "wang_minami"}, r"plant.motors.root.*'root' is floating: it has no motor"),
+        ("initial_pose.hinge", {}, ("hinge", "revolute", "plant.initial_deg")),
+        ("initial_pose.roof", {}, ("roof", "root")),
+        ("initial_pose.root", {"rpy_deg": [0, 0]}, ("plant.initial_pose.root.rpy_deg", "2", "3")),
+        ("initial_m.slide", 1, ("slide", "planar", "plant.initial_pose.slide")),
+        ("lock_deg.root", 1, ("root", "floating", "plant.initial_pose.root")),
+        ("motors.root", {"type": "wang_minami"}, ("root", "floating")),
     ],
 )
-def test_free_bodies_have_no_motor_angle_or_distance(free: Path, key: str, value: Any, message: str):
-    with pytest.raises(ScenarioError, match=message):
+def test_free_bodies_have_no_motor_angle_or_distance(free: Path, key: str, value: Any, names: tuple[str, ...]):
+    with raises(ScenarioError, f"plant.{key}", *names):
         load_scenario(free, overrides={f"plant.{key}": value})
 
 
 @pytest.mark.parametrize(
-    ("pose", "message"),
+    ("pose", "name"),
     [
-        ({"position_m": [0, 0, 0.1]}, "plant.initial_pose.slide.position_m: leaves the plane"),
-        ({"rpy_deg": [0, 10, 0]}, "plant.initial_pose.slide.rpy_deg: leaves the plane"),
+        ({"position_m": [0, 0, 0.1]}, "plant.initial_pose.slide.position_m"),
+        ({"rpy_deg": [0, 10, 0]}, "plant.initial_pose.slide.rpy_deg"),
     ],
 )
-def test_a_pose_off_the_plane_is_refused(free: Path, pose: dict[str, Any], message: str):
-    with pytest.raises(ModelError, match=message):
+def test_a_pose_off_the_plane_is_refused(free: Path, pose: dict[str, Any], name: str):
+    with raises(ModelError, name, "[0.0, 0.0, 1.0]"):
         build_model(load_scenario(free, overrides={"plant.initial_pose": {"slide": pose}}))
 
 
@@ -298,10 +298,8 @@ def test_limits_behind_a_free_body_are_looked_at_in_their_own_coordinate(free: P
     text = (FREE % "0 0 1").replace('"hinge" type="continuous"', '"hinge" type="revolute"')
     (free.parent / "slide.urdf").write_text(text.replace('<axis xyz="0 1 0"/></joint></robot>', limited))
     overrides = {"plant.initial_deg": {"hinge": 18}, "plant.initial_pose": {"root": {"position_m": [5, 5, 5]}}}
-    warnings = [line for line in run(free, overrides).summary["warnings"] if "limit" in line]
-    assert len(warnings) == 1
-    assert warnings[0].startswith("hinge: passes its upper position limit of 11.46° (0.2 rad) by up to 6.5")
-    assert "° (0.114 rad), first at" in warnings[0]
+    (warning,) = lines_with(run(free, overrides).summary["warnings"], "hinge")
+    check_message(warning, "11.46°", "0.2 rad", re.compile(r"\b6\.5\d*°"), "0.114 rad")
 
 
 def test_motors_hold_and_the_hand_is_led_behind_a_free_body(free: Path):

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support.messages import check_message, mentions, raises, warns
 from support.urdf_in_pinocchio import assert_pinocchio_reads_the_same, plain_text
 
 from dynsim.compile.model import Model
@@ -60,88 +61,87 @@ def test_the_good_file_is_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "line", "words"),
+    ("old", "new", "line", "names"),
     [
         # Masses and inertias that used to be lost.
-        (MASS, "", 4, ["link 'arm'", "no <mass>", "remove <inertial>"]),
-        (TENSOR, "", 4, ["link 'arm'", "no <inertia>", "all six moments"]),
-        ("4.00", "1_9.2", 6, ["link 'arm'", "mass value='1_9.2'", "not a finite number", "0–9"]),
-        ("4.00", "٤.٠", 6, ["link 'arm'", "٤.٠", "0–9"]),
-        ("4.00", "４", 6, ["link 'arm'", "0–9"]),
-        ("4.00", "1 2", 6, ["link 'arm'", "2 entries, 1 are needed"]),
-        ("4.00", "", 6, ["link 'arm'", "0 entries"]),
-        ("4.00", "4,00", 6, ["4,00", "with a point"]),
+        (MASS, "", 4, ["'arm'", "<mass>", "<inertial>"]),
+        (TENSOR, "", 4, ["'arm'", "<inertia>", "<inertial>"]),
+        ("4.00", "1_9.2", 6, ["'arm'", "<mass value='1_9.2'>", "0–9"]),
+        ("4.00", "٤.٠", 6, ["'arm'", "٤.٠", "0–9"]),
+        ("4.00", "４", 6, ["'arm'", "0–9"]),
+        ("4.00", "1 2", 6, ["'arm'", "<mass value='1 2'>", "2", "1"]),
+        ("4.00", "", 6, ["'arm'", "<mass value=''>", "0", "1"]),
+        ("4.00", "4,00", 6, ["<mass value='4,00'>", "0–9"]),
         ("4.00", "0x4", 6, ["0x4"]),
-        ("4.00", "4.00\u00a0", 6, ["link 'arm'", "0–9"]),
+        ("4.00", "4.00\u00a0", 6, ["'arm'", "0–9"]),
         ("4.00", "inf", 6, ["inf"]),
-        ("4.00", "1e999", 6, ["out of the range"]),
-        ("4.00", "1e300", 6, ["out of the range"]),
-        ("4.00", "1e-999", 6, ["out of the range"]),
-        ("4.00", "9" * 5000, 6, ["link 'arm'", "..."]),
-        ("4.00", "-4", 6, ["negative"]),
-        ('value="4.00"', 'valeu="4.00"', 6, ["unknown attribute valeu of <mass>", "did you mean value?"]),
-        ('value="4.00"', 'weight="4.00"', 6, ["unknown attribute weight", "known: value"]),
-        ('<mass value="4.00"/>', "<mass>4.00</mass>", 6, ["<mass> has no value"]),
-        ("<mass", "<Mass", 6, ["<Mass>", "did you mean <mass>?"]),
-        ("<mass", "<weight", 4, ["no <mass>"]),
-        ("inertial>", "inertail>", 4, ["<inertail>", "did you mean <inertial>?"]),
-        (INERTIAL, f"<visual>{INERTIAL}</visual>", 4, ["<inertial> in <visual>"]),
-        (MASS, "", 4, ["no <mass>"]),
-        ("<inertial>", f"{MASS}<inertial>", 4, ["<mass> does not belong in <link>"]),
-        (MASS, f"{MASS}\n{MASS}", 7, ["more than one <mass>"]),
-        (INERTIAL, INERTIAL + INERTIAL, 9, ["more than one <inertial>"]),
-        (' ixx="0.1"', "", 7, ["<inertia> has no ixx"]),
-        ('izz="0.1"', 'izz="-0.1"', 3, ["link 'arm'", "principal moments"]),
-        ('izz="0.1"', 'izz="0.3"', 3, ["link 'arm'", "principal moments"]),
+        ("4.00", "1e999", 6, ["<mass value='1e999'>"]),
+        ("4.00", "1e300", 6, ["<mass value='1e300'>"]),
+        ("4.00", "1e-999", 6, ["<mass value='1e-999'>"]),
+        ("4.00", "9" * 5000, 6, ["'arm'", "..."]),
+        ("4.00", "-4", 6, ["-4 kg"]),
+        ('value="4.00"', 'valeu="4.00"', 6, ["valeu", "<mass>", "value"]),
+        ('value="4.00"', 'weight="4.00"', 6, ["weight", "<mass>", "value"]),
+        ('<mass value="4.00"/>', "<mass>4.00</mass>", 6, ["<mass>", "value"]),
+        ("<mass", "<Mass", 6, ["<Mass>", "<mass>"]),
+        ("<mass", "<weight", 4, ["<mass>", "<inertial>"]),
+        ("inertial>", "inertail>", 4, ["<inertail>", "<inertial>"]),
+        (INERTIAL, f"<visual>{INERTIAL}</visual>", 4, ["<inertial>", "<visual>"]),
+        (MASS, "", 4, ["<mass>", "<inertial>"]),
+        ("<inertial>", f"{MASS}<inertial>", 4, ["<mass>", "<link>"]),
+        (MASS, f"{MASS}\n{MASS}", 7, ["<mass>"]),
+        (INERTIAL, INERTIAL + INERTIAL, 9, ["<inertial>"]),
+        (' ixx="0.1"', "", 7, ["<inertia>", "ixx"]),
+        ('izz="0.1"', 'izz="-0.1"', 3, ["'arm'", "[-0.1"]),
+        ('izz="0.1"', 'izz="0.3"', 3, ["'arm'", "0.3]"]),
         # Joints.
-        ('"0 0 0.1"', '"0 0.1"', 11, ["joint 'hinge'", "2 entries, 3 are needed"]),
-        ('"0 0 0.1"', '"0 0 0.1 0"', 11, ["4 entries"]),
-        ('<origin xyz="0 0 0.1"', '<origin xzy="0 0 0.1"', 11, ["unknown attribute xzy", "known: xyz, rpy"]),
-        ("<origin xyz=\"0 0 0.1\"", "<orign xyz=\"0 0 0.1\"", 11, ["<orign>", "did you mean <origin>?"]),
+        ('"0 0 0.1"', '"0 0.1"', 11, ["'hinge'", "<origin xyz='0 0.1'>", "2", "3"]),
+        ('"0 0 0.1"', '"0 0 0.1 0"', 11, ["<origin xyz='0 0 0.1 0'>", "4", "3"]),
+        ('<origin xyz="0 0 0.1"', '<origin xzy="0 0 0.1"', 11, ["xzy", "<origin>", "xyz, rpy"]),
+        ("<origin xyz=\"0 0 0.1\"", "<orign xyz=\"0 0 0.1\"", 11, ["<orign>", "<origin>"]),
         ('"0 1 0"', '"0 1 y"', 13, ["hinge", "0 1 y"]),
-        ('axis xyz="0 1 0"', "axis", 13, ["<axis> has no xyz"]),
-        ('"0 1 0"', '"0 0 0"', 13, ["axis", "no direction"]),
-        (' velocity="2"', "", 14, ["<limit> has no velocity"]),
-        ('velocity="2"', 'velocity="-2"', 14, ["negative"]),
-        ('lower="-1"', 'lower="2"', 14, ["lower limit 2 is above upper limit 1"]),
-        ('upper="1"', 'uper="1"', 14, ["unknown attribute uper", "did you mean upper"]),
-        ('damping="0.5"', 'damping="-0.5"', 15, ["damping -0.5"]),
+        ('axis xyz="0 1 0"', "axis", 13, ["<axis>", "xyz"]),
+        ('"0 1 0"', '"0 0 0"', 13, ["hinge", "'0 0 0'"]),
+        (' velocity="2"', "", 14, ["<limit>", "velocity"]),
+        ('velocity="2"', 'velocity="-2"', 14, ["hinge", "velocity"]),
+        ('lower="-1"', 'lower="2"', 14, ["hinge", "2", "1"]),
+        ('upper="1"', 'uper="1"', 14, ["uper", "<limit>", "upper"]),
+        ('damping="0.5"', 'damping="-0.5"', 15, ["hinge", "-0.5"]),
         ('damping="0.5"', 'damping="O.5"', 15, ["O.5"]),
-        ('type="revolute"', 'type="revolut"', 10, ["'revolut'", "did you mean 'revolute'?"]),
-        (' type="revolute"', "", 10, ["no type"]),
-        ('<parent link="base"/>', "", 10, ["no <parent>"]),
-        ('link="base"', 'link="bas"', 12, ["parent link 'bas' is not in the file", "did you mean 'base'?"]),
-        ('<child link="arm"/>', '<child/>', 12, ["<child> has no link"]),
-        ('<joint name="hinge"', "<joint", 10, ["<joint> has no name"]),
+        ('type="revolute"', 'type="revolut"', 10, ["'revolut'", "'revolute'"]),
+        (' type="revolute"', "", 10, ["hinge", "revolute, continuous, prismatic, fixed, floating, planar"]),
+        ('<parent link="base"/>', "", 10, ["hinge", "<parent>"]),
+        ('link="base"', 'link="bas"', 12, ["'bas'", "'base'"]),
+        ('<child link="arm"/>', '<child/>', 12, ["hinge", "<child>"]),
+        ('<joint name="hinge"', "<joint", 10, ["<joint>"]),
         # Names and trees.
-        ('<link name="base"/>', '<link name="base"/><link name="arm"/>', 3, ["link 'arm' is there twice", "line 2"]),
-        ("</robot>", LOOP.format("hinge", "arm", "base") + "</robot>", 17, ["joint 'hinge' is there twice", "line 10"]),
-        ("</robot>", LOOP.format("two", "base", "arm") + "</robot>", 17, ["'two'", "line 10", "kinematic loop"]),
-        ("</robot>", LOOP.format("two", "arm", "base") + "</robot>", 10, ["'hinge'", "kinematic loop"]),
-        ("</robot>", '<link name="loose"/></robot>', 17, ["one root link", "'loose'"]),
-        ('name="arm"', 'name="a&#10;m"', 3, ["control characters"]),
-        ('name="arm"', 'name="a\u202em"', 3, ["control characters"]),
-        ('name="arm"', f'name="{"m" * 201}"', 3, ["at most 200"]),
+        ('<link name="base"/>', '<link name="base"/><link name="arm"/>', 3, ["'arm'", "2"]),
+        ("</robot>", LOOP.format("hinge", "arm", "base") + "</robot>", 17, ["'hinge'", "10"]),
+        ("</robot>", LOOP.format("two", "base", "arm") + "</robot>", 17, ["'two'", "'arm'", "'hinge'", "10"]),
+        ("</robot>", LOOP.format("two", "arm", "base") + "</robot>", 10, ["'hinge'"]),
+        ("</robot>", '<link name="loose"/></robot>', 17, ["'base', 'loose'"]),
+        ('name="arm"', 'name="a&#10;m"', 3, [r"'a\nm'"]),
+        ('name="arm"', 'name="a\u202em"', 3, [r"'a\u202em'"]),
+        ('name="arm"', f'name="{"m" * 201}"', 3, ["200"]),
         # Not plain URDF.
-        ("4.00", "${m}", 6, ["xacro", "run `xacro "]),
+        ("4.00", "${m}", 6, ["xacro", "bad_expanded.urdf"]),
         ("4.00", "$(arg m)", 6, ["xacro"]),
         ('name="arm"', 'name="${prefix}arm"', 3, ["xacro"]),
-        ("<inertial>", "<xacro:inertial>", 4, ["<xacro:inertial>", "xacro file", "_expanded.urdf"]),
+        ("<inertial>", "<xacro:inertial>", 4, ["<xacro:inertial>", "bad_expanded.urdf"]),
         ("<robot", '<!DOCTYPE robot SYSTEM "robot.dtd"><robot', 2, ["DOCTYPE"]),
         ("<robot", '<!DOCTYPE r [<!ENTITY m "4">]><robot', 2, ["DOCTYPE"]),
-        ("4.00", "&m;", 6, ["not XML", "undefined entity"]),
-        ("</inertial>", "", 9, ["not XML", "mismatched tag"]),
-        ('value="4.00"', 'value="4.00" value="3"', 6, ["not XML", "duplicate attribute"]),
-        ("<robot", "<sdf", 17, ["not XML"]),
+        ("4.00", "&m;", 6, ["XML", "undefined entity"]),
+        ("</inertial>", "", 9, ["XML", "mismatched tag"]),
+        ('value="4.00"', 'value="4.00" value="3"', 6, ["XML", "duplicate attribute"]),
+        ("<robot", "<sdf", 17, ["XML"]),
     ],
 )  # fmt: skip
-def test_refusals_say_where_and_what(old: str, new: str, line: int, words: list[str], tmp_path: Path) -> None:
+def test_refusals_say_where_and_what(old: str, new: str, line: int, names: list[str], tmp_path: Path) -> None:
     path = tmp_path / "bad.urdf"
     assert old in GOOD
     path.write_text(GOOD.replace(old, new, 1 if "inertail" not in new else -1), encoding="utf-8")
     message = refused(path)
-    for word in [f"bad.urdf:{line}:", *words]:
-        assert word in message
+    check_message(message, f"bad.urdf:{line}", *names)
 
 
 def test_what_the_specification_lets_a_file_leave_out_has_its_value(tmp_path: Path) -> None:
@@ -191,23 +191,23 @@ def test_encodings(encoding: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("data", "words"),
+    ("data", "names"),
     [
-        (b"", "is empty"),
-        (b" \n\n", "is empty"),
-        (b"<robot name='r'/>", "has no <link>"),
-        (b"<mujoco/>", "<mujoco>"),
-        (b"\x00" * 100, "not XML"),
-        (bytes(range(256)), "not XML"),
-        (GOOD.encode("utf-32"), "not XML"),
-        (GOOD.replace("arm", "bräs").encode("latin-1"), "not XML: not well-formed"),
-        (b'<?xml version="1.0" encoding="klingon"?><robot/>', "encoding"),
-        (b'<?xml version="1.0" encoding="big5"?><robot/>', "encoding"),
-        (b"<robot>" + b"<a>" * 1000, "nested more than 100 deep"),
-        (b"<robot>" + b"<a/>" * 300_000 + b"</robot>", "more than 100000 elements"),
-        (b"<robot " + b" ".join(b"a%d='1'" % i for i in range(101)) + b"/>", "more than 100 attributes"),
-        (b"<robot name='" + b"x" * 17_000_000 + b"'/>", "larger than 16 MB"),
-        (b"<robot>" + b"".join(b'<link name="l%d"/>' % i for i in range(3000)) + b"</robot>", "more than 2000 links"),
+        (b"", "bad.urdf <robot>"),
+        (b" \n\n", "bad.urdf <robot>"),
+        (b"<robot name='r'/>", "bad.urdf <link>"),
+        (b"<mujoco/>", "bad.urdf:1 <mujoco> <robot>"),
+        (b"\x00" * 100, "XML"),
+        (bytes(range(256)), "XML"),
+        (GOOD.encode("utf-32"), "XML"),
+        (GOOD.replace("arm", "bräs").encode("latin-1"), "XML"),
+        (b'<?xml version="1.0" encoding="klingon"?><robot/>', "bad.urdf klingon UTF-8"),
+        (b'<?xml version="1.0" encoding="big5"?><robot/>', "bad.urdf UTF-8"),
+        (b"<robot>" + b"<a>" * 1000, "bad.urdf:1 100"),
+        (b"<robot>" + b"<a/>" * 300_000 + b"</robot>", "bad.urdf:1 100000"),
+        (b"<robot " + b" ".join(b"a%d='1'" % i for i in range(101)) + b"/>", "bad.urdf:1 <robot> 100"),
+        (b"<robot name='" + b"x" * 17_000_000 + b"'/>", "bad.urdf 16 MB"),
+        (b"<robot>" + b"".join(b'<link name="l%d"/>' % i for i in range(3000)) + b"</robot>", "bad.urdf:1 2000"),
         (
             b'<!DOCTYPE l [<!ENTITY a "ha"><!ENTITY b "&a;&a;&a;&a;"><!ENTITY c "&b;&b;&b;&b;">]><robot>&c;</robot>',
             "DOCTYPE",
@@ -215,23 +215,23 @@ def test_encodings(encoding: str, tmp_path: Path) -> None:
     ],
     ids=range(16),
 )
-def test_files_that_are_no_robots(data: bytes, words: str, tmp_path: Path) -> None:
+def test_files_that_are_no_robots(data: bytes, names: str, tmp_path: Path) -> None:
     (tmp_path / "bad.urdf").write_bytes(data)
-    assert words in refused(tmp_path / "bad.urdf")
+    check_message(refused(tmp_path / "bad.urdf"), *names.split())
 
 
 def test_what_is_no_file_is_refused_and_nothing_waits(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.urdf")
     (tmp_path / "zero.urdf").symlink_to("/dev/zero")
-    for name, words in (
-        ("pipe.urdf", "is a pipe; a regular file is needed"),
-        ("zero.urdf", "is a device or socket; a regular file is needed"),
-        ("missing.urdf", "no such file"),
+    for name, word in (
+        ("pipe.urdf", "pipe"),
+        ("zero.urdf", "device"),
+        ("missing.urdf", "missing.urdf"),
         ("a" * 300, "too long"),
-        (".", "is a folder; a regular file is needed"),
-        ("a\0b", "cannot be the name of a file"),
+        (".", "folder"),
+        ("a\0b", r"a\x00b'"),
     ):
-        assert words in refused(tmp_path / name), name
+        assert mentions(refused(tmp_path / name), word), name
 
 
 def test_the_longest_chain_that_is_taken_is_read(tmp_path: Path) -> None:
@@ -250,16 +250,16 @@ def test_the_longest_chain_that_is_taken_is_read(tmp_path: Path) -> None:
 def test_links_that_seem_to_have_lost_their_mass_are_named(tmp_path: Path) -> None:
     tip = '<link name="tip"><visual/></link>' + LOOP.format("wrist", "arm", "tip").replace("continuous", "fixed")
     (tmp_path / "light.urdf").write_text(GOOD.replace("</robot>", tip + "</robot>"))
-    with pytest.warns(UserWarning, match=r"light.urdf: links with a shape but without <inertial> .* \(tip\)"):
+    with warns(UserWarning, "light.urdf", "<inertial>", "tip"):
         read_urdf(tmp_path / "light.urdf")
 
 
 def test_moving_links_without_mass_are_named(tmp_path: Path) -> None:
     """Allowed by the specification; without a motor nothing could move them, and with one only its rotor is left."""
     (tmp_path / "light.urdf").write_text(GOOD.replace(INERTIAL, ""))
-    with pytest.warns(UserWarning, match=r"light.urdf: nothing beyond these joints has a mass \(hinge\)"):
+    with warns(UserWarning, "light.urdf", "hinge"):
         robot = read_urdf(tmp_path / "light.urdf")
-    with pytest.raises(ModelError, match="hinge: moves no mass"):
+    with raises(ModelError, "hinge"):
         Model(robot)
 
 
@@ -267,7 +267,7 @@ def test_impossible_moments_within_a_possible_body_are_named(tmp_path: Path) -> 
     odd = f'<link name="odd">{INERTIAL}</link>'.replace("4.00", "0.1").replace('izz="0.1"', 'izz="-0.001"')
     text = GOOD.replace("</robot>", odd + LOOP.format("glue", "arm", "odd").replace("continuous", "fixed") + "</robot>")
     (tmp_path / "odd.urdf").write_text(text)
-    with pytest.warns(UserWarning, match=r"moments of inertia that no body can have.*\(odd\)"):
+    with warns(UserWarning, "odd.urdf", "odd"):
         read_urdf(tmp_path / "odd.urdf")
 
 
@@ -391,7 +391,7 @@ def counted(text: str) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     return total, joints
 
 
-@pytest.mark.filterwarnings("ignore:.*(has a mass|Coulomb|no body can have)")
+@pytest.mark.filterwarnings("ignore:.*mutated.urdf:UserWarning")
 def test_mutations_are_refused_or_read_in_full(tmp_path: Path) -> None:
     """Never a traceback, never a loss: what is read has the masses, moments, axes, limits of two other counts."""
     rng, read, refusals = np.random.default_rng(8), 0, []
@@ -432,10 +432,10 @@ INSIDE = '<{0}><link name="payload">{1}</link></{0}></robot>'
 def test_a_link_that_would_be_ignored_is_refused(tmp_path: Path, around: str) -> None:
     text = f'<robot name="r" xmlns:x="x"><link name="a">{INERTIAL}</link>' + INSIDE.format(around, INERTIAL)
     (tmp_path / "bad.urdf").write_text(text)
-    assert f"<link> in <{around}> would be ignored; it belongs in <robot>" in refused(tmp_path / "bad.urdf")
+    check_message(refused(tmp_path / "bad.urdf"), "<link>", f"<{around}>", "<robot>")
 
 
 def test_text_where_urdf_has_attributes_is_refused(tmp_path: Path) -> None:
     text = '<robot name="r"><link name="a"><inertial><mass value="8.5">80</mass></inertial></link></robot>'
     (tmp_path / "bad.urdf").write_text(text)
-    assert "<mass> holds the text '80'; URDF has values in attributes only" in refused(tmp_path / "bad.urdf")
+    check_message(refused(tmp_path / "bad.urdf"), "<mass>", "'80'")

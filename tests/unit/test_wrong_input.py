@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.messages import check_message, raises
 
 import dynsim
 from dynsim.compile.model import Model
@@ -37,34 +38,33 @@ def model() -> Model:
 
 
 @pytest.mark.parametrize(
-    ("call", "message"),
+    ("call", "names"),
     [
-        (lambda m: m.point_position(10, ORIGIN, Q), "no body 10; indices of this model are 0 to 9"),
-        (lambda m: m.point_jacobian(-1, ORIGIN, Q), "no body -1; indices of this model are 0 to 9"),
-        (lambda m: m.point_position(np.int64(10), ORIGIN, Q), "no body 10; indices"),
-        (lambda m: m.body_pose(True, Q), "no body True; bodies: link_1, link_2"),
-        (lambda m: m.body_pose(None, Q), "no body None; bodies: link_1, link_2"),
-        (lambda m: m.body_pose("link_11", Q), "no body 'link_11'; bodies: link_1, link_2"),
-        (lambda m: m.mass_matrix("upright"), "q must be real numbers, not 'upright'"),
-        (lambda m: m.mass_matrix(["0"] * 10), "q must be real numbers, not ['0', '0'"),
-        (lambda m: m.mass_matrix(None), "q must be real numbers, not None"),
-        (lambda m: m.mass_matrix(Q + 1j), "q must be real numbers, not array([0.+1.j, "),
-        (lambda m: m.mass_matrix([[0.0], [0.0, 1.0]]), "q is no array of numbers"),
-        (lambda m: m.mass_matrix(Q[:9]), "q has shape (9,); this model has 10 joints"),
-        (lambda m: m.mass_matrix(np.where(np.arange(10) == 2, np.nan, 0.0)), "q is nan at joint_3; it must be finite"),
-        (lambda m: m.bias_forces(Q, Q - np.inf), "v is -inf at joint_1; it must be finite"),
-        (lambda m: m.inverse_dynamics(Q, Q, Q * np.nan), "vdot is nan at joint_1"),
-        (lambda m: m.forward_dynamics(Q, Q, [1.0]), "tau has shape (1,)"),
-        (lambda m: m.point_position(0, "tip", Q), "point must be real numbers, not 'tip'"),
-        (lambda m: m.point_position(0, [0.0, np.nan, 0.0], Q), "point is [0.0, nan, 0.0]; it must be finite"),
-        (lambda m: Model("elbow_comparison"), "needs a Robot, not 'elbow_comparison'; Model.from_urdf(file)"),
-        (lambda m: Model.from_urdf(None), "a URDF file is named by its path, not by None"),
+        (lambda m: m.point_position(10, ORIGIN, Q), ("10", "0", "9")),
+        (lambda m: m.point_jacobian(-1, ORIGIN, Q), ("-1", "0", "9")),
+        (lambda m: m.point_position(np.int64(10), ORIGIN, Q), ("10", "0", "9")),
+        (lambda m: m.body_pose(True, Q), ("True", "link_1, link_2")),
+        (lambda m: m.body_pose(None, Q), ("None", "link_1, link_2")),
+        (lambda m: m.body_pose("link_11", Q), ("link_11", "link_1, link_2")),
+        (lambda m: m.mass_matrix("upright"), ("q", "'upright'")),
+        (lambda m: m.mass_matrix(["0"] * 10), ("q", "['0', '0'")),
+        (lambda m: m.mass_matrix(None), ("q", "None")),
+        (lambda m: m.mass_matrix(Q + 1j), ("q", "array([0.+1.j")),
+        (lambda m: m.mass_matrix([[0.0], [0.0, 1.0]]), ("q",)),
+        (lambda m: m.mass_matrix(Q[:9]), ("q", "(9,)", "10")),
+        (lambda m: m.mass_matrix(np.where(np.arange(10) == 2, np.nan, 0.0)), ("q", "nan", "joint_3")),
+        (lambda m: m.bias_forces(Q, Q - np.inf), ("v", "-inf", "joint_1")),
+        (lambda m: m.inverse_dynamics(Q, Q, Q * np.nan), ("vdot", "nan", "joint_1")),
+        (lambda m: m.forward_dynamics(Q, Q, [1.0]), ("tau", "(1,)", "10")),
+        (lambda m: m.point_position(0, "tip", Q), ("point", "'tip'")),
+        (lambda m: m.point_position(0, [0.0, np.nan, 0.0], Q), ("point", "[0.0, nan, 0.0]")),
+        (lambda m: Model("elbow_comparison"), ("Robot", "'elbow_comparison'", "Model.from_urdf")),
+        (lambda m: Model.from_urdf(None), ("URDF", "None")),
     ],
 )
-def test_a_model_names_what_it_cannot_take(model: Model, call: Any, message: str) -> None:
-    with pytest.raises(ModelError) as caught:
+def test_a_model_names_what_it_cannot_take(model: Model, call: Any, names: tuple[str, ...]) -> None:
+    with raises(ModelError, *names) as caught:
         call(model)
-    assert message in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
@@ -77,55 +77,55 @@ BODY = Link("body", "hinge", None, "revolute", np.array([0.0, 0.0, 1.0]), Inerti
 
 
 @pytest.mark.parametrize(
-    ("link", "robot", "message"),
+    ("link", "robot", "names"),
     [
-        ({"axis": np.array([0.0, 1.0])}, {}, "hinge: axis is array([0., 1.]); it must be an array of shape (3,)"),
-        ({"axis": "z"}, {}, "hinge: axis is 'z'"),
-        ({"R_PJ": np.eye(2)}, {}, "hinge: R_PJ is array([[1., 0.], [0., 1.]])"),
-        ({"p_PJ": np.full(3, np.nan)}, {}, "hinge: p_PJ is array([nan, nan, nan])"),
-        ({"p_PJ": [[0.0], [0.0, 1.0]]}, {}, "hinge: p_PJ is [[0.0], [0.0, 1.0]]"),
-        ({"inertia": Inertia(1.0, np.full(3, np.inf))}, {}, "body: centre of mass is array([inf, inf, inf])"),
-        ({"inertia": Inertia(1.0, tensor=np.zeros(6))}, {}, "body: inertia tensor is array([0., 0., 0., 0., 0., 0.])"),
-        ({"inertia": Inertia("1")}, {}, "body: mass is '1'; it must be a finite number"),
-        ({}, {"hand": ("tip", np.zeros(3))}, "arm: the hand is on 'tip', which is no body; bodies: body"),
-        ({}, {"hand": ("body", np.zeros(2))}, "arm: the hand's point is array([0., 0.])"),
-        ({}, {"gravity": 9.81}, "arm: gravity is 9.81; it must be an array of shape (3,)"),
-        ({}, {"q0": np.zeros(2)}, "arm: q0 is array([0., 0.]); it must be an array of shape (1,)"),
+        ({"axis": np.array([0.0, 1.0])}, {}, ("hinge", "axis", "array([0., 1.])", "(3,)")),
+        ({"axis": "z"}, {}, ("hinge", "axis", "'z'")),
+        ({"R_PJ": np.eye(2)}, {}, ("hinge", "R_PJ", "array([[1., 0.], [0., 1.]])", "(3, 3)")),
+        ({"p_PJ": np.full(3, np.nan)}, {}, ("hinge", "p_PJ", "array([nan, nan, nan])", "(3,)")),
+        ({"p_PJ": [[0.0], [0.0, 1.0]]}, {}, ("hinge", "p_PJ", "[[0.0], [0.0, 1.0]]", "(3,)")),
+        ({"inertia": Inertia(1.0, np.full(3, np.inf))}, {}, ("body", "array([inf, inf, inf])", "(3,)")),
+        ({"inertia": Inertia(1.0, tensor=np.zeros(6))}, {}, ("body", "array([0., 0., 0., 0., 0., 0.])", "(3, 3)")),
+        ({"inertia": Inertia("1")}, {}, ("body", "'1'")),
+        ({}, {"hand": ("tip", np.zeros(3))}, ("arm", "'tip'", "body")),
+        ({}, {"hand": ("body", np.zeros(2))}, ("arm", "hand", "array([0., 0.])", "(3,)")),
+        ({}, {"gravity": 9.81}, ("arm", "gravity", "9.81", "(3,)")),
+        ({}, {"q0": np.zeros(2)}, ("arm", "q0", "array([0., 0.])", "(1,)")),
     ],
 )
-def test_a_description_by_hand_is_refused_with_the_quantity(link: Any, robot: Any, message: str) -> None:
-    with pytest.raises(ModelError) as caught:
+def test_a_description_by_hand_is_refused_with_the_quantity(link: Any, robot: Any, names: tuple[str, ...]) -> None:
+    with raises(ModelError, *names):
         Model(replace(Robot("arm", (replace(BODY, **link),), (), ("body", np.zeros(3))), **robot))
-    assert message in str(caught.value)
 
 
 @pytest.mark.parametrize(
-    ("call", "error", "message"),
+    ("call", "error", "names"),
     [
-        (lambda: load_scenario(None), ScenarioError, "a scenario is named by its file"),
-        (lambda: variant_names(3), ScenarioError, "not by 3"),
-        (lambda: load_scenario("elbow_comparison", 3), ScenarioError, "no variant 3; variants: two_elbows, elbow_7"),
-        (lambda: load_scenario("elbow_comparison", ["a"]), ScenarioError, "no variant ['a']; variants: two_elbows"),
-        (lambda: load_scenario("elbow_comparison", overrides=["a=1"]), ScenarioError, "overrides must map dotted keys"),
-        (lambda: load_scenario("elbow_comparison", overrides={1: 2}), ScenarioError, "not {1: 2}"),
-        (lambda: scenario_from_resolved(None), ScenarioError, "must be a mapping of keys to values, not None"),
-        (lambda: build_model("elbow_comparison"), ScenarioError, "needs a Scenario, not 'elbow_comparison'"),
-        (lambda: dynsim.check("elbow_comparison"), ScenarioError, "needs a Scenario, not 'elbow_comparison'"),
-        (lambda: dynsim.compare("elbow_comparison", jobs=0), ScenarioError, "jobs = 0: must be a whole number"),
-        (lambda: dynsim.compare("elbow_comparison", jobs="2"), ScenarioError, "jobs = '2': must be a whole number"),
-        (lambda: build_model(load_scenario("snake_operator")), ModelError, "is kinematic: it has no rigid-body model"),
+        (lambda: load_scenario(None), ScenarioError, ("scenario", "None")),
+        (lambda: variant_names(3), ScenarioError, ("scenario", "3")),
+        (lambda: load_scenario("elbow_comparison", 3), ScenarioError, ("3", "two_elbows, elbow_7")),
+        (lambda: load_scenario("elbow_comparison", ["a"]), ScenarioError, ("['a']", "two_elbows, elbow_7")),
+        (lambda: load_scenario("elbow_comparison", overrides=["a=1"]), ScenarioError, ("overrides", "['a=1']")),
+        (lambda: load_scenario("elbow_comparison", overrides={1: 2}), ScenarioError, ("overrides", "{1: 2}")),
+        (lambda: scenario_from_resolved(None), ScenarioError, ("scenario", "None")),
+        (lambda: build_model("elbow_comparison"), ScenarioError, ("Scenario", "'elbow_comparison'", "load_scenario")),
+        (lambda: dynsim.check("elbow_comparison"), ScenarioError, ("Scenario", "'elbow_comparison'", "load_scenario")),
+        (lambda: dynsim.compare("elbow_comparison", jobs=0), ScenarioError, ("jobs = 0",)),
+        (lambda: dynsim.compare("elbow_comparison", jobs="2"), ScenarioError, ("jobs = '2'",)),
+        (lambda: build_model(load_scenario("snake_operator")), ModelError, ("snake", "kinematic")),
         (
             lambda: build.controller(s := load_scenario("single_pendulum"), build_model(s)),
             ModelError,
-            "the scenario has no controller",
+            ("controller",),
         ),
-        (lambda: load_servo_map(None), ServoMapError, "a servo map is named by its file"),
+        (lambda: load_servo_map(None), ServoMapError, ("servo map", "None")),
     ],
 )
-def test_scenarios_and_maps_name_what_they_cannot_take(call: Any, error: type[DynsimError], message: str) -> None:
-    with pytest.raises(error) as caught:
+def test_scenarios_and_maps_name_what_they_cannot_take(
+    call: Any, error: type[DynsimError], names: tuple[str, ...]
+) -> None:
+    with raises(error, *names) as caught:
         call()
-    assert message in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
@@ -144,22 +144,21 @@ def small_record() -> Record:
 
 
 @pytest.mark.parametrize(
-    ("call", "message"),
+    ("call", "names"),
     [
-        (lambda r: r["v"], "no signal 'v'; this record has: q"),
-        (lambda r: r[0], "no signal 0; this record has: q"),
-        (lambda r: r[["q"]], "no signal ['q']; this record has: q"),
-        (lambda r: r.units["v"], "no signal 'v'; this record has: q"),
-        (lambda r: r.labels["v"], "no signal 'v'; this record has: q"),
-        (lambda r: r.summary["step"], "no entry of the summary 'step'; this record has: steps"),
-        (lambda r: r.provenance["scenario"], "no entry of the provenance 'scenario'; this record has: engine"),
+        (lambda r: r["v"], ("'v'", "q")),
+        (lambda r: r[0], ("0", "q")),
+        (lambda r: r[["q"]], ("['q']", "q")),
+        (lambda r: r.units["v"], ("'v'", "q")),
+        (lambda r: r.labels["v"], ("'v'", "q")),
+        (lambda r: r.summary["step"], ("summary", "'step'", "steps")),
+        (lambda r: r.provenance["scenario"], ("provenance", "'scenario'", "engine")),
     ],
 )
-def test_what_a_record_lacks_is_a_sentence(call: Any, message: str) -> None:
+def test_what_a_record_lacks_is_a_sentence(call: Any, names: tuple[str, ...]) -> None:
     for record in (small_record(), copy.deepcopy(small_record()), pickle.loads(pickle.dumps(small_record()))):
-        with pytest.raises(MissingEntry) as caught:
+        with raises(MissingEntry, *names) as caught:
             call(record)
-        assert str(caught.value) == message
         # For those who look for KeyError, and for the command line.
         assert isinstance(caught.value, KeyError)
         assert isinstance(caught.value, RecordError)
@@ -171,7 +170,7 @@ def test_summary_and_provenance_are_mappings_still(tmp_path: Path) -> None:
     assert record.summary.get("none") is None
     record.summary |= {"more": 1}
     assert record.summary == {"steps": 3, "more": 1}
-    with pytest.raises(RecordError, match="the summary of a record is a mapping of names to values, not 3"):
+    with raises(RecordError, "summary", "3"):
         record.summary = 3  # type: ignore[assignment]
 
 
@@ -244,7 +243,7 @@ def test_odd_provenance_of_records_is_one_error(tmp_path: Path, monkeypatch) -> 
     record = dynsim.simulate(load_scenario("single_pendulum", overrides={"duration_s": 0.2, "metrics.settle_s": 0.0}))
     record.provenance = {"scenario": "x"}
     assert figures.draw(record, tmp_path)  # the figures of one run need no name
-    with pytest.raises(RecordError, match="the record cannot be drawn"):
+    with raises(RecordError):
         figures.draw_comparison({"a": record}, tmp_path)
     snake = dynsim.simulate(load_scenario("snake_circle", overrides={"duration_s": 0.2, "record.rate_hz": 50}))
     snake.scene = None
@@ -264,7 +263,7 @@ def test_plot_names_the_record_that_lacks_something(tmp_path: Path, monkeypatch,
         cli.main()
     assert leaving.value.code == 2
     (line,) = [line for line in capfd.readouterr().err.splitlines() if line.strip()]
-    assert line.startswith(f"error: {path}: no signal 'heat_joule'; this record has: ")
+    check_message(line, f"error: {path}", "'heat_joule'", "q")
 
 
 def replayed() -> tuple[Record, Record]:
@@ -277,29 +276,29 @@ def replayed() -> tuple[Record, Record]:
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("change", "names"),
     [
-        (lambda m: m.add("q", m.time, "rad"), "share no joint angles"),
-        (lambda m: m.add("state", np.zeros((101, 2)), "1", labels=("a", "b")), "'state' of the measured run has shape"),
-        (lambda m: m.add("record_time", np.zeros((101, 1)), "s", labels=("a",)), "'record_time' of the measured run"),
-        (lambda m: m.provenance.update(speed="fast"), "says speed 'fast'"),
-        (lambda m: m.provenance.update(speed=0), "says speed 0"),
+        (lambda m: m.add("q", m.time, "rad"), ("rad",)),
+        (lambda m: m.add("state", np.zeros((101, 2)), "1", labels=("a", "b")), ("'state'", "(101, 2)")),
+        (lambda m: m.add("record_time", np.zeros((101, 1)), "s", labels=("a",)), ("'record_time'", "(101, 1)")),
+        (lambda m: m.provenance.update(speed="fast"), ("speed", "'fast'")),
+        (lambda m: m.provenance.update(speed=0), ("speed", "0")),
     ],
 )
-def test_compare_refuses_what_is_no_measured_run(change: Any, message: str) -> None:
+def test_compare_refuses_what_is_no_measured_run(change: Any, names: tuple[str, ...]) -> None:
     simulated, measured = replayed()
     assert compare_records(simulated, measured).worst.rms < 1e-12
     change(measured)
-    with pytest.raises(RecordError, match=message):
+    with raises(RecordError, *names):
         compare_records(simulated, measured)
 
 
 def test_export_refuses_motion_without_columns_and_endless_rates(tmp_path: Path) -> None:
     record, _ = replayed()
-    with pytest.raises(RecordError, match="--rate must be positive, not inf"):
+    with raises(RecordError, "--rate", "inf"):
         export_record(record, tmp_path / "a.csv", "csv", rate=float("inf"))
     record.add("v", record.time, "rad/s")
-    with pytest.raises(RecordError, match=r"signals 'q' \(101, 1\) and 'v' \(101,\) of the record must both have"):
+    with raises(RecordError, "'q'", "(101, 1)", "'v'", "(101,)"):
         export_record(record, tmp_path / "a.csv", "csv")
 
 
@@ -308,7 +307,7 @@ def test_export_refuses_a_motion_that_is_not_finite(signal: str, quantity: str, 
     record, _ = replayed()
     record.add("v", record["q"].copy(), "rad/s", labels=record.labels["q"])
     record[signal][7, 0] = np.nan
-    with pytest.raises(RecordError, match=rf"the {quantity} of {record.labels['q'][0]} is nan at sample 7 \(t = "):
+    with raises(RecordError, quantity, record.labels["q"][0], "nan", "7", "0.14 s"):
         export_record(record, tmp_path / "a.csv", "csv", rate=10.0)
     assert not any(tmp_path.iterdir())
 
@@ -317,7 +316,7 @@ def test_export_refuses_a_motion_that_is_not_finite(signal: str, quantity: str, 
 def test_times_that_are_none_are_refused(sample: int, value: float) -> None:
     record = Record(np.linspace(0.0, 2.0, 101))
     record.time[sample] = value
-    with pytest.raises(CheckRefused, match=f"time is {value} at sample {sample}, of 101"):
+    with raises(CheckRefused, str(value), str(sample), "101"):
         check_motion(record, load_servo_map("arm"))
 
 
@@ -343,5 +342,5 @@ def test_provenance_does_without_the_metadata_of_a_library_and_finds_the_commit_
 
 
 def test_an_initial_angle_without_digits_is_refused():
-    with pytest.raises(ModelError, match=r"an initial angle of 3\.22e\+17 rad; .* take it modulo a turn"):
+    with raises(ModelError, "joint_1", "3.22e+17 rad", "1e+06 rad"):
         build_model(load_scenario("single_pendulum", overrides={"plant.chain.0.initial_deg": 2**64}))

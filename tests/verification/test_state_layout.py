@@ -17,7 +17,8 @@ from dynsim.dynamics.derivative import new_workspace
 from dynsim.dynamics.simd.forms import aligned
 from dynsim.dynamics.state import OutputLayout, StateLayout, block
 from dynsim.engine.force_indeterminacy import acceleration_range
-from dynsim.integrators.run import FINISHED, METHODS, PROJECTIONS, STATUS, STEPS, Run
+from dynsim.integrators.methods import METHODS
+from dynsim.integrators.run import FINISHED, PROJECTIONS, STATUS, STEPS, Run
 
 PACKAGE, TESTS = Path(dynsim.__file__).parent, Path(__file__).parents[1]
 

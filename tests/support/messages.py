@@ -1,0 +1,101 @@
+"""Checks of messages by their form and by the names in them: a test does not depend on how a message is worded."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+
+import pytest
+
+Name = str | re.Pattern[str]
+
+# The only wordings that tests know: where several messages with the same names are possible, these tell which one it
+# is. A reworded message changes one line here.
+PHRASES = {
+    "outside": "outside the triangle",
+    "unloaded": "a wheel carries nothing",
+    "pulls": "surface pulls",
+    "slides": "slides",
+    "takes": "seconds to two minutes",
+    "no scene": "has no scene",
+    "no poses": "not every joint was recorded",
+    "other bodies": "other bodies than the record",
+    "fails": "does not survive",
+    "reference": "its reference",
+    "energy row": "electrical energy [J]",
+    "impact row": "impact loss",
+    "no posture": "could be brought onto the hand's path",
+    "no forces": "carry the motion",
+    "incomplete": "incomplete",
+    "all silent": "is the supply or the line lost?",
+    "late answers": "earlier requests",
+    "output failed": " failed: ",
+    "busy": "too busy",
+    "sent": "was sent",
+    "unconfirmed": "NOT confirmed",
+}
+
+
+def mentions(text: object, *names: Name) -> bool:
+    """Whether a text has every name (file, key, joint, value, number) as a whole word, or matches its pattern."""
+    return not _missing(str(text), names)
+
+
+def says(text: object, phrase: str) -> bool:
+    """Whether a text is the message that a key of ``PHRASES`` stands for."""
+    return PHRASES[phrase] in str(text)
+
+
+def lines_with(text: str | Iterable[str], *names: Name, phrase: str = "") -> list[str]:
+    """Lines of a text, or of several warnings, that have every name and the phrase."""
+    rows = text.splitlines() if isinstance(text, str) else text
+    return [row for row in rows if mentions(row, *names) and (not phrase or says(row, phrase))]
+
+
+def check_message(text: object, *names: Name, phrase: str = "") -> None:
+    """Assert that a message has words, further problems in indented lines, no traceback, every name, and the phrase."""
+    __tracebackhide__ = True
+    message = str(text).rstrip()
+    assert len(re.findall(r"[^\W\d_]{2,}", message)) > 1, f"no words: {message!r}"
+    assert not re.search(r"\n(?!  )|\n\s*(\n|$)", message), f"further lines must be indented and not blank: {message!r}"
+    assert not re.search(r"Traceback|\bat 0x[0-9a-f]{6}", message), message
+    assert not _missing(message, names), f"without {_missing(message, names)}: {message!r}"
+    assert not phrase or says(message, phrase), f"is not {phrase!r}: {message!r}"
+
+
+@contextmanager
+def raises(
+    error: type[BaseException] | tuple[type[BaseException], ...], *names: Name, phrase: str = ""
+) -> Iterator[pytest.ExceptionInfo[BaseException]]:
+    """``pytest.raises``, and :func:`check_message` of the message."""
+    with pytest.raises(error) as caught:
+        yield caught
+    check_message(caught.value, *names, phrase=phrase)
+
+
+@contextmanager
+def warns(category: type[Warning], *names: Name, phrase: str = "") -> Iterator[pytest.WarningsRecorder]:
+    """``pytest.warns``, with a warning that has every name and the phrase."""
+    with pytest.warns(category) as caught:
+        yield caught
+    rows = [str(warning.message) for warning in caught]
+    assert lines_with(rows, *names, phrase=phrase), rows
+
+
+def _missing(text: str, names: Iterable[Name]) -> list[str]:
+    return [
+        str(name)
+        for name in names
+        if not (re.search(_whole(name), text) if isinstance(name, str) else name.search(text))
+    ]
+
+
+def _whole(name: str) -> str:
+    """The pattern of a name that is not a part of a longer one, and of a number that is not a part of another."""
+    before, after = r"(?<!\w)" if re.match(r"\w", name) else "", r"(?!\w)" if re.search(r"\w$", name) else ""
+    if name[:1].isdigit():
+        before += r"(?<!\d\.)"
+    if name[-1:].isdigit():
+        after += r"(?!\.\d)"
+    return before + re.escape(name) + after
