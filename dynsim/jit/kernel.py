@@ -180,7 +180,7 @@ def _make_private(folder: Path) -> None:
         if _USER is None:
             continue
         status = part.lstat()
-        # Writable by the user's own group or root's, but nobody outside them.
+        # The user's own group and root's may write, other groups may not.
         writable = status.st_mode & (stat.S_IWOTH if status.st_gid in trusted else stat.S_IWOTH | stat.S_IWGRP)
         sticky = part != folder and status.st_mode & stat.S_ISVTX
         if not stat.S_ISDIR(status.st_mode) or status.st_uid not in trusted or (writable and not sticky):
@@ -277,7 +277,7 @@ def exact_kernel(function: F) -> F:
 class FixedSignature:
     """Kernel that is called repeatedly with arguments of the same types as in the first call.
 
-    Numba checks the types of all arguments in each call; for a hundred tables that takes as long as many a kernel. Here
+    Numba checks the types of all arguments in each call; for a hundred tables that takes as long as many kernels do. Here
     nothing is checked: an array of another type would be misread.
     """
 

@@ -1,6 +1,6 @@
-"""The problem of accelerations and contact forces at one state, from the bodies alone.
+"""The problem of accelerations and contact forces at one state, computed from the bodies only.
 
-Only points and joints at rest have undecided modes. Mass matrix and Jacobians are computed without the kernels; drift
+Only points and joints at rest have open modes. Mass matrix and Jacobians are computed without the kernels; drift
 accelerations of points are differences of their velocities.
 """
 
@@ -24,17 +24,17 @@ Array = NDArray[np.float64]
 
 # Largest gap of a closed contact [m]; largest rate at rest [m/s, rad/s].
 CLOSED, RESTS = 1e-5, 1e-5
-# Largest gap and rate along the normal of what stays closed: tolerances of projection [m, m/s].
+# Largest gap and normal rate of contacts that stay closed: tolerances of projection [m, m/s].
 MET, STAYS = 1e-9, 3e-8
-# Determinants and diagonals below this part of the frictionless ones are as good as zero: a step ends just before.
+# Determinants and diagonals below this fraction of the frictionless ones count as zero: a step ends just before.
 CRITICAL = 0.02
-# Most joints and contacts whose combinations are looked at one by one.
+# Largest number of joints and contacts whose combinations are examined individually.
 FEW = 8
-# Steps of the differences that give a point's drift [s].
+# Steps of the differences for the drift of a point [s].
 DRIFT_STEP = 1e-4
 # Sweeps and damping of the projected iteration, and the relative violation that counts as zero.
 SWEEPS, DAMPING, SOLVED = 20000, 0.7, 1e-7
-# Relative changes above this are those of an iteration that diverges, which says nothing about forces.
+# Larger relative changes mean that the iteration diverges, which shows nothing about forces.
 DIVERGED = 1e12
 
 
@@ -44,12 +44,18 @@ class State:
 
     Attributes
     ----------
-    q, v, current : positions, rates and currents
-    mass : M + J_m, (n, n)
-    names : closed contacts; rows : normal and two tangents of each, (3, n); slip : (2,) along the tangents [m/s]
-    gaps : of each [m]; friction : coefficient of each; smoothing : speed below which that of a glued one fades [m/s]
-    resting : joints at rest that rub, with their bounds
-    stops : joints at rest on a stop, each with the sign of the rate with which it leaves
+    q, v, current : ndarray
+        Positions, rates and currents.
+    mass : (n, n) ndarray
+        M + J_m.
+    names, rows, slip : list
+        Closed contacts; normal and two tangents of each, (3, n); slip along the tangents, (2,) [m/s].
+    gaps, friction, smoothing : list
+        Gap [m] and coefficient of each; speed below which the friction of a glued contact fades [m/s].
+    resting : list
+        Joints at rest with dry friction, and their bounds.
+    stops : list
+        Joints at rest on a stop, with the sign of the rate at which each leaves.
     """
 
     q: Array
@@ -100,11 +106,11 @@ def state_of(seen: Observed, values: Mapping[str, Sequence[float]], currents: Ar
     resting = [int(j) for j in np.flatnonzero((bound > 0.0) & (np.abs(v) < RESTS))]
     rubbing = np.where((bound > 0.0) & (np.abs(v) >= RESTS), -bound * np.sign(v), 0.0)
     recorded = seen.record["current"]
-    # Without a sample the run has not begun, and no current flows.
+    # Without a sample the run has not begun, and currents are zero.
     current = currents if currents is not None else recorded[-1].copy() if len(seen) else np.zeros(recorded.shape[1])
     circuits = [a for a, motor in enumerate(seen.robot.motors) if isinstance(motor, Motor)]
     if circuits and currents is None and len(values.get("current", ())) == len(circuits):
-        # Those of circuits are of the state, the others' those of the last sample.
+        # Currents of circuits belong to the state, other currents to the last sample.
         current[circuits] = values["current"]
     mass = seen.bodies.mass_matrix(q)
     bounds = [float(bound[j]) for j in resting]
@@ -120,9 +126,9 @@ def state_of(seen: Observed, values: Mapping[str, Sequence[float]], currents: Ar
 
 
 def critical(seen: Observed, values: Mapping[str, Sequence[float]]) -> bool:
-    """Whether some combination of modes has a paradox: contacts slide, and others stick, joints rest or are let go.
+    """Whether some combination of modes has a paradox: contacts slide, and others stick, joints rest or are released.
 
-    A contact that slides has its slip's direction, or, from rest, any.
+    A sliding contact has the direction of its slip or, at rest, any direction.
     """
     whole, basis = state_of(seen, values), seen.bodies.free_directions()
     identity, count = np.eye(len(whole.v)), len(whole.names)
@@ -131,7 +137,7 @@ def critical(seen: Observed, values: Mapping[str, Sequence[float]]) -> bool:
     W = rows @ inverse @ rows.T
     blocks = [[3 * k, 3 * k + 1, 3 * k + 2] for k in range(count)]
     blocks += [[3 * count + m] for m in range(len(whole.resting))]
-    # A part in which all contacts slide has no other modes to choose from, whatever the rest does.
+    # A part in which all contacts slide has no other modes, whatever the other parts do.
     for part in parts(W, blocks):
         slides = max(part) < count and all(float(np.linalg.norm(whole.slip[k])) > RESTS for k in part)
         if slides and _paradox(whole, part, inverse, (1.0,) if seen.real else (1.0, -1.0)):
@@ -140,7 +146,7 @@ def critical(seen: Observed, values: Mapping[str, Sequence[float]]) -> bool:
 
 
 def _mobility(state: State, basis: Array) -> Array:
-    """Accelerations of unit forces in the free directions of a basis, (n, n)."""
+    """Return the accelerations of unit forces in the free directions of a basis, (n, n)."""
     return np.asarray(basis @ np.linalg.solve(basis.T @ state.mass @ basis, basis.T))
 
 
@@ -163,8 +169,7 @@ def _some_modes_critical(state: State, basis: Array, *, real: bool) -> bool:
 def _paradox(state: State, sliding: Sequence[int], inverse: Array, signs: Sequence[float]) -> bool:
     """Whether det or a diagonal entry of N W (N − μ T)ᵀ falls to zero.
 
-    That is for all directions that slip can have, and for all combinations of the ``signs`` that normal forces can
-    have.
+    Considers all possible directions of slip, and all combinations of ``signs`` of normal forces.
     """
     choices = []
     for k in sliding:
@@ -172,7 +177,7 @@ def _paradox(state: State, sliding: Sequence[int], inverse: Array, signs: Sequen
         if speed > RESTS:
             choices.append([state.slip[k] / speed])
         else:
-            # The direction with the largest coupling is the worst, with either sign.
+            # The direction with the largest coupling is the worst, for either sign.
             normal, tangents = state.rows[k][0], state.rows[k][1:]
             coupling = tangents @ inverse @ normal
             size = float(np.linalg.norm(coupling))
@@ -184,10 +189,10 @@ def _paradox(state: State, sliding: Sequence[int], inverse: Array, signs: Sequen
     if values[0] <= 1e-11 * values[-1]:
         return False
     for directions in itertools.islice(itertools.product(*choices), 64):
-        # From rest the static coefficient may hold.
+        # At rest the static coefficient may apply.
         mu = [max(state.friction[k], state.static[k]) for k in sliding]
         T = np.stack([direction @ state.rows[k][1:] for k, direction in zip(sliding, directions, strict=True)])
-        # Each glued contact may pull, which turns its own friction round.
+        # Each glued contact may pull, which reverses its own friction.
         for turned in itertools.islice(itertools.product(signs, repeat=len(sliding)), 64):
             A = bare - N @ inverse @ ((np.array(turned) * mu)[:, None] * T).T
             if np.linalg.det(A) < CRITICAL * np.linalg.det(bare) or (np.diag(A) < CRITICAL * np.diag(bare)).any():
@@ -196,9 +201,9 @@ def _paradox(state: State, sliding: Sequence[int], inverse: Array, signs: Sequen
 
 
 def exists(seen: Observed, values: Mapping[str, Sequence[float]], time: float) -> bool:
-    """Whether there are contact forces that agree with Coulomb's law at a state, by an exact decision.
+    """Whether contact forces that agree with Coulomb's law exist at a state, by an exact decision.
 
-    Forces act where a gap stays closed: not where a contact is still on its way to the surface, or leaves it.
+    Forces act only if a gap stays closed, not if a contact is still approaching the surface or leaves it.
     """
     state = state_of(seen, values)
     speeds = [abs(float(rows[0] @ state.v)) / (1.0 + float(np.linalg.norm(slip)))
@@ -216,14 +221,14 @@ def exists(seen: Observed, values: Mapping[str, Sequence[float]], time: float) -
 
 
 def _only(state: State, kept: Sequence[int]) -> State:
-    """A state with only these contacts."""
+    """Return a state with only these contacts."""
     lists = ("names", "rows", "gaps", "slip", "friction", "smoothing", "static")
     kept_lists: dict[str, Any] = {key: [getattr(state, key)[k] for k in kept] for key in lists}
     return replace(state, **kept_lists)
 
 
 def leaves(seen: Observed, name: str, i: int) -> bool:
-    """Whether a contact would leave its surface at a sample if it had no force, all others having theirs."""
+    """Whether a contact would leave its surface at a sample without its force, with all other forces."""
     state = state_of(seen, {"q": seen.q[i].tolist(), "v": seen.v[i].tolist()}, seen.record["current"][i])
     if name not in state.names:
         return True
@@ -236,7 +241,7 @@ def leaves(seen: Observed, name: str, i: int) -> bool:
 
 
 def _solved(seen: Observed, state: State, time: float) -> tuple[bool, Array]:
-    """Whether a damped projected iteration finds forces by Coulomb's law, and the accelerations with them, (n,)."""
+    """Return whether a damped projected iteration finds Coulomb forces, and the accelerations with them, (n,)."""
     W, free, rows, inverse, push = _problem(seen, state, time)
     if not len(rows):
         return True, inverse @ push
@@ -258,7 +263,7 @@ def _solved(seen: Observed, state: State, time: float) -> tuple[bool, Array]:
 
 
 def _problem(seen: Observed, state: State, time: float) -> tuple[Array, Array, Array, Array, Array]:
-    """W and b of the accelerations W f + b along the rows of contacts, resting joints and stops; rows, M⁻¹, push."""
+    """Return W and b of the accelerations W f + b along contacts, resting joints and stops; rows, M⁻¹, push."""
     push, n = _applied(seen, state, time), len(state.v)
     inverse = _mobility(state, seen.bodies.free_directions())
     joints = [np.eye(n)[j][None] for j in state.resting] + [side * np.eye(n)[j][None] for j, side in state.stops]
@@ -268,13 +273,13 @@ def _problem(seen: Observed, state: State, time: float) -> tuple[Array, Array, A
 
 
 def glued_forces(seen: Observed, values: Mapping[str, Sequence[float]], time: float) -> tuple[State, Array]:
-    """The state of a stop and the normal forces of its glued contacts, whose friction is smoothed, (c,) [N]."""
+    """Return the state of a stop and the normal forces of its glued contacts with smoothed friction, (c,) [N]."""
     state = replace(state_of(seen, values), resting=[], stops=[])
     W, free = _problem(seen, state, time)[:2]
     by_name = {contact.name: contact for contact in seen.described_contacts}
     signed = np.array([by_name[name].pulling_friction == "signed" for name in state.names])
     f: Array = np.ones(len(state.names))
-    # Dissipative friction has the sign of its force, which the forces before tell.
+    # Dissipative friction has the sign of its force, known from the preceding forces.
     for _ in range(1 if signed.all() else FEW):
         F = np.zeros((len(W), len(f)))
         for k, slip in enumerate(state.slip):
@@ -286,7 +291,7 @@ def glued_forces(seen: Observed, values: Mapping[str, Sequence[float]], time: fl
 
 
 def _contact(state: State, k: int, W: Array, free: Array, f: Array) -> None:
-    """One contact's force, the others' kept."""
+    """Update the force of one contact with the other forces fixed."""
     r = slice(3 * k, 3 * k + 3)
     a = W[3 * k : 3 * k + 3] @ f + free[r]
     block = W[r, r]
@@ -309,7 +314,7 @@ def _contact(state: State, k: int, W: Array, free: Array, f: Array) -> None:
 
 
 def _violation(state: State, W: Array, free: Array, f: Array) -> float:
-    """Largest violation of the law by the acceleration of a contact or resting joint; infinite if f is not finite."""
+    """Return the largest violation of the law by a contact or resting joint; infinite if f is not finite."""
     if not np.isfinite(f).all():
         return np.inf
     a, worst = W @ f + free, 0.0
@@ -332,7 +337,7 @@ def _violation(state: State, W: Array, free: Array, f: Array) -> float:
 
 
 def _applied(seen: Observed, state: State, time: float) -> Array:
-    """Generalised forces without contacts and resting joints, with weight and velocity products, (n,)."""
+    """Return generalised forces without contacts and resting joints, with weight and velocity products, (n,)."""
     motion = seen.bodies.motion(state.q[None], state.v[None], np.zeros((1, len(state.v))))
     push = -seen.bodies.along_rows(motion, seen.bodies.wrenches(motion))[0] - seen.bodies.damping * state.v
     push = push + seen.driven_torques(state.current[None], state.v[None])[0] + state.rubbing
@@ -347,9 +352,9 @@ def _applied(seen: Observed, state: State, time: float) -> Array:
 
 
 def _drifts(seen: Observed, state: State) -> Array:
-    """Accelerations of contacts along normal and tangents at zero joint accelerations, (c, 3) [m/s²].
+    """Return accelerations of contacts along normal and tangents at zero joint accelerations, (c, 3) [m/s²].
 
-    From the places of gaps and the velocities of touching points, before and after at constant rates.
+    Computed from gaps and velocities of touching points, before and after at constant rates.
     """
     step = DRIFT_STEP / max(1.0, float(np.abs(state.v).max(initial=0.0)))
     steps = np.array([-step, 0.0, step])
@@ -375,14 +380,14 @@ def _drifts(seen: Observed, state: State) -> Array:
 
 
 def _subsets(items: Sequence[int]) -> list[tuple[int, ...]]:
-    """All subsets of a few, of many all, none, and all but one."""
+    """Return all subsets of a few items; for many items all, none, and all but one."""
     if len(items) <= FEW:
         return [subset for size in range(len(items) + 1) for subset in itertools.combinations(items, size)]
     return [tuple(items), (), *(tuple(item for item in items if item != left) for left in items)]
 
 
 def _modes(count: int) -> list[tuple[int, ...]]:
-    """Open, sliding, sticking for each contact; for many contacts equal modes, or one different."""
+    """Return open, sliding, sticking for each contact; for many contacts equal modes, or one different."""
     if count <= 4:
         return list(itertools.product((0, 1, 2), repeat=count))
     alone = [tuple(1 if k == m else other for k in range(count)) for m in range(count) for other in (0, 2)]

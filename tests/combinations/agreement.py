@@ -3,9 +3,9 @@
 Most runs agree within the errors that their tolerances or steps imply for stable motion. If not, both are repeated with
 a tenth of the tolerance or half the step: the change is the method's error, even if the motion multiplies errors. If
 both errors are small and the results differ, the motion is not unique, which a warning must report, or one is wrong.
-Steps that are too long by far do not show their error at half their length: an unstable loop grows, with both, much
-more slowly than it should. So time stepping is repeated with a quarter of the step too before a difference is reported.
-If that changes it by a multiple of what half the step did, shorter steps may change it by that multiple again.
+Steps that are far too long do not show their error at half their length: an unstable loop grows, with both, much more
+slowly than it should. Therefore time stepping is repeated with a quarter of the step too before a difference is
+reported. If this changes it by a multiple of the change by half the step, shorter steps may change it as much again.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ NOT_UNIQUE = (
     "turns its own force against it",
 )
 # Part of warnings about shared forces, which methods may split differently; if elbows slide, or bodies
-# land on several points, the split of forces changes the motion a little.
+# land on several points, the split of forces changes the motion slightly.
 NOT_UNIQUE_FORCES, SPLIT_SHARE = "shared forces", 0.03
 
 

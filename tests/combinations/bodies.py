@@ -1,8 +1,8 @@
-"""Motion and forces of a robot's bodies at all samples of a record at once, written for the checks alone.
+"""Motion and forces of a robot's bodies at all samples of a record at once, written only for the checks.
 
-Nothing here comes from the kernels: poses, velocities and accelerations follow from the description of the robot
-link after link, forces from Newton's and Euler's equations of each body about the origin of the world. Arrays have
-samples first: (T, 3), (T, 3, 3).
+No code of the kernels is used: poses, velocities and accelerations follow from the description of the robot link by
+link, forces from Newton's and Euler's equations of each body about the world origin. Arrays have samples first: (T, 3),
+(T, 3, 3).
 """
 
 from __future__ import annotations
@@ -23,27 +23,31 @@ _FIRST = ("ball_x", "roll", "left_wheel")
 
 
 def cross_matrix(w: Array) -> Array:
-    """The matrix of w ×, (..., 3) → (..., 3, 3)."""
+    """Return the matrix of w ×, (..., 3) → (..., 3, 3)."""
     zero = np.zeros_like(w[..., 0])
     rows = (zero, -w[..., 2], w[..., 1]), (w[..., 2], zero, -w[..., 0]), (-w[..., 1], w[..., 0], zero)
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def times(R: Array, x: Array) -> Array:
-    """R x for every sample."""
+    """Return R x for every sample."""
     return np.einsum("...ij,...j->...i", R, x)
 
 
 @dataclass
 class Motion:
-    """What bodies do at the samples.
+    """Motion of the bodies at the samples.
 
     Attributes
     ----------
-    rotation, origin : frame of each body in the world, n times (T, 3, 3) and (T, 3) [m]
-    spin, flow : angular velocity of each body, and velocity of its point at the world's origin, n times (T, 3)
-    turning, rushing : angular acceleration and rate of ``flow``, n times (T, 3)
-    axis, drift : each row's motion per unit rate, angular and linear at the world's origin, n times (T, 3)
+    rotation, origin : list of ndarray
+        Frame of each body in the world, n times (T, 3, 3) and (T, 3) [m].
+    spin, flow : list of ndarray
+        Angular velocity of each body, and velocity of its point at the world origin, n times (T, 3).
+    turning, rushing : list of ndarray
+        Angular acceleration and rate of ``flow``, n times (T, 3).
+    axis, drift : list of ndarray
+        Motion of each row per unit rate, angular and linear at the world origin, n times (T, 3).
     """
 
     rotation: list[Array] = field(default_factory=list)
@@ -56,16 +60,16 @@ class Motion:
     drift: list[Array] = field(default_factory=list)
 
     def point(self, body: int, at: Array) -> Array:
-        """Return the place of a point of a body's frame, (T, 3) [m]; ``at`` : (3,) or (T, 3)."""
+        """Return the position of a point of a body's frame, (T, 3) [m]; ``at`` : (3,) or (T, 3)."""
         return self.origin[body] + times(self.rotation[body], np.broadcast_to(at, self.origin[body].shape))
 
     def velocity(self, body: int, position: Array) -> Array:
-        """Velocity of the body's point that is at a place in the world, (T, 3)."""
+        """Return the velocity of the body's point at a world position, (T, 3)."""
         return self.flow[body] + np.cross(self.spin[body], position)
 
 
 class Bodies:
-    """The tree of bodies of a robot whose motors weigh what their links weigh more."""
+    """Tree of bodies of a robot, with the masses of motors added to their links."""
 
     def __init__(self, robot: Robot) -> None:
         self.robot = robot.with_motors_mounted() if any(motor.mass for motor in robot.motors) else robot
@@ -82,7 +86,7 @@ class Bodies:
             self.damping[joints.index(motor.joint)] += getattr(motor, "reflected_damping", 0.0)
 
     def ancestors(self, body: int) -> list[int]:
-        """The rows that move a body, from it to the root."""
+        """Return the rows that move a body, from the body to the root."""
         chain = []
         while body >= 0:
             chain.append(body)
@@ -90,7 +94,7 @@ class Bodies:
         return chain
 
     def motion(self, q: Array, v: Array, vdot: Array) -> Motion:
-        """Poses, velocities and accelerations; q (T, nq), v and vdot (T, n)."""
+        """Return poses, velocities and accelerations for q (T, nq), v and vdot (T, n)."""
         samples, m = len(q), Motion()
         still = np.zeros((samples, 3))
         mounts: dict[int, int] = {}
@@ -116,7 +120,7 @@ class Bodies:
             m.drift.append(drift)
             m.spin.append(spin_P + angular * rate)
             m.flow.append(flow_P + drift * rate)
-            # The rate of a row's axis is the velocity of its mount times it, as of one motion vector by another.
+            # The rate of a row's axis is the motion cross product of the velocity of its mount and the axis.
             bent = np.cross(spin_M, angular)
             swept = np.cross(spin_M, drift) + np.cross(flow_M, angular)
             m.turning.append(turn_P + angular * gain + bent * rate)
@@ -124,7 +128,7 @@ class Bodies:
         return m
 
     def _moved(self, i: int, q: Array, R_J: Array, o_J: Array) -> tuple[Array, Array]:
-        """Frame of a body in the world whose joint's frame is at R_J, o_J."""
+        """Return the world frame of a body whose joint's frame is at R_J, o_J."""
         link, k = self.robot.links[i], self.places[i]
         if link.kind == "prismatic":
             return R_J, o_J + times(R_J, link.axis * q[:, k : k + 1])
@@ -141,7 +145,7 @@ class Bodies:
         return R_J @ _turn(np.array([0.0, 0.0, 1.0]), heading), o_J + times(R_J, np.stack([x, y, 0.0 * x], axis=1))
 
     def _axis(self, i: int, R: Array, R_J: Array) -> tuple[Array, Array]:
-        """Angular velocity, and velocity of the body's origin, per unit rate of the row."""
+        """Return the angular velocity, and velocity of the body's origin, per unit rate of the row."""
         link, still = self.robot.links[i], np.zeros((len(R), 3))
         if link.kind == "revolute":
             return times(R_J, np.broadcast_to(link.axis, still.shape)), still
@@ -153,14 +157,14 @@ class Bodies:
             return still, R[:, :, 0]
         if link.kind == "turn":
             return R[:, :, 2], still
-        # Radius over track is the left one's parameter, half the radius the right one's.
+        # Radius over track is the parameter of the left wheel, half the radius of the right wheel.
         left = link if link.kind == "left_wheel" else self.robot.links[i - 1]
         right = self.robot.links[i + 1] if link.kind == "left_wheel" else link
         sign = -1.0 if link.kind == "left_wheel" else 1.0
         return sign * left.parameter * R[:, :, 2], right.parameter * R[:, :, 0]
 
     def wrenches(self, m: Motion, weight: bool = True) -> list[tuple[Array, Array]]:
-        """Moment about the world's origin and force that each body needs, its weight taken off."""
+        """Return moment about the world origin and force that each body needs, minus its weight."""
         needed = []
         for i, link in enumerate(self.robot.links):
             body, R = link.inertia, m.rotation[i]
@@ -175,7 +179,7 @@ class Bodies:
         return needed
 
     def along_rows(self, m: Motion, wrenches: Sequence[tuple[Array, Array]]) -> Array:
-        """Generalised forces of a wrench on each body, (T, n)."""
+        """Return generalised forces of a wrench on each body, (T, n)."""
         moments, forces = ([part.copy() for part in parts] for parts in zip(*wrenches, strict=True))
         rows = np.zeros((len(m.origin[0]), self.n))
         for i in range(self.n - 1, -1, -1):
@@ -186,27 +190,27 @@ class Bodies:
         return rows
 
     def force_along_rows(self, m: Motion, body: int, position: Array, force: Array, moment: Array) -> Array:
-        """Generalised forces of a force at a place of the world and a moment, both on one body, (T, n)."""
+        """Return generalised forces of a force at a world position and a moment, both on one body, (T, n)."""
         about, rows = moment + np.cross(position, force), np.zeros((len(force), self.n))
         for i in self.ancestors(body):
             rows[:, i] = (m.axis[i] * about).sum(axis=1) + (m.drift[i] * force).sum(axis=1)
         return rows
 
     def jacobian(self, m: Motion, body: int, position: Array) -> Array:
-        """Velocity per unit rate of a body's point at a place of the world, (T, 3, n)."""
+        """Return the velocity per unit rate of a body's point at a world position, (T, 3, n)."""
         J = np.zeros((len(position), 3, self.n))
         for i in self.ancestors(body):
             J[:, :, i] = m.drift[i] + np.cross(m.axis[i], position)
         return J
 
     def mass_matrix(self, q: Array) -> Array:
-        """M + J_m of one configuration (nq,), by a unit acceleration of each row, (n, n)."""
+        """Return M + J_m at one configuration (nq,), from a unit acceleration of each row, (n, n)."""
         still = np.zeros((self.n, self.n))
         m = self.motion(np.repeat(q[None], self.n, axis=0), still, np.eye(self.n))
         return self.along_rows(m, self.wrenches(m, weight=False)) + np.diag(self.armature)
 
     def momentum(self, m: Motion, chosen: Sequence[int]) -> tuple[Array, Array]:
-        """Angular momentum about the world's origin and momentum of some bodies, (T, 3) each."""
+        """Return angular momentum about the world origin and momentum of some bodies, (T, 3) each."""
         angular = linear = np.zeros((len(m.origin[0]), 3))
         for i in chosen:
             body, R = self.robot.links[i].inertia, m.rotation[i]
@@ -218,7 +222,7 @@ class Bodies:
         return angular, linear
 
     def energies(self, m: Motion, v: Array) -> tuple[Array, Array]:
-        """Kinetic energy with rotors, and potential energy up to a constant, (T,) each [J]."""
+        """Return kinetic energy with rotors, and potential energy up to a constant, (T,) each [J]."""
         kinetic, potential = 0.5 * (self.armature * v * v).sum(axis=1), np.zeros(len(v))
         for i, link in enumerate(self.robot.links):
             body, R = link.inertia, m.rotation[i]
@@ -230,7 +234,7 @@ class Bodies:
         return kinetic, potential
 
     def free_directions(self) -> Array:
-        """Rates that couplings of joints leave, as columns, (n, n − k)."""
+        """Return the rates that couplings of joints allow, as columns, (n, n − k)."""
         joints, rows = list(self.robot.joint_names), []
         for coupling in self.robot.couplings:
             row = np.zeros(self.n)
@@ -244,7 +248,7 @@ class Bodies:
 
 
 def position_rates(bodies: Bodies, q: Array, v: Array) -> Array:
-    """q̇ of coordinates (T, nq) and rates (T, n)."""
+    """Return q̇ for coordinates (T, nq) and rates (T, n)."""
     rates = np.zeros_like(q)
     for i, link in enumerate(bodies.robot.links):
         k = bodies.places[i]
@@ -268,14 +272,14 @@ def position_rates(bodies: Bodies, q: Array, v: Array) -> Array:
 
 
 def _turn(axis: Array, angle: Array) -> Array:
-    """Rotations about a unit axis, (T,) → (T, 3, 3)."""
+    """Return rotations about a unit axis, (T,) → (T, 3, 3)."""
     K = cross_matrix(np.asarray(axis, dtype=np.float64))
     sine, cosine = np.sin(angle)[:, None, None], np.cos(angle)[:, None, None]
     return np.eye(3) + sine * K + (1.0 - cosine) * (K @ K)
 
 
 def _attitude(quaternion: Array) -> Array:
-    """Rotations of quaternions w, x, y, z, of any length, (T, 4) → (T, 3, 3)."""
+    """Return rotations of quaternions w, x, y, z, of any length, (T, 4) → (T, 3, 3)."""
     unit = quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)
     w, K = unit[:, 0, None, None], cross_matrix(unit[:, 1:])
     return np.eye(3) + 2.0 * w * K + 2.0 * K @ K

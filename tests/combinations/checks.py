@@ -31,7 +31,7 @@ from dynsim.scenario import build
 START = 1e-5
 # A force above this multiple of weight, loads and motor torques at a lever of 5 cm is absurd.
 ABSURD, LEVER_M = 1e6, 0.05
-# Rates above which rounding of positions spoils what is computed from them; only unstable loops get there [rad/s, m/s].
+# Rates above which rounding of positions spoils derived quantities; only unstable loops get there [rad/s, m/s].
 ROUNDED = 1e9
 # Signals that may be NaN because they divide by a load that may be zero.
 MAY_BE_NAN = ("center_of_pressure", "traction_demand")

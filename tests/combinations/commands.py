@@ -19,7 +19,7 @@ SHOWS_HELD_UNTIL_TICK = False
 
 
 def commands(seen: Observed) -> Finding:
-    """Voltages are the controller's commands now, or at the last tick, for joints with a constant reference."""
+    """Check that voltages are the controller's commands now, or at the last tick, for constant references."""
     controller = seen.config.get("controller") or {}
     if controller.get("type") != "joint_pd" or any(
         controller.get(key) for key in ("hand", "operator", "brace", "torques")
@@ -64,7 +64,7 @@ def _gain(controller: Mapping[str, Any], key: str, joint: str) -> float | None:
 
 
 def _held_command_errors(seen: Observed, command: Array, shown: Array, period: float) -> Array:
-    """By how much voltages differ from the command at their tick, where that is a sample, (T,) [V]."""
+    """Return how much voltages differ from the command at their tick, if that is a sample, (T,) [V]."""
     count = seen.time / period
     at_tick = np.abs(count - np.round(count)) < 1e-6
     tick = np.where(at_tick, np.round(count), np.floor(count)).astype(int)

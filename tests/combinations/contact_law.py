@@ -13,31 +13,31 @@ from dynsim.model.surfaces import HeightField
 Array = NDArray[np.float64]
 Finding = Iterator[str]
 
-# Promise of docs/physics.md: gaps after a step's projection [m]; and where a point counts as landed.
+# Specification of docs/physics.md: gaps after the projection of a step [m]; and gap at which a point counts as landed.
 DRIFT = 1e-9
-# Of joint stops: limits in files are rounded [rad or m].
+# Slack for joint stops, because limits in files are rounded [rad or m].
 STOP_SLACK = 1e-6
-# Share of the force that a frozen direction of slip and the tolerance of an event leave.
+# Fraction of the force that a frozen slip direction and the tolerance of an event leave.
 CONE = 1e-5
-# What sticks moves no faster: limit of the projection of velocities [m/s]; steps solve contact problems to 1e-8.
+# Largest speed of a sticking point: limit of the velocity projection [m/s]; steps solve contact problems to 1e-8.
 CREEP = 1e-6
-# Beyond this the nearest point of a height field is not looked for everywhere [m].
+# Beyond this distance the nearest point of a height field is not searched everywhere [m].
 FAR = 0.5
-# The direction of slower slip is noise: 1000 times the default atol [m/s].
+# Direction of slower slip is noise: 1000 times the default atol [m/s].
 SLOW = 1e-4
-# The kernels' own bound of such slip, in units of atol.
+# The kernels' bound for such slip, in units of atol.
 OF_ATOL = 1000.0
 
 
 def touching(seen: Observed) -> Finding:
-    """Gaps, slip and normals of the record agree with the posture; open contacts have no force, and none pulls."""
+    """Check that gaps, slip and normals agree with the posture, open contacts have no force, and no contact pulls."""
     for k, touch in enumerate(seen.touches()):
         name = touch.contact.name
         off = np.abs(touch.gap - seen.record["contact_gap"][:, k])
-        # The foot of the perpendicular to waves far below is one of several.
+        # The foot of the perpendicular to waves far below is not unique.
         if isinstance(touch.contact.surface, HeightField):
             off[touch.gap > FAR] = 0.0
-        # Two searches for a nearest point.
+        # Errors of two searches for a nearest point.
         if off.max() > 1e-8 + 1e-6 * np.abs(touch.gap[off.argmax()]):
             i = int(off.argmax())
             yield (
@@ -83,7 +83,7 @@ def touching(seen: Observed) -> Finding:
 
 
 def _unsolved(seen: Observed, rate: float) -> Array:
-    """Force that gives all links together this rate [m/s] within the step of each sample, (T,) [N].
+    """Return the force that gives all links together this rate [m/s] within the step of each sample, (T,) [N].
 
     Contact problems of time stepping are solved to some rate: mobility times a force outside its cone is at most this.
     """
@@ -92,7 +92,7 @@ def _unsolved(seen: Observed, rate: float) -> Array:
 
 
 def _reach(seen: Observed, touch: Touch) -> Array:
-    """Largest gap of a contact with a force, (T,) [m]; time stepping adds the motion of a step along the normal.
+    """Return the largest gap of a contact with a force, (T,) [m]; in time stepping plus the normal motion of a step.
 
     A point that starts within a micrometre of its surface counts as closed. While it is closed, its rate along the
     normal is zero at the end of each step, so that it leaves the surface by half the change of that rate in a step.
@@ -106,12 +106,12 @@ def _reach(seen: Observed, touch: Touch) -> Array:
 
 
 def _fastest_approach(touch: Touch) -> Array:
-    """Largest speed along the normal until each sample, (T,) [m/s]."""
+    """Return the largest speed along the normal until each sample, (T,) [m/s]."""
     return np.asarray(np.maximum.accumulate(np.maximum(np.abs(touch.approach), np.abs(touch.approach_before))))
 
 
 def coefficient(touch: Touch, speed: Array) -> Array:
-    """μ at speeds of slip, (T,)."""
+    """Return μ at slip speeds, (T,)."""
     contact = touch.contact
     at_rest = contact.friction_at_rest
     mu = contact.friction + contact.viscous_friction * speed
@@ -121,7 +121,7 @@ def coefficient(touch: Touch, speed: Array) -> Array:
 
 
 def friction(seen: Observed) -> Finding:
-    """Friction stays in its cone, is on its edge against the slip where there is some, and slips nowhere else."""
+    """Check that friction is in its cone, on its edge against slip, and that there is no other slip."""
     for touch in seen.touches():
         yield from _glued_friction(seen, touch) if not seen.real else _real_friction(seen, touch)
 
@@ -148,11 +148,11 @@ def _real_friction(seen: Observed, touch: Touch) -> Finding:
     speed, size = np.linalg.norm(touch.slip, axis=1), np.linalg.norm(tangential, axis=1)
     closed = touch.mode != OPEN
     slips = closed & (touch.mode == SLIDING) & (f_n > 0.0)
-    # Steps take μ of their start, the direction of their mean, and rates of before an impact.
+    # Steps use μ at their start, the direction of their mean, and rates before an impact.
     before = touch.slip_before
     speed = np.maximum(speed, np.linalg.norm(before, axis=1))
     if seen.stepped:
-        # A sample within a step has the force of the step, but rates between those of its ends.
+        # A sample within a step has the force of the step, but rates between those at its ends.
         speed = np.maximum(speed, np.maximum(np.append(speed[1:], 0.0), np.append(0.0, speed[:-1])))
     most = np.maximum(contact.friction_at_rest, coefficient(touch, speed))
     if contact.grip_axis is None:
@@ -167,26 +167,26 @@ def _real_friction(seen: Observed, touch: Touch) -> Finding:
                 f"{contact.name} at t = {seen.time[i]:.6g} s: friction of {size[i]:.6g} N is outside the cone of "
                 f"{most[i]:.4g} × {f_n[i]:.6g} N"
             )
-    # Time stepping has its law at the ends of steps; a sample may lie within one.
+    # In time stepping the law applies at the ends of steps; a sample may be within a step.
     power = (tangential * touch.slip_after).sum(axis=1)
-    # A normal that is a little off has a share of the normal force in the surface, which may be all that there is.
+    # A slightly wrong normal has a tangential share of the normal force, possibly all of the tangential force.
     noise = _share(seen, touch) * np.linalg.norm(touch.force, axis=1) * speed
-    # Against w friction gives f·u up to |f| |u − w| to slip u.
-    # A slip that begins against its direction by what integration does not know, a few times atol, goes on so.
+    # Friction against w gives f·u up to |f| |u − w| to slip u.
+    # Slip that begins against its direction by less than the accuracy of integration, a few times atol, continues.
     unknown = SLOW + touch.lag if seen.stepped else max(1e-7, 10.0 * seen.scenario.integrator.absolute_tolerance)
     gained = slips & (power > noise + size * unknown + 1e-12)
     if seen.stepped:
-        # A step in which slip ends may end with some of it turned round.
+        # A step in which slip ends may end with part of it reversed.
         gained &= (tangential * before).sum(axis=1) > 0.0
     if gained.any():
         i = int(np.where(gained, power, 0.0).argmax())
         yield f"{contact.name} at t = {seen.time[i]:.6g} s: friction drives the slip with {power[i]:.4g} W"
     if contact.grip_axis is None:
         yield from _against_slip(seen, touch, slips, before)
-    # Only the velocity of the touching place counts: other points of a rolling sphere move.
+    # Only the velocity of the touching point counts: other points of a rolling sphere move.
     sticks = closed & (touch.mode == STICKING)
     if seen.stepped:
-        # A step at whose end slip is over had some of it.
+        # A step at whose end slip is over contained some slip.
         sticks &= np.concatenate([[False], sticks[:-1]])
     moving = sticks & (np.linalg.norm(touch.slip, axis=1) > _creep(seen, touch))
     if moving.any():
@@ -196,17 +196,17 @@ def _real_friction(seen: Observed, touch: Touch) -> Finding:
 
 
 def _share(seen: Observed, touch: Touch) -> Array:
-    """Part of a force by which its parts may be off, (T,): by steps it belongs to the normal of half a step before."""
+    """Return the fraction of a force by which its parts may be wrong, (T,): in steps the normal is half a step old."""
     return CONE + touch.turned if seen.stepped else np.full(len(seen), CONE)
 
 
 def _slow_slip(seen: Observed) -> float:
-    """Slip keeps its initial direction up to 1000 times atol [m/s]; steps may continue to twice that speed."""
+    """Return the slip up to which its initial direction is kept, 1000 atol [m/s]; in steps twice that speed."""
     return max(2.0 * OF_ATOL * seen.scenario.integrator.absolute_tolerance, SLOW)
 
 
 def _creep(seen: Observed, touch: Touch) -> Array:
-    """Largest slip of a sticking contact, (T,) [m/s]: time stepping adds the turn of the surface in a step."""
+    """Return the largest slip of a sticking contact, (T,) [m/s]: time stepping adds the rotation of the surface."""
     if not seen.stepped:
         return np.full(len(seen), CREEP)
     moved = np.linalg.norm(np.diff(touch.position, axis=0, prepend=touch.position[:1]), axis=1)
@@ -217,7 +217,7 @@ def _creep(seen: Observed, touch: Touch) -> Array:
 
 
 def _against_slip(seen: Observed, touch: Touch, slips: NDArray[np.bool_], before: Array) -> Finding:
-    """Sliding friction is μ f_n against the slip."""
+    """Check that sliding friction is μ f_n against the slip."""
     speed, f_n = np.linalg.norm(touch.slip_after, axis=1), touch.normal_force
     if seen.stepped:
         # If slip begins, ends or turns within a step, its friction is a mean: only steady slip is compared.
@@ -227,7 +227,7 @@ def _against_slip(seen: Observed, touch: Touch, slips: NDArray[np.bool_], before
         steady = slips & (np.minimum(speed, earlier) > SLOW) & (turned < 0.2 * both)
         middle = 0.5 * (touch.slip_after + before)
         low, high = coefficient(touch, np.minimum(speed, earlier)), coefficient(touch, both)
-        # The contact's place moves on the body within a step, and the tangent plane turns.
+        # The contact moves on the body within a step, and the tangent plane turns.
         # Directions of u and w are up to 2 |u − w|/|u| apart.
         share = (
             (turned + 2.0 * touch.lag) / np.maximum(both, 1e-300) + np.abs(high - low) / np.maximum(high, 1e-300) + 1e-3
@@ -261,14 +261,14 @@ def _at_an_end(seen: Observed, touch: Touch, i: int) -> bool:
 
 
 def _turned_rows(seen: Observed, touch: Touch) -> tuple[Array, Array]:
-    """What a step to each sample changes at the sample's rates: the gap beyond its rate [m], and slip [m/s], (T,)."""
+    """Return the changes in a step at the sample's rates: gap beyond its rate [m], and slip [m/s], (T,)."""
     then = next(other for other in seen.touches_before if other.contact.name == touch.contact.name)
     gap = touch.gap - then.gap - seen.step * touch.approach
     return np.asarray(gap), np.linalg.norm(touch.slip - then.slip, axis=1)
 
 
 def gaps(seen: Observed) -> Finding:
-    """Nothing lies below its surface: by events within what projection leaves, by steps within their way."""
+    """Check that nothing is below its surface: by events within the residual of projection, by steps within a step."""
     for touch in seen.touches():
         name, contact = touch.contact.name, touch.contact
         if not seen.real:
@@ -279,7 +279,7 @@ def gaps(seen: Observed) -> Finding:
                     f"glued to"
                 )
             continue
-        # A point that no joint moves along the normal is left out of the contacts, with a warning.
+        # A point that no joint moves along the normal is excluded from the contacts, with a warning.
         if f"{name}: no joint moves this point along the normal" in " ".join(seen.run.warnings):
             continue
         deepest = int(touch.gap.argmin())
@@ -287,10 +287,10 @@ def gaps(seen: Observed) -> Finding:
         begun = max(-float(touch.gap[0]), 0.0)
         allowed = DRIFT
         if seen.stepped:
-            # The gap of the middle of a step decides: until its end a point moves and falls freely.
+            # The gap at the middle of a step decides: until its end a point moves and falls freely.
             fall = 0.5 * seen.step**2 * float(np.linalg.norm(seen.bodies.gravity))
             allowed = 1e-7 + sag + 1.5 * seen.step * float(_fastest_approach(touch)[deepest]) + fall
-            # Rates lie along the surface at the end of a step, so on a curve the point leaves it by half their change.
+            # Rates are along the surface at the end of a step, so on a curve the point leaves it by half their change.
             allowed += float(np.abs(_turned_rows(seen, touch)[0])[touch.mode != OPEN].sum())
             if contact.tip is not None and _at_an_end(seen, touch, deepest):
                 continue
@@ -302,7 +302,7 @@ def gaps(seen: Observed) -> Finding:
 
 
 def _spent(seen: Observed, joint: str, limit: float, beyond: float) -> bool:
-    """Whether what hits on the stop have taken does not suffice to push the joint back against its largest force."""
+    """Whether the energy lost in hits is too small to push the joint back against its largest force."""
     for stop in seen.record.summary["joint_stops"]:
         if stop["joint"] == joint and stop["limit"] == limit:
             return bool(stop.get("impact_loss_J", np.inf) < stop["force_max"] * beyond)
@@ -310,7 +310,7 @@ def _spent(seen: Observed, joint: str, limit: float, beyond: float) -> bool:
 
 
 def stops(seen: Observed) -> Finding:
-    """Joints stay within their stops, and steps take back what one let pass; a stop pushes only at its end."""
+    """Check that joints stay within their stops, steps move them back, and a stop pushes only at its end."""
     if not seen.real:
         return
     for i, (link, k) in enumerate(zip(seen.robot.links, seen.bodies.places, strict=True)):
@@ -326,7 +326,7 @@ def stops(seen: Observed) -> Finding:
                     f"{link.joint} at t = {seen.time[deepest]:.6g} s is {beyond[deepest]:.3g} beyond its stop (allowed "
                     f"{allowed:.3g})"
                 )
-            # 20 ms to come back, at 0.02 a second at the most, and as long again for what energy is left to do it.
+            # 20 ms to return, at most at 0.02 per second, and as long again for the remaining energy.
             late = seen.time >= seen.time[deepest] + 0.2 + 2.0 * max(float(beyond[deepest]), 0.0) / 0.02
             if beyond[deepest] > 10.0 * STOP_SLACK and late.any():
                 still = float(beyond[late].min())
@@ -350,7 +350,7 @@ def _stop_forces(seen: Observed) -> Finding:
 
 
 def dry(seen: Observed) -> Finding:
-    """Dry friction of joints stays within its bound, and is on it, against the motion, where there is some."""
+    """Check that dry friction of joints is within its bound, and on it, against the motion, if there is motion."""
     if "joint_friction" not in seen.record:
         return
     gears = {motor.joint: getattr(motor, "dry_friction", 0.0) for motor in seen.robot.motors}
@@ -358,7 +358,7 @@ def dry(seen: Observed) -> Finding:
         i = seen.joints.index(joint)
         bound = seen.robot.links[i].friction + gears.get(joint, 0.0)
         torque, rate = seen.record["joint_friction"][:, k], seen.v[:, i]
-        # Events look at the ends of steps: samples within them, and the torque of a joint at rest, have their errors.
+        # Events are checked at the ends of steps: samples within them, and torques of joints at rest, have errors.
         off = 1e-6 if seen.stepped else max(1e-6, seen.scenario.integrator.rtol)
         if (np.abs(torque) > bound * (1.0 + off) + 1e-12).any():
             t = int(np.abs(torque).argmax())
@@ -369,7 +369,7 @@ def dry(seen: Observed) -> Finding:
         if not seen.stepped:
             moves &= ~_rests_with_constant_torque(seen, torque, rate)
         if seen.stepped:
-            # Steady motion only: a step in which it stops or begins has any force within the bound.
+            # Only steady motion: in a step in which it stops or begins, any force within the bound is valid.
             gain = seen.step * seen.vdot[:, i]
             moves &= np.minimum((rate - gain) * rate, (rate + gain) * rate) > 0.01 * rate**2
         beside = np.where(moves, np.abs(torque + bound * np.sign(rate)), 0.0)
@@ -382,7 +382,7 @@ def dry(seen: Observed) -> Finding:
 
 
 def _rests_with_constant_torque(seen: Observed, torque: Array, rate: Array) -> Array:
-    """Return samples at which a joint without a separate row may be at rest because contacts hold it, nearly.
+    """Return samples at which a joint without a separate row may be nearly at rest because contacts hold it.
 
     Its torque is constant from one choice of modes to the next. The contacts may turn it at rates so low that slip has
     no defined direction, before the modes are chosen again: 1000 times atol.

@@ -1,9 +1,9 @@
-"""Whether forces by Coulomb's law exist at one state: exactly, by branching over modes and directions of slip.
+"""Existence of forces by Coulomb's law at one state: exact, by branching over modes and slip directions.
 
-A mode of each contact and resting joint makes the law linear, but for the disc of a contact that sticks and for the
-direction in which one at rest begins to slip. The disc is cut off by tangents where a solution leaves it. Directions
-are branched into sectors, in each of which the law is relaxed to the hull of its arc. So a branch without a solution
-has none, and a sector as narrow as rounding has one if its hull has.
+With a mode for each contact and resting joint the law is linear, except for the disc of a sticking contact and the
+direction in which a contact at rest begins to slip. The disc is cut by tangents where a solution leaves it. Directions
+are branched into sectors, in each of which the law is relaxed to the hull of its arc. If a relaxed branch has no
+solution, the branch has none either; a sector as narrow as rounding has a solution if its hull has one.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ Array = NDArray[np.float64]
 
 # Relative violation that counts as zero: the tolerance of the linear programs.
 SOLVED = 1e-7
-# Sectors below this are a direction: the hull leaves its arc by their square [rad].
+# Narrower sectors count as a direction: the hull deviates from its arc by their square [rad].
 NARROW = 1e-4
-# Most cuts of one disc by tangents: each leaves a fraction of the violation.
+# Maximum number of cuts of one disc by tangents: each leaves a fraction of the violation.
 CUTS = 40
 OPEN, PRESSED, STICKS = "open", "pressed", "sticks"
 
@@ -30,7 +30,7 @@ OPEN, PRESSED, STICKS = "open", "pressed", "sticks"
 class Point:
     """A closed contact, with three rows from ``row`` on, normal first; without friction, and for a joint stop, one row.
 
-    ``friction`` : its coefficient, static where it is at rest; ``direction`` : of its slip, (2,); None at rest
+    ``friction`` is its coefficient, static at rest; ``direction`` is the direction of its slip, (2,), None at rest.
     """
 
     row: int
@@ -52,7 +52,7 @@ def _rows(m: Point | Rest) -> list[int]:
 
 @dataclass
 class _Program:
-    """Conditions G x ≤ g, E x = e on x, from which f = F x."""
+    """Constraints G x ≤ g, E x = e on x, with f = F x."""
 
     F: Array
     upper: list[tuple[Array, float]] = field(default_factory=list)
@@ -62,7 +62,7 @@ class _Program:
 def forces_exist(W: Array, b: Array, points: Sequence[Point], rests: Sequence[Rest]) -> bool:
     """Whether there is an f with accelerations a = W f + b by Coulomb's law; ``W`` : (p, p), ``b`` : (p,).
 
-    Parts that do not act on each other are decided one by one.
+    Parts that do not affect each other are decided separately.
     """
     members: list[Point | Rest] = [*points, *rests]
     blocks = [_rows(m) for m in members]
@@ -70,7 +70,7 @@ def forces_exist(W: Array, b: Array, points: Sequence[Point], rests: Sequence[Re
 
 
 def parts(W: Array, blocks: Sequence[Sequence[int]]) -> list[list[int]]:
-    """Sets of blocks of rows, of which no force along one moves another set."""
+    """Return sets of blocks of rows such that no force along one set moves another."""
     sizes = np.sqrt(np.abs(np.diag(W)))
     result, left = [], set(range(len(blocks)))
     while left:
@@ -90,7 +90,7 @@ def parts(W: Array, blocks: Sequence[Sequence[int]]) -> list[list[int]]:
 def _part_has_forces(W: Array, b: Array, members: Sequence[Point | Rest]) -> bool:
     rows = [r for m in members for r in _rows(m)]
     index = {r: i for i, r in enumerate(rows)}
-    # Rows and forces in units with a diagonal and a right-hand side of one.
+    # Rows and forces are scaled to a diagonal and a right-hand side of one.
     units = np.ones(len(rows))
     for m in members:
         own = [index[r] for r in _rows(m)]
@@ -107,7 +107,7 @@ def _part_has_forces(W: Array, b: Array, members: Sequence[Point | Rest]) -> boo
         else Rest(index[m.row], m.bound / (units[index[m.row]] * size))
         for m in members
     ]
-    # What is said of the first members; the others may have any mode.
+    # Modes chosen for the first members; the others may have any mode.
     stack: list[tuple[object, ...]] = [()]
     while stack:
         chosen = stack.pop()
@@ -127,7 +127,7 @@ def _part_has_forces(W: Array, b: Array, members: Sequence[Point | Rest]) -> boo
 
 
 def _modes(member: Point | Rest) -> list[object]:
-    """Modes of one contact or joint, the likeliest last."""
+    """Return the modes of one contact or joint, the likeliest last."""
     if isinstance(member, Rest):
         return [-1.0, 1.0, 0.0]
     if member.direction is not None or member.friction == 0.0:
@@ -137,7 +137,7 @@ def _modes(member: Point | Rest) -> list[object]:
 
 
 def _feasible(W: Array, b: Array, members: Sequence[Point | Rest], chosen: Sequence[object]) -> bool:
-    """Whether the relaxed law has forces with the chosen modes of the first members, and any of the others."""
+    """Whether the relaxed law has forces with the chosen modes of the first members and any modes of the others."""
     parts, count = [], 0
     for i, m in enumerate(members):
         mode = chosen[i] if i < len(chosen) else None
@@ -170,7 +170,7 @@ def _feasible(W: Array, b: Array, members: Sequence[Point | Rest], chosen: Seque
         if mode == STICKS:
             program.equal += [(A[r], -b[r]) for r in t]
         elif isinstance(mode, tuple):
-            # The acceleration is in the cone of the sector: to the left of its first side, right of its last.
+            # The acceleration is in the cone of the sector: left of its first side, right of its last.
             for sign, angle in zip((1.0, -1.0), mode, strict=True):
                 side = sign * np.array([-np.sin(angle), np.cos(angle)])
                 program.upper.append((-(side @ A[list(t)]), float(side @ b[list(t)])))
@@ -191,7 +191,7 @@ def _feasible(W: Array, b: Array, members: Sequence[Point | Rest], chosen: Seque
 
 
 def _directions(m: Point | Rest, mode: object) -> Array:
-    """Directions of a member's force, of which not negative shares make it up, but for discs and joints."""
+    """Return the directions whose non-negative combinations form a member's force, except for discs and joints."""
     if isinstance(m, Rest):
         return np.ones((1, 1))
     if mode == OPEN:
@@ -209,7 +209,7 @@ def _directions(m: Point | Rest, mode: object) -> Array:
 
 
 def _tangent(identity: Array, m: Point, own: slice, angle: float) -> Array:
-    """Coefficients of f_t·e − μ f_n ≤ 0."""
+    """Return the coefficients of f_t·e − μ f_n ≤ 0."""
     return np.cos(angle) * identity[own][1] + np.sin(angle) * identity[own][2] - m.friction * identity[own][0]
 
 

@@ -1,7 +1,7 @@
-"""Few assignments of levels that hold each pair, or each triple, of levels that is not refused; and random ones.
+"""Few assignments of levels that contain each allowed pair, or triple, of levels; and random assignments.
 
-A combination of levels counts for the adaptive methods and for time stepping apart: where both know it, each has a
-scene that holds it.
+A combination of levels counts separately for adaptive methods and for time stepping: if both support it, each has a
+scene with it.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from combinations.factors import FACTORS, METHOD, REFUSALS, methods
 
-# Assignments tried for each that is taken, and how often a level is tried where assignments are refused.
+# Candidate assignments for each accepted one, and how often a level is tried if assignments are refused.
 CANDIDATES, ATTEMPTS = 10, 200
-# One method for each kind of which features are refused.
+# One method for each kind with different refused features.
 KINDS = ("dopri5", "time_stepping")
 
 LEVELS = [(factor, level) for factor, levels in FACTORS.items() for level in levels]
@@ -26,7 +26,7 @@ CHOICES = [[NUMBER[factor, level] for level in levels] for factor, levels in FAC
 
 
 class _Law:
-    """What a kind of methods refuses: a refusal is met where all its factors have one of its levels."""
+    """Refusals of a kind of methods: a refusal applies if all its factors have one of its levels."""
 
     def __init__(self, method: str) -> None:
         kept = [r for r in REFUSALS if r.holds_for(method)]
@@ -39,11 +39,11 @@ class _Law:
                     self._hit[row, [NUMBER[factor, level] for level in refused]] = 1
 
     def allows(self, chosen: Sequence[int]) -> bool:
-        """Whether levels, one for a factor at most, can be combined."""
+        """Whether levels, at most one for each factor, can be combined."""
         return bool((self._hit[:, list(chosen)].sum(axis=1) < self._full).all())
 
     def open(self, chosen: Sequence[int], choices: Sequence[int]) -> list[int]:
-        """Those of the choices that can be added."""
+        """Return the choices that can be added."""
         before = self._hit[:, list(chosen)].sum(axis=1)
         free = (before[:, None] + self._hit[:, list(choices)] < self._full[:, None]).all(axis=0)
         return [level for level, good in zip(choices, free.tolist(), strict=True) if good]
@@ -56,18 +56,18 @@ def _law(method: str) -> _Law:
 
 @cache
 def pairs(seed: int) -> list[dict[str, str]]:
-    """Assignments that hold every pair of levels of different factors that is not refused."""
+    """Return assignments that contain every allowed pair of levels of different factors."""
     return _covering(seed, 2)
 
 
 @cache
 def triples(seed: int) -> list[dict[str, str]]:
-    """The same for every triple."""
+    """Return assignments that contain every allowed triple."""
     return _covering(seed, 3)
 
 
 def draw(seed: int, number: int) -> dict[str, str]:
-    """A random assignment by its number: the same for ever, in any order."""
+    """Return a random assignment by its number: always the same, in any order."""
     random = np.random.default_rng([seed, number])
     kind = KINDS[int(random.integers(len(KINDS)))]
     for _ in range(ATTEMPTS):
@@ -79,7 +79,7 @@ def draw(seed: int, number: int) -> dict[str, str]:
 
 @cache
 def allowed(size: int, method: str) -> NDArray[np.bool_]:
-    """Which combinations of so many levels, by their numbers in ascending order, a method takes."""
+    """Return a mask of the combinations of ``size`` levels, in ascending order, that a method supports."""
     law = _law(method)
     taken = np.zeros((len(LEVELS),) * size, dtype=bool)
     for numbers in _combinations(size):
@@ -88,7 +88,7 @@ def allowed(size: int, method: str) -> NDArray[np.bool_]:
 
 
 def refused_share() -> float:
-    """The share of the pairs that no method takes."""
+    """Return the fraction of pairs that no method supports."""
     taken = np.logical_or.reduce([allowed(2, kind) for kind in KINDS])
     return 1.0 - taken.sum() / len(_combinations(2))
 
@@ -101,7 +101,7 @@ def _combinations(size: int) -> list[tuple[int, ...]]:
 
 
 def _covering(seed: int, size: int) -> list[dict[str, str]]:
-    """Greedy: of some random assignments that hold a combination still missing, the one that holds most of them."""
+    """Search greedily: of some random assignments with a missing combination, choose the one with most of them."""
     random = np.random.default_rng([seed, size])
     missing = {kind: allowed(size, kind).copy() for kind in KINDS}
     taken: list[dict[str, str]] = []
@@ -118,7 +118,7 @@ def _covering(seed: int, size: int) -> list[dict[str, str]]:
                     break
                 drawn = [levels for levels in [_filled(random, law, wanted)] if levels is not None]
             if not drawn:
-                # No whole assignment has it: its levels refuse each other by way of a third factor.
+                # No whole assignment has it: its levels are incompatible through a third factor.
                 lacks[tuple(wanted)] = False
                 continue
             best = max(drawn, key=lambda levels: int(lacks[np.ix_(*[levels] * size)].sum()))
@@ -137,7 +137,7 @@ def _named(chosen: Sequence[int]) -> dict[str, str]:
 def _filled(
     random: Generator, law: _Law, wanted: Sequence[int], lacks: NDArray[np.bool_] | None = None
 ) -> list[int] | None:
-    """A whole assignment around some levels, preferring those of which most is missing; None: it comes to nothing."""
+    """Complete some levels to an assignment, preferring levels with many missing combinations; None if impossible."""
     chosen = list(wanted)
     there = {LEVELS[k][0] for k in chosen}
     left = [choices for factor, choices in zip(FACTORS, CHOICES, strict=True) if factor not in there]

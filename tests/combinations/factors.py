@@ -50,10 +50,13 @@ class Refusal:
 
     Attributes
     ----------
-    levels : two or more factors, each with one or several levels; ``method`` may be among them
-    reason : why they cannot be combined
-    error : pattern of dynsim's message for a scene that has them; empty: no scene can have them, because the levels
-        exclude each other by their meaning
+    levels : dict
+        Two or more factors, each with one or several levels; ``method`` may be among them.
+    reason : str
+        Why they cannot be combined.
+    error : str
+        Pattern of dynsim's message for a scene with these levels; empty: there is no such scene, because the levels
+        exclude each other by their meaning.
     """
 
     levels: tuple[tuple[str, tuple[str, ...]], ...]

@@ -1,4 +1,4 @@
-"""Combinations that were wrong once: levels that differ from a plain scene, and numbers of scenes that showed it."""
+"""Combinations that were wrong once: levels that differ from a plain scene, and numbers of scenes with the fault."""
 
 from __future__ import annotations
 
@@ -16,13 +16,16 @@ PLAIN = {
 
 @dataclass(frozen=True)
 class Known:
-    """A fault that was mended.
+    """A corrected fault.
 
     Attributes
     ----------
-    fault : in a sentence
-    levels : that differ from :data:`PLAIN`
-    numbers : of scenes that showed it
+    fault : str
+        Description in one sentence.
+    levels : dict
+        Levels that differ from :data:`PLAIN`.
+    numbers : tuple of int
+        Scenes with the fault.
     """
 
     fault: str
@@ -31,7 +34,7 @@ class Known:
 
     @property
     def assignment(self) -> dict[str, str]:
-        """Levels of all factors."""
+        """Return the levels of all factors."""
         return {**PLAIN, **self.levels}
 
 

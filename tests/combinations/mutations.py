@@ -1,8 +1,8 @@
-"""Mutation check of the harness: faults that dynsim once had are put back one by one, and the scenes must find each.
+"""Mutation check of the harness: faults that dynsim once had are restored one by one, and the scenes must detect each.
 
     PYTHONPATH=.:tests python -m combinations.mutations --only jam
 
-copies the package, restores the fault, compiles it, and runs the scenes of :mod:`combinations.known` that once had it.
+copies the package, restores the fault, compiles it, and runs the scenes of :mod:`combinations.known` that once failed.
 """
 
 from __future__ import annotations
@@ -32,8 +32,10 @@ class Fault:
 
     Attributes
     ----------
-    name : key of the scenes in :data:`combinations.known.KNOWN`
-    texts : file below the package, present text, text with the fault
+    name : str
+        Key of the scenes in :data:`combinations.known.KNOWN`.
+    texts : tuple
+        File below the package, present text, text with the fault.
     """
 
     name: str
@@ -113,7 +115,7 @@ def restore(fault: Fault, folder: Path) -> None:
     Raises
     ------
     LookupError
-        The text that the fault replaces is not there.
+        If the text that the fault replaces is missing.
     """
     target = folder / PACKAGE.name
     shutil.copytree(PACKAGE, target, ignore=shutil.ignore_patterns("__pycache__"))
@@ -128,7 +130,7 @@ def restore(fault: Fault, folder: Path) -> None:
 
 
 def problems(name: str) -> list[str]:
-    """Problems of the scenes of a known fault, with the package that this process has."""
+    """Return the problems of the scenes of a known fault, with the package of this process."""
     listed = []
     for number in KNOWN[name].numbers:
         with tempfile.TemporaryDirectory() as temporary:
@@ -138,7 +140,7 @@ def problems(name: str) -> list[str]:
 
 
 def problems_with(fault: Fault) -> list[str]:
-    """:func:`problems` in a process of its own, whose package has the fault."""
+    """Return :func:`problems` from a separate process whose package has the fault."""
     with tempfile.TemporaryDirectory() as temporary:
         restore(fault, Path(temporary))
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join([temporary, str(TESTS)])}
@@ -153,7 +155,7 @@ def problems_with(fault: Fault) -> list[str]:
 
 
 def main() -> int:
-    """Print what the scenes say of each fault; 1 if one is not found."""
+    """Print the problems that the scenes report for each fault; return 1 if a fault is not detected."""
     parser = argparse.ArgumentParser(prog="python -m combinations.mutations", description=__doc__)
     names = [fault.name for fault in FAULTS]
     parser.add_argument("--only", choices=names, help="this fault alone")

@@ -18,7 +18,7 @@ from dynsim.model.drives import Motor
 Array = NDArray[np.float64]
 Finding = Iterator[str]
 
-# Rates of closed rows that are left as they are; projection takes larger ones away at once [m/s or rad/s].
+# Rates of closed rows that are not projected; larger rates are removed at once [m/s or rad/s].
 PROJECTED = 1e-8
 
 
@@ -176,7 +176,7 @@ def motion(seen: Observed) -> Finding:
         yield from _stepped_motion(seen)
         return
     between = seen.sample_time is not None and seen.sample_time < 0.99 * np.diff(seen.time).max(initial=0.0)
-    # What a command does from a tick to the next one shows in no sample.
+    # The effect of a command between two ticks is not visible in the samples.
     if jumps_at_ticks(seen) or between:
         return
     speeds = position_rates(seen.bodies, seen.q, seen.v)
@@ -194,10 +194,10 @@ def motion(seen: Observed) -> Finding:
 
 
 def _projected(seen: Observed, samples: NDArray[np.int_]) -> Array:
-    """Changes of rates by projection, (samples, n): of the least norm that takes PROJECTED from each closed row.
+    """Return changes of rates by projection, (samples, n): least-norm changes that remove PROJECTED from closed rows.
 
-    Where rows nearly depend on each other that is many times as much. Directions of joints count too, so that it is
-    PROJECTED at least.
+    If rows are nearly dependent, the changes are many times as large. Directions of joints count too, so that the
+    result is at least PROJECTED.
     """
     touches = [touch for touch in seen.touches() if (touch.mode != OPEN).any()]
     jacobians = [seen.bodies.jacobian(seen.motion, touch.body, touch.position) for touch in touches]

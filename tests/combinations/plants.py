@@ -1,4 +1,4 @@
-"""Robots of scenes: an arm that comes down to its elbow and goes up behind it, on each kind of base."""
+"""Robots of scenes: an arm that descends to its elbow and rises behind it, on each kind of base."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.random import Generator
 
 from combinations.factors import Levels
 
-# Of the links that turn [m] and [kg].
+# Revolute links: [m] and [kg].
 LENGTH, MASS, RADIUS = (0.15, 0.3), (0.1, 0.5), (0.01, 0.03)
 
 
@@ -20,9 +20,12 @@ class Joint:
 
     Attributes
     ----------
-    start : its position in the plant's keys [° or m]
-    body : that it moves
-    before : it is before the elbow: the elbow moves with it
+    start : float
+        Its position in the keys of the plant [° or m].
+    body : str
+        Body that it moves.
+    before : bool
+        It is before the elbow, so that the elbow moves with it.
     """
 
     name: str
@@ -38,17 +41,24 @@ class Joint:
 
 @dataclass
 class Plant:
-    """A robot, and what scenes must know of it.
+    """A robot, and its properties that scenes need.
 
     Attributes
     ----------
-    section : ``plant:`` of the scenario, without motors, friction and stops
-    joints : those that can have a motor, in order
-    follower : a joint that is coupled to another; empty: none is
-    elbow, hand, last : (body, point in its axes [m]); ``last`` is the body before the hand's point
-    radius : of the links [m]
-    files : by name
-    limited : joints that soon reach a stop
+    section : dict
+        ``plant:`` of the scenario, without motors, friction and stops.
+    joints : list of Joint
+        Joints that can have a motor, in order.
+    follower : str
+        Joint that is coupled to another; empty if there is no coupling.
+    elbow, hand, last : tuple
+        (body, point in its axes [m]); ``last`` is the body before the hand's point.
+    radius : float
+        Radius of the links [m].
+    files : dict
+        Content of files, with the file names as keys.
+    limited : list
+        Joints that soon reach a stop.
     """
 
     section: dict[str, Any]
@@ -60,7 +70,7 @@ class Plant:
     limited: set[str] = field(default_factory=set)
 
     def entry(self, joint: Joint) -> dict[str, Any]:
-        """The entry of ``chain`` of a joint of a serial arm."""
+        """Return the entry of ``chain`` for a joint of a serial arm."""
         chain = self.section.get("arm", self.section)["chain"]
         entry: dict[str, Any] = chain[int(joint.name.removeprefix("joint_")) - 1]
         return entry
@@ -71,13 +81,13 @@ class Plant:
 
     @property
     def arm(self) -> dict[str, Any]:
-        """The section that has the arm's keys."""
+        """Return the section with the keys of the arm."""
         section: dict[str, Any] = self.section.get("arm", self.section)
         return section
 
 
 def plant(random: Generator, levels: Levels) -> Plant:
-    """The robot of an assignment."""
+    """Return the robot of an assignment."""
     name = levels["plant"]
     light = 0.3 if levels["motor"] == "velocity" else 1.0
     if name in ("revolute", "prismatic"):
@@ -127,7 +137,7 @@ def _mobile(random: Generator, levels: Levels, light: float) -> Plant:
         "heading_deg": float(random.uniform(-180, 180)),
         "mass_kg": 12.0,
         "wheel": wheel,
-        # Below the origin of the base, which candidates would put under the floor of the elbow.
+        # Below the origin of the base, where candidates would put it under the floor of the elbow.
         "mount": {"position_m": [-0.05, 0.0, 0.0]},
     }
     wheels = [Joint(f"base.{side}", "revolute", 0.0, f"base.{side}", True) for side in ("left", "right")]
@@ -141,7 +151,7 @@ def _urdf(random: Generator, name: str, levels: Levels, light: float) -> Plant:
     pitch, back, yaw = float(random.uniform(112, 125)), float(random.uniform(-80, -50)), float(random.uniform(-20, 20))
     root = {"floating": "floating", "planar": "planar"}.get(name)
     losses = levels["rubbing"]
-    # In the file here and there, instead of in the scenario.
+    # Some values are in the file instead of in the scenario.
     dynamics = f'<dynamics damping="{0.05 if losses == "viscous" else 0.0}" friction="0"/>'
 
     def link(body: str, mass: float, length: float) -> str:
@@ -209,7 +219,7 @@ def _urdf(random: Generator, name: str, levels: Levels, light: float) -> Plant:
 
 
 def set_limits(robot: Plant, joint: Joint, lower: float, upper: float) -> None:
-    """Give a joint stops [° or m]."""
+    """Set stops of a joint [° or m]."""
     if robot.serial:
         robot.entry(joint)["limit_deg" if joint.turns else "limit_m"] = [lower, upper]
         return
@@ -228,7 +238,7 @@ def set_limits(robot: Plant, joint: Joint, lower: float, upper: float) -> None:
 
 
 def set_losses(robot: Plant, random: Generator, level: str) -> None:
-    """Damping and dry friction of bearings; that of gears is their motors'."""
+    """Set damping and dry friction of bearings; dry friction of gears belongs to the motors."""
     damping = float(random.uniform(0.02, 0.3)) if level == "viscous" else 0.0
     dry = float(random.uniform(0.02, 0.3)) if level in ("bearing", "both") else 0.0
     slides = any(not joint.turns for joint in robot.joints)
@@ -249,7 +259,7 @@ def set_losses(robot: Plant, random: Generator, level: str) -> None:
 
 
 def set_motors(robot: Plant, motors: Mapping[str, Mapping[str, Any]]) -> None:
-    """Give joints motors, by their names."""
+    """Set the motors of joints, with the joint names as keys."""
     if not robot.serial:
         robot.section["motors"] = {name: dict(motor) for name, motor in motors.items()}
         return

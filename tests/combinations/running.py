@@ -177,8 +177,9 @@ def faults(scene: Scene, done: Mapping[str, Run], *, thorough: bool = False) -> 
 
     Parameters
     ----------
-    thorough : whether to repeat the resolved scenario, go on from a state, save and load the record, draw figures and
-        page, and export
+    thorough : bool
+        Whether to repeat the resolved scenario, continue from a state, save and load the record, draw figures and page,
+        and export.
     """
     wrong: list[tuple[str, str]] = []
     for name, own in done.items():
@@ -226,7 +227,7 @@ def expected(scene: Scene, text: str) -> bool:
 def _differs(a: Run, b: Run) -> str:
     """Return the difference of two runs that should be bit-identical; empty if they are.
 
-    How far a run comes until its wall limit depends on the machine: then the samples that both have are compared.
+    The progress of a run until its wall limit depends on the machine: then the samples that both have are compared.
     """
     late = "out_of_time" in (a.status, b.status)
     if a.status != b.status and not late:
@@ -272,7 +273,7 @@ def _kept(own: Run) -> list[tuple[str, str]]:
 
 
 def _goes_on(own: Run) -> str:
-    """Start another simulation from the state of one in the middle of its run: it begins where that one is."""
+    """Start another simulation from the state of one in the middle of its run: it must begin in that state."""
     assert own.resolved is not None
     duration = own.resolved.duration_s
     try:
@@ -280,9 +281,9 @@ def _goes_on(own: Run) -> str:
         simulation = Simulation(own.resolved, state=state)
         simulation.advance(0.41 * duration)
     except DynsimError:
-        # The run itself may stop, and not every controller goes on from a state.
+        # The run itself may stop, and not every controller continues from a state.
         return ""
-    # Time stepping takes joints back to stops, and points to surfaces, that they have passed.
+    # Time stepping moves joints back to stops, and points to surfaces, that they have passed.
     off = float(np.abs(simulation.record()["q"][0] - state.q).max(initial=0.0))
     return f"a run from its state at {state.time:.6g} s begins {off:.3g} off" if off > 1e-6 else ""
 

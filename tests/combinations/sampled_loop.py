@@ -1,4 +1,4 @@
-"""Growth of a sampled loop, by a separate discretisation of the checks: the matrix exponential over one period."""
+"""Growth of a sampled loop, by a separate discretisation for the checks: the matrix exponential over one period."""
 
 from __future__ import annotations
 
@@ -18,10 +18,11 @@ UNSTABLE = "the sampled loop is unstable"
 
 
 def loop_growth(seen: Observed, q: Array | None = None, *, most: bool = False) -> float | None:
-    """Logarithm per second of the growth of the slower of two loops, or the faster; None if no command is sampled.
+    """Return the growth rate [1/s] of the slower of two loops (or of the faster one); None if no command is sampled.
 
-    One with all contacts let go, one with those held that touch: between them lies what contacts do. No weight and no
-    velocity products: what grows without them is the loop. At the start, or at coordinates q (nq,).
+    In one loop all contacts are released, in the other one all touching contacts are held: the effect of contacts is in
+    between. Weight and velocity products are excluded, so that only the loop can cause growth. Evaluated at the start,
+    or at coordinates q (nq,).
     """
     period = seen.sample_time
     if period is None or not seen.robot.motors or seen.config.get("sensors"):
@@ -36,14 +37,14 @@ def loop_growth(seen: Observed, q: Array | None = None, *, most: bool = False) -
             rows.append(J if seen.real and touch.contact.friction > 0.0 else touch.normal[0][None] @ J)
     _, sizes, vectors = np.linalg.svd(np.vstack(rows) @ basis)
     rank = int((sizes > 1e-9).sum())
-    # Contacts that let nothing move hold every loop (8831).
+    # Contacts that prevent all motion stabilise every loop (8831).
     loops = (basis, basis @ vectors[rank:].T)
     radii = [_spectral_radius(seen, q, free) if free.shape[1] else 0.0 for free in loops]
     return float(np.log(max((max if most else min)(radii), 1e-300))) / period
 
 
 def _spectral_radius(seen: Observed, q: Array, basis: Array) -> float:
-    """Largest eigenvalue over one period of the motions in a basis, (n, k), at coordinates q (nq,)."""
+    """Return the largest eigenvalue over one period of the motions in a basis, (n, k), at coordinates q (nq,)."""
     from scipy.linalg import expm
 
     period, controller = seen.sample_time, seen.config.get("controller") or {}
@@ -79,9 +80,9 @@ def _spectral_radius(seen: Observed, q: Array, basis: Array) -> float:
 
 
 def _gains(controller: Mapping[str, Any], motor: Motor | Servo, number: int) -> tuple[float, float]:
-    """Gains of a motor; ``number``: its index among the DC motors, for gains that are listed by motor."""
+    """Return the gains of a motor; ``number``: its index among the DC motors, for gains listed by motor."""
     if isinstance(motor, Servo):
-        # The velocity loop makes up for the back-EMF of the rate that it read: u = k_v (v_d − v) + K_m v.
+        # The velocity loop compensates the back-EMF of the measured rate: u = k_v (v_d − v) + K_m v.
         return (0.0, motor.k_v - motor.joint_constant) if motor.velocity_mode else (motor.k_p, motor.k_d)
     gains = []
     for key, default in (("k_p_V_per_rad", 500.0), ("k_d_V_s_per_rad", 20.0)):

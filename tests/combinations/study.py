@@ -1,9 +1,9 @@
-"""Many scenes: each run by all its methods and looked at; what became of them, by factor and level.
+"""Many scenes, each run by all its methods and checked; results by factor and level.
 
     PYTHONPATH=.:tests python -m combinations --seed 7 --count 1000 --jobs 2 --journal study.jsonl --keep failing
 
-draws fresh scenes; ``--cover pairs`` (or ``triples``) runs those that hold every pair (triple) instead. ``--repeat N``
-prints the scene of a number and runs it again. A journal keeps what is done, and goes on with it.
+draws new scenes; ``--cover pairs`` (or ``triples``) instead runs scenes that contain every pair (triple). ``--repeat
+N`` prints the scene of a number and runs it again. A journal stores completed scenes, and the study resumes from it.
 """
 
 from __future__ import annotations
@@ -30,23 +30,30 @@ from dynsim.errors import SimulationInterrupted
 from dynsim.studies.processes import WorkerInterrupted, WorkerLost, run_in_processes
 from dynsim.system.files import write_json
 
-# Share of the scenes of which everything is looked at that a record can become.
+# Every THOROUGH-th scene is checked completely, including all results of its record.
 THOROUGH = 10
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a scene.
+    """Result of a scene.
 
     Attributes
     ----------
-    number, seed : that it was drawn with
-    levels : of all factors
-    status : by run, see :attr:`combinations.running.Run.status`
-    problems : kind and text of each
-    said : texts of stops and refusals, by run
-    solves, given_up : contact problems of its runs by time stepping, and those that were given up
-    wall_s : of all its runs [s]
+    number, seed : int
+        Number and seed with which it was drawn.
+    levels : dict
+        Levels of all factors.
+    status : dict
+        Status of each run, see :attr:`combinations.running.Run.status`.
+    problems : list
+        Kind and text of each problem.
+    said : dict
+        Texts of stops and refusals of each run.
+    solves, given_up : int
+        Contact problems of its runs with time stepping, and the number of problems given up.
+    wall_s : float
+        Wall time of all its runs [s].
     """
 
     number: int
@@ -65,7 +72,7 @@ class Outcome:
 
 
 def assignment(cover: str, seed: int, number: int) -> dict[str, str]:
-    """The levels of a scene by its number: of a cover, or drawn."""
+    """Return the levels of a scene by its number, from a cover or drawn."""
     if cover == "none":
         return draw(seed, number)
     return {"pairs": pairs, "triples": triples}[cover](seed)[number]
@@ -81,9 +88,9 @@ def look_at(
     takes: Callable[[Scene, str, str], bool] = lambda drawn, method, manner: True,
     change: Callable[[dict[str, Any]], None] = lambda settings: None,
 ) -> Outcome:
-    """Run a scene by all its methods, or by those that ``takes`` lets through, and look at everything.
+    """Run a scene by all its methods, or by the methods that ``takes`` accepts, and check everything.
 
-    ``change`` : sections of the scene that are changed
+    ``change`` has sections of the scene to change.
 
     Raises
     ------
@@ -109,7 +116,7 @@ def look_at(
 
 
 def _checked(drawn: Scene, done: Mapping[str, Run]) -> list[tuple[str, str]]:
-    """What :mod:`combinations.checks` says of the records."""
+    """Return the problems that :mod:`combinations.checks` finds in the records."""
     from combinations import checks
 
     said: list[tuple[str, str]] = []
@@ -122,7 +129,7 @@ def _checked(drawn: Scene, done: Mapping[str, Run]) -> list[tuple[str, str]]:
 
 
 class _Work:
-    """:func:`look_at` for processes, each with a folder of its own."""
+    """:func:`look_at` as a task for processes, each with a separate folder."""
 
     def __init__(self, cover: str, seed: int, keep: Path | None) -> None:
         self._cover, self._seed, self._keep = cover, seed, keep
@@ -135,7 +142,7 @@ class _Work:
                 outcome = look_at(levels, self._seed, number, folder)
             except SimulationInterrupted:
                 raise
-            except Exception as error:  # of the harness itself: the others go on
+            except Exception as error:  # fault of the harness itself: continue with the other scenes
                 problem = ("harness", f"{type(error).__name__}: {error}")
                 outcome = Outcome(number, self._seed, levels, {}, [problem])
             if outcome.failed and self._keep is not None:
@@ -144,14 +151,14 @@ class _Work:
 
 
 def keep(outcome: Outcome, folder: Path, target: Path) -> None:
-    """Copy a scene's files, and write what is wrong with it."""
+    """Copy the files of a scene, and write its problems."""
     shutil.copytree(folder, target, dirs_exist_ok=True)
     lines = [f"{kind}: {text}" for kind, text in outcome.problems]
     (target / "problems.txt").write_text("\n".join(lines) + "\n", "utf-8")
 
 
 def table(outcomes: Sequence[Outcome]) -> str:
-    """Levels with their scenes, how their runs ended, and how many scenes have problems."""
+    """Return levels with their scenes, how their runs ended, and how many scenes have problems."""
     lines = [
         f"{'factor':<12}{'level':<15}{'scenes':>7}{'runs':>6}{'finished':>10}{'stopped':>9}{'refused':>9}{'failing':>9}"
     ]
@@ -176,7 +183,7 @@ def _row(own: Sequence[Outcome]) -> str:
 
 
 def account(outcomes: Sequence[Outcome]) -> dict[str, Any]:
-    """Numbers of a study: scenes, runs, stops by kind, problems by kind with the first scene of each."""
+    """Return the numbers of a study: scenes, runs, stops by kind, problems by kind with the first scene of each."""
     ended = Counter(status for outcome in outcomes for status in outcome.status.values())
     kinds = Counter(kind for outcome in outcomes for kind in {kind for kind, _ in outcome.problems})
     return {
@@ -206,7 +213,7 @@ def account(outcomes: Sequence[Outcome]) -> dict[str, Any]:
 def study(
     cover: str, seed: int, numbers: Sequence[int], jobs: int, kept: Path | None, take: Callable[[Outcome], None]
 ) -> list[Outcome]:
-    """Scenes by their numbers, in processes; ``take`` gets each outcome as it comes."""
+    """Run scenes by their numbers, in processes; ``take`` gets each outcome as it arrives."""
     outcomes: list[Outcome] = []
 
     def take_late(number: int, result: Callable[[], Outcome | None]) -> None:
@@ -226,7 +233,7 @@ def study(
 
 
 def _noted(journal: Path | None, seed: int) -> list[Outcome]:
-    """What a journal has of a seed; a process that was killed may have left a line unfinished."""
+    """Return the entries of a journal for a seed; a killed process may have left an unfinished line."""
     outcomes: list[Outcome] = []
     if journal is not None and journal.exists():
         for line in journal.read_text("utf-8").splitlines():
@@ -253,7 +260,7 @@ def _options() -> argparse.Namespace:
 
 
 def main() -> int:
-    """Run scenes, print what became of them; 1 where any fails."""
+    """Run scenes and print their results; return 1 if any fails."""
     options = _options()
     if options.repeat is not None:
         return _repeat(options)
@@ -299,7 +306,7 @@ def _repeat(options: argparse.Namespace) -> int:
 
 
 if __name__ == "__main__":
-    # By its name: other processes find it by that.
+    # Imported under its module name, because other processes look it up there.
     from combinations import study as module
 
     raise SystemExit(module.main())

@@ -1,7 +1,7 @@
-"""Distances and normals of surfaces, straight from what a scenario says, and where a contact touches.
+"""Distances and normals of surfaces, computed directly from a scenario, and the touching points of contacts.
 
-Boxes and height fields are found by their own means: clamped points for one, SciPy's splines and a search for the
-foot of the perpendicular for the other.
+Boxes and height fields use separate methods: clamped points for boxes, SciPy's splines and a search for the foot of the
+perpendicular for height fields.
 """
 
 from __future__ import annotations
@@ -16,29 +16,29 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-# Positions along an axis at which its distance is looked at first, and how often the best part is cut.
+# Initial positions along an axis at which its distance is evaluated, and number of bisections of the best part.
 _SHARES, _CUTS = 33, 60
 
 
 @dataclass(frozen=True)
 class Shape:
-    """A surface: distances (T,) [m] and unit normals (T, 3) to the free side at places (T, 3).
+    """A surface: distances (T,) [m] and unit normals (T, 3) to the free side at positions (T, 3).
 
-    ``bends`` : whether the middle of a straight line can be nearest to it
+    ``bends``: whether the middle of a straight line can be nearest to it.
     """
 
     look: Callable[[Array], tuple[Array, Array]]
     bends: bool
 
     def distance(self, position: Array) -> Array:
-        """Signed distances (T,) [m]."""
+        """Return signed distances (T,) [m]."""
         return self.look(position)[0]
 
 
 def shape(config: Mapping[str, Any], shift: Array, heights: Any = None) -> Shape:
-    """The surface that a section of a scenario describes, moved by a vector [m].
+    """Return the surface that a section of a scenario describes, moved by a vector [m].
 
-    ``heights`` : origin (2,), spacing (2,) and heights (ny, nx) of a height field, whose file may be gone
+    ``heights`` has origin (2,), spacing (2,) and heights (ny, nx) of a height field whose file may no longer exist.
     """
     kind = config["type"]
     if kind == "plane":
@@ -66,7 +66,7 @@ def shape(config: Mapping[str, Any], shift: Array, heights: Any = None) -> Shape
 
 
 def nearest(surface: Shape, start: Array, end: Array | None) -> Array:
-    """The point of the axis from start to end, (T, 3) each, that is nearest to a surface."""
+    """Return the point of the axis from start to end, (T, 3) each, that is nearest to a surface."""
     if end is None or not surface.bends:
         return start
     along = end - start
@@ -74,7 +74,7 @@ def nearest(surface: Shape, start: Array, end: Array | None) -> Array:
     far = np.stack([surface.distance(start + u * along) for u in shares], axis=1)
     best = far.argmin(axis=1)
     low, high = shares[np.maximum(best - 1, 0)], shares[np.minimum(best + 1, _SHARES - 1)]
-    # Of equal halves the one with the smaller slope: distances of convex bodies are convex along a line.
+    # For equal halves use the smaller slope: distances of convex bodies are convex along a line.
     for _ in range(_CUTS):
         middle = 0.5 * (low + high)
         at = start + middle[:, None] * along

@@ -1,4 +1,4 @@
-"""A good record passes all checks, and each kind of corruption is found by the check for it."""
+"""A good record passes all checks, and each kind of corruption is detected by its check."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def _simulated(settings: dict[str, Any]) -> Run:
 
 
 def _spoilt(run: Run, **signals: Callable[[np.ndarray], np.ndarray]) -> Run:
-    """The run with some signals of its record changed."""
+    """Return the run with some signals of its record changed."""
     assert run.record is not None
     record = Record(run.record.time, provenance=run.record.provenance)
     record.signals.update(run.record.signals)
@@ -111,7 +111,7 @@ def _kinds(run: Run) -> set[str]:
 def test_good_records_pass(method: str, kind: str) -> None:
     run = _run(method, kind)
     assert problems(run.scenario, run) == []
-    # There is something to check: contacts that slide and stick, a stop, dry friction.
+    # The record contains sliding and sticking contacts, a stop and dry friction.
     assert run.record is not None
     modes = run.record["contact_mode"]
     assert {0, 1} <= set(np.unique(modes))
@@ -130,7 +130,7 @@ def _times(factor: float) -> Callable[[np.ndarray], np.ndarray]:
 
 
 def _turned_tangent(data: np.ndarray) -> np.ndarray:
-    """Friction on the floor turned by 40°, normal forces kept."""
+    """Rotate the friction on the floor by 40°, with normal forces unchanged."""
     turn = np.radians(40.0)
     x, y = data[..., 0].copy(), data[..., 1].copy()
     data[..., 0], data[..., 1] = np.cos(turn) * x - np.sin(turn) * y, np.sin(turn) * x + np.cos(turn) * y
@@ -158,7 +158,7 @@ def _falling(data: np.ndarray) -> np.ndarray:
 
 
 def _lagging(data: np.ndarray) -> np.ndarray:
-    """Held a tick longer than it was."""
+    """Hold values a tick longer than the controller did."""
     return np.concatenate([data[:2], data[:-2]])
 
 
@@ -196,19 +196,19 @@ def test_corrupted_signals_are_found(method: str, fault: str) -> None:
 
 
 def test_the_floor_of_the_residual_is_that_of_the_summary() -> None:
-    """An arm that its dry friction holds turns over less than its ledger resolves."""
+    """An arm held by its dry friction has a turnover below the resolution of its ledger."""
     settings = {**deepcopy(ARM), "duration_s": 0.02, "integrator": {"method": "radau5"}}
     del settings["objects"], settings["loads"]
     settings["plant"]["chain"][1]["friction_N_m"] = settings["plant"]["chain"][2]["friction_N_m"] = 10.0
     run = _simulated(settings)
     assert problems(settings, run) == []
-    # 1 kg, of which each landing may leave 1e-13 m times the weight, ten of them up to the limit of 1e-6.
+    # For 1 kg each landing may leave 1e-13 m times the weight, ten of them up to the limit of 1e-6.
     assert residual_floor(Observed(run)) == pytest.approx(1.0 * 9.81 * 1e-6, rel=1e-3)
     assert "ledger" in _kinds(_spoilt(run, energy_electrical=_shifted(1e-9, 5)))
 
 
 def _below(data: np.ndarray) -> np.ndarray:
-    """Positions with the elbow bent a little further in one sample."""
+    """Bend the elbow a little further in one sample."""
     data[60, 1] += 0.01
     return data
 
@@ -229,7 +229,7 @@ def test_points_below_surfaces_and_joints_beyond_stops_are_found(method: str) ->
 
 
 def test_wrong_currents_of_circuits_are_found() -> None:
-    """Samples four times as dense resolve L/R = 1.5 ms."""
+    """Sample four times as densely, which resolves L/R = 1.5 ms."""
     settings = {**deepcopy(ARM), "duration_s": 0.1, "record": {"rate_hz": 4000.0}, "integrator": {"method": "radau5"}}
     run = _simulated(settings)
     assert problems(settings, run) == []
@@ -266,7 +266,7 @@ def test_a_check_that_disagrees_with_the_run_is_found() -> None:
 
 @cache
 def _unique(method: str, friction: float) -> Run:
-    """The arm without objects and dry friction, so that forces are unique."""
+    """Return the arm without objects and dry friction, so that forces are unique."""
     settings = deepcopy(ARM)
     del settings["objects"], settings["loads"]["lean"], settings["plant"]["chain"][1]["friction_N_m"]
     settings["contacts"]["friction"] = friction
@@ -280,7 +280,7 @@ def test_runs_of_a_scene_agree_and_strangers_do_not(stranger: str) -> None:
     assert {problem.kind for problem in compare(ARM, runs)} == ({"methods"} if stranger else set())
 
 
-# Kinds of stops that a benign scene has no reason for.
+# Kinds of stops that cannot occur in a benign scene.
 @pytest.mark.parametrize("kind", ["chatter", "no_progress", "not_projected", "forces_reversed", "no_contact_forces"])
 def test_a_stop_without_reason_is_found(kind: str) -> None:
     run = _run("radau5")
@@ -292,7 +292,7 @@ def test_a_stop_without_reason_is_found(kind: str) -> None:
 
 @pytest.mark.parametrize(("share", "crawls"), [(0.1, True), (10.0, False)])
 def test_a_run_that_crawls_to_its_wall_limit_is_found(share: float, crawls: bool) -> None:
-    """Half-way, with a last step of that share of the mean one."""
+    """The run is half-way, with a last step of that fraction of the mean step."""
     run = _run("radau5")
     assert run.record is not None
     state = {name: run.record[name][-1].tolist() for name in ("q", "v", "current")}
@@ -348,7 +348,7 @@ def test_critical_friction_finds_a_true_paradox() -> None:
     for speed in (1.0, -1.0):
         v[0] = speed
         paradox[speed] = critical(seen, {"q": seen.robot.initial.tolist(), "v": v.tolist()})
-    # In one direction of the slip alone.
+    # A paradox occurs in one direction of the slip only.
     assert sorted(paradox.values()) == [False, True]
 
 
@@ -412,14 +412,14 @@ def test_bodies_agree_with_pinocchio(seed: int) -> None:
 
 @pytest.mark.parametrize("kind", ["ball", "floating", "planar", "rolling"])
 def test_joints_with_several_rows_move_as_their_rates_say(kind: str) -> None:
-    """Velocities and accelerations against differences of positions and velocities."""
+    """Compare velocities and accelerations with differences of positions and velocities."""
     random = np.random.default_rng(3)
     robot = random_robot_of(random, [kind, "revolute"])
     bodies = Bodies(robot)
     q = random_positions(random, robot)
     v, vdot = random.normal(size=(2, bodies.n))
     h = 1e-4
-    # Two steps of constant acceleration either way, positions by the midpoint rule.
+    # Two steps of constant acceleration in each direction, positions by the midpoint rule.
     states = [(q, v)]
     for sign in (-1.0, 1.0):
         middle = q + 0.5 * sign * h * position_rates(bodies, q[None], v[None])[0]
@@ -433,14 +433,14 @@ def test_joints_with_several_rows_move_as_their_rates_say(kind: str) -> None:
     body, point = bodies.n - 1, random.normal(size=3)
     places = [motion.point(body, point) for motion in (before, now, after)]
     velocities = [motion.velocity(body, motion.point(body, point)) for motion in (before, now, after)]
-    # The error of a central difference.
+    # Error of a central difference.
     np.testing.assert_allclose((places[2] - places[0]) / (2 * h), velocities[1], rtol=0, atol=1e-5)
     gain = now.rushing[body] + np.cross(now.turning[body], places[1]) + np.cross(now.spin[body], velocities[1])
     np.testing.assert_allclose((velocities[2] - velocities[0]) / (2 * h), gain, rtol=0, atol=1e-5)
 
 
 def test_own_nearest_points_are_nearest() -> None:
-    """Of axes to a box and a sphere, against a fine search; distances from a box against those of its faces."""
+    """Compare axes near a box and a sphere with a fine search; distances from a box with those from its faces."""
     random = np.random.default_rng(0)
     box = shape({"type": "box", "center_m": [0, 0, 0], "edges_m": [1, 2, 3], "edge_radius_m": 0.1}, np.zeros(3))
     assert box.distance(np.array([[0.7, 0.0, 0.0], [0.0, -1.5, 0.0]])) == pytest.approx([0.2, 0.5])
@@ -454,13 +454,13 @@ def test_own_nearest_points_are_nearest() -> None:
 
 
 def test_the_last_step_ends_with_the_run() -> None:
-    """A shorter last step has a middle of its own, along whose normal its forces are."""
+    """A shorter last step has a separate midpoint, and its forces act along the normal there."""
     settings: dict[str, Any] = deepcopy(ARM)
     settings |= {"duration_s": 0.1008, "record": {"rate_hz": 2000.0}}
     settings["surfaces"] = {"floor": {"type": "sphere", "center_m": [0.4, 0.0, -0.33], "radius_m": 0.25}}
     settings["contacts"]["friction"] = 0.0
     settings["initial"] = {"on_surface": ["tip"]}
-    # Steps end where constant loads do, which is the end of the run too.
+    # Steps end where constant loads do, which is also the end of the run.
     del settings["plant"]["link"]["motor"], settings["controller"], settings["loads"]
     settings["integrator"] = {"method": "time_stepping", "step_s": 0.001}
     seen = Observed(_simulated(settings))
@@ -470,13 +470,13 @@ def test_the_last_step_ends_with_the_run() -> None:
     np.testing.assert_allclose(end[-3:], [0.1, 0.1008, 0.1008], rtol=0, atol=1e-12)
     (touch,) = (touch for touch in seen.touches() if touch.contact.name == "tip")
     normal = seen._at_midpoints(touch.contact, seen.v_start)[2]
-    # Within the step the normal turns by far more than what is allowed.
+    # Within the step the normal turns by far more than the tolerance.
     assert touch.normal_force[-1] > 1.0
     assert touch.turned[-1] > 1e-3
     np.testing.assert_allclose(touch.force, touch.normal_force[:, None] * normal, rtol=0, atol=1e-9)
 
 
-# A body that slides along x and z on a plane that leans sideways by 1 in 2: friction wedges it from 2 on.
+# A body that slides along x and z on a plane inclined sideways by 1 in 2: friction wedges it from μ = 2 on.
 WEDGE = {
     "name": "wedge",
     "duration_s": 0.05,

@@ -1,4 +1,4 @@
-"""The exact decision whether forces by Coulomb's law exist, against closed forms and enumeration."""
+"""The exact decision whether Coulomb forces exist, against closed forms and enumeration."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from combinations.coulomb import Point, Rest, forces_exist, parts
 
 
 def _one_contact(coupling: float, friction: float) -> tuple[np.ndarray, Point]:
-    """A point that slides along its first tangent, with A = 1 − μ coupling."""
+    """Return a point that slides along its first tangent, with A = 1 − μ coupling."""
     W = np.eye(3)
     W[0, 1] = W[1, 0] = coupling
     return W, Point(0, friction, np.array([1.0, 0.0]))
@@ -20,13 +20,13 @@ def _one_contact(coupling: float, friction: float) -> tuple[np.ndarray, Point]:
 
 @pytest.mark.parametrize(("friction", "b", "some"), [(1.0, -1.0, True), (3.0, -1.0, False), (3.0, 1.0, True)])
 def test_painleve_of_one_contact(friction: float, b: float, some: bool) -> None:
-    """Without a force a = b, with one A f + b = 0: for A < 0 none if b < 0, two if b > 0."""
+    """Without a force a = b, with a force A f + b = 0: for A < 0 no solution if b < 0, two if b > 0."""
     W, point = _one_contact(0.5, friction)
     assert forces_exist(W, np.array([b, 0.3, -0.2]), [point], []) is some
 
 
 def test_any_right_side_has_forces_at_rest() -> None:
-    """The paradox of a point that slides disappears at rest: it sticks, or slips the other way."""
+    """The paradox of a sliding point disappears at rest: it sticks, or slips the other way."""
     W, _ = _one_contact(0.5, 3.0)
     for angle in np.linspace(0.0, 2.0 * np.pi, 9):
         assert forces_exist(W, np.array([-1.0, 5.0 * np.cos(angle), 5.0 * np.sin(angle)]), [Point(0, 3.0)], [])
@@ -39,7 +39,7 @@ def test_a_point_at_rest_that_can_only_slip() -> None:
 
 
 def test_sliding_contacts_as_by_enumeration() -> None:
-    """Sets of contacts that carry, one by one: f = −A⁻¹ b there, not negative, and A f + b elsewhere."""
+    """Enumerate sets of contacts with forces: f = −A⁻¹ b there, not negative, and A f + b elsewhere."""
     random = np.random.default_rng(3)
     exist = []
     for _ in range(60):
@@ -62,7 +62,7 @@ def test_sliding_contacts_as_by_enumeration() -> None:
 
 
 def test_joints_at_rest_and_stops() -> None:
-    """A joint of unit inertia holds with at most its bound or moves; between two stops that close in nothing exists."""
+    """A joint of unit inertia holds up to its bound or moves; between two closing stops there is no solution."""
     unit = np.ones((1, 1))
     assert forces_exist(unit, np.array([0.5]), [], [Rest(0, 1.0)])
     assert forces_exist(unit, np.array([-3.0]), [], [Rest(0, 1.0)])

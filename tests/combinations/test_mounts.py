@@ -1,7 +1,7 @@
-"""Objects of parts, on hinges beside them and on rails, with springs, and ties to the world, in combined scenes.
+"""Objects of parts, hinged objects and objects on rails, with springs, and ties to the world, in combined scenes.
 
-They are no levels of the table of factors: its draws are those of the faults that were found. Each kind is put into
-scenes with other features, all methods that take it run, and every check looks at the records.
+They are not levels in the table of factors, because this would change the draws of known faults. Each kind is added to
+scenes with other features, all methods that support it run, and every check is applied to the records.
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ def _thing(settings: Settings, **changes: Any) -> None:
 
 
 def beside(settings: Settings) -> None:
-    """A door on a hinge at its edge, tilted, with friction that the drawn hinge has too."""
+    """Add a door on a hinge at its edge, tilted, with friction if the drawn hinge has friction."""
     hinge = settings["objects"]["thing"]["hinge"] | {"point_m": [0.05, -0.1, 0.02], "limits_deg": [-40.0, 40.0]}
     _thing(settings, hinge=hinge, rpy_deg=[10.0, 20.0, 30.0])
 
 
 def rails(settings: Settings) -> None:
-    """A drawer on rails that go down, with damping and a stop."""
+    """Add a drawer on rails that slope down, with damping and a stop."""
     slide = {"axis": [1.0, 0.5, -0.3], "damping_N_s_per_m": 0.5, "limits_m": [-0.05, 0.02]}
     _thing(settings, hinge=None, slide=slide, rpy_deg=[0.0, 10.0, 40.0])
 
 
 def parts(settings: Settings) -> None:
-    """A free T-joint on the shelf, or a little above it."""
+    """Add a free T-joint on the shelf, or a little above it."""
     run = {"mass_kg": 0.12, "shape": "cylinder", "radius_m": 0.03, "length_m": 0.14, "rpy_deg": [90, 0, 0]}
     branch = {"mass_kg": 0.08, "shape": "cylinder", "radius_m": 0.03, "length_m": 0.09, "position_m": [0.045, 0, 0]}
     branch["rpy_deg"] = [0, 90, 0]
@@ -53,24 +53,24 @@ def parts(settings: Settings) -> None:
 
 
 def closer(settings: Settings) -> None:
-    """A door with a spring whose rest is elsewhere."""
+    """Add a door with a spring that rests at another angle."""
     beside(settings)
     settings["objects"]["thing"]["hinge"] |= {"spring_N_m_per_rad": 0.8, "rest_deg": 15.0}
 
 
 def sprung_rails(settings: Settings) -> None:
-    """A drawer with a spring."""
+    """Add a drawer with a spring."""
     rails(settings)
     settings["objects"]["thing"]["slide"] |= {"spring_N_per_m": 60.0, "rest_m": 0.01}
 
 
 def to_the_world(settings: Settings) -> None:
-    """The tie of the scene holds the arm to the world, where it is."""
+    """Tie the arm to the world at its present position."""
     settings["ties"]["spring"]["other"] = "world"
 
 
 def not_holding(settings: Settings) -> None:
-    """A tie without force."""
+    """Add a tie without force."""
     settings["ties"]["spring"]["holds"] = False
 
 
@@ -85,9 +85,9 @@ MOUNTS: dict[str, tuple[Callable[[Settings], None], dict[str, str]]] = {
     "turned_to_the_world": (to_the_world, {"ties": "torsion"}),
     "not_holding": (not_holding, {"ties": "linear"}),
 }
-# Momentum a fifth beyond its bound in violent motions (time stepping), and an equilibrium that is refused.
+# Known: momentum a fifth beyond its bound in violent motions (time stepping), and an equilibrium that is refused.
 OPEN = {("to_the_world", 0), ("to_the_world", 2), ("parts", 5)}
-# Those of the default tests.
+# Kinds that are in the default tests.
 QUICK = {"closer", "to_the_world"}
 
 
@@ -109,7 +109,7 @@ def test_combined_scenes_with_it(name: str, number: int, tmp_path: Path, request
     if (name, number) in OPEN:
         request.applymarker(pytest.mark.xfail(reason="open, see the comment"))
     change, wanted = MOUNTS[name]
-    # The first draws that have these levels.
+    # The first draws with these levels.
     fitting = (k for k in range(100_000) if all(draw(SEED, k)[factor] == level for factor, level in wanted.items()))
     chosen = [next(fitting) for _ in range(number + 1)][-1]
     outcome = look_at(draw(SEED, chosen), SEED, chosen, tmp_path, change=change)

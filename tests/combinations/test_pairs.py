@@ -1,4 +1,4 @@
-"""Every feature with every other: scenes that hold each pair of levels run, and everything holds of their records."""
+"""Every feature with every other: scenes that contain each pair of levels run, and their records pass all checks."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ PAIRS = 188
 FEW = 30
 # Scenes among these that the default tests run: the remaining scenes take seconds.
 QUICK = {1, 2, 3, 4, 5, 6, 7, 8, 11}
-# Scenes of fresh seeds that were wrong once: (seed, number).
+# Scenes of other seeds that were wrong once: (seed, number).
 FOUND = {
     "an equilibrium of a floating robot that moved without a warning": (271127, 188),
     "a joint at rest whose row nearly depended on those of an elbow: 25 kN held a motion": (271127, 108),
@@ -142,7 +142,7 @@ def test_scenes_are_the_same_for_ever(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("refusal", [r for r in REFUSALS if r.error], ids=lambda r: r.name)
 def test_what_is_refused_is_said(refusal: Refusal, tmp_path: Path) -> None:
-    """The scene of an assignment that meets only this refusal; the message of dynsim matches the table."""
+    """Run the scene of an assignment with only this refusal; the message of dynsim matches the table."""
     for k in range(TRIES):
         levels = draw(SEED, k)
         levels.update({factor: refused[k % len(refused)] for factor, refused in refusal.levels if factor != METHOD})
@@ -162,7 +162,7 @@ def _begin(levels: dict[str, str], method: str, folder: Path) -> None:
 
 
 def _possible(wanted: dict[str, str], method: str) -> bool:
-    """Whether any whole assignment has these levels: they may refuse each other by way of a third factor."""
+    """Whether any whole assignment has these levels: they may be incompatible through a third factor."""
     random = np.random.default_rng(SEED)
     law = covering._law(method)
     return any(

@@ -14,14 +14,14 @@ from combinations.verdicts import STOPS, UNVERIFIED, VERIFIERS
 from dynsim.engine.stopping import KINDS
 
 PACKAGE = Path(dynsim.__file__).parent
-# Where sentences for the list of warnings of a run of the dynamics are made, and by which function alone.
+# Modules that make sentences for the warnings of a dynamic run, and the function if it is only one.
 SOURCES = {
     "engine/warnings.py": "",
     "engine/soundness.py": "",
     "engine/equilibrium.py": "",
     "scenario/build.py": "left_out_warnings",
 }
-# Sentences there that end as part of an error, of a stop, or of another sentence.
+# Sentences there that become part of an error, of a stop, or of another sentence.
 PARTS = (
     r"^joint .* moves no inertia in this posture",
     r"^plant: ",
@@ -41,7 +41,7 @@ LEAST_WORDS = 5
 
 
 def sentences(source: str, function: str = "") -> Iterator[str]:
-    """Texts with placeholders of a module, or of one function of it, a number for each placeholder."""
+    """Yield texts with placeholders of a module, or of one function of it, with a number for each placeholder."""
     tree: ast.AST = ast.parse(source)
     if function:
         own = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef) and node.name == function]

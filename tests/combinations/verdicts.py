@@ -28,22 +28,22 @@ Match = re.Match[str]
 
 # Numbers in sentences have three digits.
 DIGITS = 0.006
-# Share of the turnover above which steps must not make energy without a warning if contacts are compliant.
+# Fraction of the turnover above which steps must not create energy without a warning if contacts are compliant.
 GAIN = 1e-3
 NUMBER = r"([-+]?[0-9.]+(?:e[-+]?[0-9]+)?|inf|-inf|nan)"
 # Slip and rates below this count as rest in the sentences of the engine [m/s, rad/s].
 AT_REST = 1e-9
-# Rows that depend on each other have a singular value below this part of the largest.
+# Dependent rows have a singular value below this fraction of the largest.
 DEPENDENT = 1e-6
-# Share of a contact's force by which the engine may see it differently inside its cone, for lack of digits.
+# Fraction of a contact's force by which the engine may see it differently inside its cone, for lack of digits.
 UNDECIDED = 1e-3
-# Part of the warning of contacts that wedge themselves.
+# Part of the warning about contacts that wedge.
 WEDGED = "friction can wedge"
-# The rounding of an angle above this is 1e-3 rad: it has no direction with the digits of a sentence [rad].
+# Above this the rounding of an angle is 1e-3 rad: with the digits of a sentence it has no direction [rad].
 LOST = 1e13
-# Samples in which a contact is looked at for wedging, and directions of its cone.
+# Number of samples in which a contact is checked for wedging, and number of directions of its cone.
 LOOKED, ROUND = 41, 7201
-# A loop is unstable if the logarithm of its states grows by more than GROWTH in a second; it explains the end of a run
+# A loop is unstable if the logarithm of its states grows by more than GROWTH per second; it explains the end of a run
 # if they have grown by e to the power GROWN.
 GROWTH, GROWN = 1.0, 3.0
 
@@ -52,7 +52,7 @@ def untrue(scenario: Mapping[str, Any], run: Run, seen: Observed) -> Iterator[st
     """Yield a sentence for each wrong warning or stop, and for a warning that is missing."""
     lost = len(seen) > 0 and np.abs(seen.q).max() > LOST
     for warning in run.warnings:
-        # The stop itself, in the words of its error.
+        # The stop itself, with the text of its error.
         if warning.startswith("incomplete: "):
             if run.error is None or str(run.error) not in warning:
                 yield f"{warning!r}, but it ended with {run.error!r}"
@@ -80,23 +80,23 @@ def untrue(scenario: Mapping[str, Any], run: Run, seen: Observed) -> Iterator[st
 
 
 def untrue_start(stop: SimulationStopped, seen: Observed) -> Iterator[str]:
-    """Yield a sentence if a run that stops before its first sample had forces to start with."""
+    """Yield a sentence if a run that stopped before its first sample could have started."""
     if reason := _not_critical(stop, seen) and _has_forces(stop, seen):
         yield f"stops ({stop.kind}) before anything moves: {reason}; {str(stop)[:200]}"
 
 
 def _stop(stop: SimulationStopped, seen: Observed) -> Iterator[str]:
-    """Whether a stop was necessary."""
+    """Yield a sentence if a stop was not necessary."""
     text = f"stops ({stop.kind}) at t = {stop.time:.6g} s"
     if stop.kind not in STOPS:
         yield f"{text}: no check knows this kind of stop"
         return
-    # An unstable loop with time to grow, in any posture, explains a stop of any kind.
+    # An unstable loop with time to grow, in any posture, explains any kind of stop.
     for q in (None, *seen.q) if UNSTABLE in str(stop) else (None,):
         rate = loop_growth(seen, q)
         if rate is not None and rate > GROWTH and rate * stop.time > GROWN:
             return
-    # Of loops with encoders there is no own model, but their growth.
+    # There is no separate model of loops with encoders, so only their growth is checked.
     energy = seen.record["energy_kinetic"]
     grows = energy[-1] > 100.0 * energy[: max(1, len(seen) // 2)].max()
     if UNSTABLE in str(stop) and seen.config.get("sensors") and grows:
@@ -123,9 +123,9 @@ def _unproved(stop: SimulationStopped, seen: Observed) -> str:
 
 
 def _crawls(stop: SimulationStopped, seen: Observed) -> str:
-    """Whether the rest would take more steps, as long as the last one, than were taken; otherwise it is only slow.
+    """Whether the rest would take more steps of the last length than were taken; otherwise it is only slow.
 
-    Steps that are short for a reason that is true may be as many as they like.
+    Steps that are short for a true reason may be arbitrarily many.
     """
     if (match := re.search(HOLDS_UP, str(stop))) is not None:
         return _not_changing(match, stop, seen)
@@ -138,7 +138,7 @@ def _crawls(stop: SimulationStopped, seen: Observed) -> str:
 
 
 def _stands(stop: SimulationStopped, seen: Observed) -> str:
-    """Whether friction that changes as fast as the message says limits the steps; otherwise the stop is unproved."""
+    """Whether friction that changes as fast as stated limits the steps; otherwise the stop is unproved."""
     match = re.search(HOLDS_UP, str(stop))
     return _unproved(stop, seen) if match is None else _not_changing(match, stop, seen)
 
@@ -147,22 +147,22 @@ HOLDS_UP = (
     rf"steps are as short as {NUMBER} s because (\S+) slips at {NUMBER} m/s and its friction changes within {NUMBER} "
     rf"s; integrator.method: radau5"
 )
-# Explicit steps that stiff friction holds up, in its time constants: the limit of stability of DOPRI5 is 3.3,
-# and steps go up to it, are rejected, and go up again.
+# Explicit steps limited by stiff friction, in its time constants: the stability limit of DOPRI5 is 3.3, and steps grow
+# up to it, are rejected, and grow again.
 HELD_UP = (1.0, 5.0)
 # Slip below 1000 atol, or this [m/s], turns friction as fast as at this speed (docs/physics.md).
 SLOWEST = 1e-7
-# Forces of real contacts come from the last sample, but the state from the stop: they may have changed by this.
+# Forces of real contacts come from the last sample, but the state from the stop: they may have changed by this factor.
 SINCE = 1.3
 
 
 def _not_changing(match: Match, stop: SimulationStopped, seen: Observed) -> str:
-    """Why friction does not change as fast with slip as is said, by an explicit method whose steps that holds up.
+    """Return why friction changes more slowly with slip than stated, for an explicit method whose steps it limits.
 
-    Friction damps slip: dv/dt = −A v, A_ij = W_ij D_j, with the mobility W of slip: that of the bodies less what the
-    rows R of all that is closed leave none of, whose forces have the directions F, with friction. Slip across the
-    direction of a real contact that slips turns its friction μ f, with D = μ f / v. Friction of a glued contact is
-    −μ f s / w, w² = |s|² + v_s², with D = μ f / w (1 − s sᵀ / w²).
+    Friction damps slip: dv/dt = −A v, A_ij = W_ij D_j, with the mobility W of slip: the mobility of the bodies minus
+    the part removed by the rows R of all closed contacts, whose forces have the directions F, with friction. Slip
+    across the direction of a slipping real contact turns its friction μ f, with D = μ f / v. Friction of a glued
+    contact is −μ f s / w, w² = |s|² + v_s², with D = μ f / w (1 − s sᵀ / w²).
     """
     if seen.record.summary["method"] != "dopri5":
         return "its method is not explicit"
@@ -222,7 +222,7 @@ def _not_changing(match: Match, stop: SimulationStopped, seen: Observed) -> str:
     if not 1.0 / since < fastest * float(match[4]) < since:
         return f"friction changes within {1.0 / max(fastest, 1e-300):.3g} s"
     own = float(A.diagonal()[blocks[match[2]]].sum())
-    # The largest of the traces of the blocks is at least the mean of the eigenvalues.
+    # The largest trace of the blocks is at least the mean of the eigenvalues.
     if own * len(blocks) * since < fastest:
         return f"that is not by {match[2]}, whose friction alone changes within {1.0 / max(own, 1e-300):.3g} s"
     low, high = HELD_UP
@@ -232,7 +232,7 @@ def _not_changing(match: Match, stop: SimulationStopped, seen: Observed) -> str:
 
 
 def _glued(stop: SimulationStopped, seen: Observed) -> dict[str, tuple[Array, float]]:
-    """Friction of each glued contact at a stop, (3,), and its normal force."""
+    """Return the friction of each glued contact at a stop, (3,), and its normal force."""
     state, f = glued_forces(seen, stop.state, stop.time)
     motion = seen.bodies.motion(state.q[None], state.v[None], np.zeros((1, len(state.v))))
     forces = dict(zip(state.names, zip(f.tolist(), state.friction, strict=True), strict=True))
@@ -248,11 +248,11 @@ def _glued(stop: SimulationStopped, seen: Observed) -> dict[str, tuple[Array, fl
 
 
 def _does_not_run_away(stop: SimulationStopped, seen: Observed) -> str:
-    """Why steps need not be so short: nothing is critical, and friction does not drive the arm to infinite rates.
+    """Return why steps need not be so short: nothing is critical, and friction does not cause infinite rates.
 
-    Friction that reverses with a pulling glued contact may feed the motion. Fast motion has forces ∝ v², so that the
-    power P ∝ v³ and dT/dt = P make the rates infinite after 2 T/P: no step goes beyond that. With an error of at least
-    third order in its share of that time a step that is refused takes at least rtol^(1/3) of it.
+    Friction that reverses with a pulling glued contact may drive the motion. Fast motion has forces ∝ v², so that the
+    power P ∝ v³ and dT/dt = P make the rates infinite after 2 T/P: no step can pass that time. With an error of at
+    least third order in its share of that time, a rejected step takes at least rtol^(1/3) of it.
     """
     if not (reason := _not_critical(stop, seen)) or seen.real:
         return reason
@@ -275,7 +275,7 @@ STOPS: dict[str, Callable[[SimulationStopped, Observed], str]] = {
     "step_too_small": _does_not_run_away,
     "not_finite": _not_critical,
     "no_contact_forces": _has_forces,
-    # The scene gives no reason for runs that do not end.
+    # The scene contains no reason for runs that do not end.
     "not_projected": _unproved,
     "chatter": _unproved,
     "no_progress": _stands,
@@ -308,21 +308,21 @@ def _pulls(match: Match, seen: Observed) -> str:
     if touch is None or seen.real:
         return "no such glued contact"
     least = -float(touch.normal_force.min(initial=0.0))
-    # Steps between samples may have seen more.
+    # Steps between samples may have seen larger values.
     if least > float(match[4]) * (1.0 + DIGITS):
         return f"with {least:.4g} N in a sample"
-    # Commands of an unstable loop alternate from tick to tick, and samples may see each second one.
+    # Commands of an unstable loop alternate from tick to tick, and samples may show only every second one.
     if any(UNSTABLE in warning for warning in seen.run.warnings):
         return ""
     pulling = touch.normal_force < 0.0
     share = 100.0 * float(pulling.mean())
-    # If two samples in a row have different signs, it is unknown when the sign changes, and how often.
+    # If consecutive samples have different signs, the time and number of sign changes between them are unknown.
     off = 100.0 * (3.0 + np.count_nonzero(pulling[1:] != pulling[:-1])) / len(seen) + 1.0
     return "" if abs(share - float(match[3])) <= off else f"in {share:.3g} % of the samples"
 
 
 def _pulls_between(match: Match, seen: Observed) -> str:
-    """Whether a contact that leaves its surface does not pull; steps between samples may have seen more."""
+    """Return a reason if a contact that leaves its surface does not pull; steps between samples may have seen more."""
     touch = _touch(seen, match[1])
     if touch is None or not seen.real:
         return "no such contact that leaves its surface"
@@ -353,7 +353,7 @@ def _never_pressed(match: Match, seen: Observed) -> str:
 
 
 def _reversed(match: Match, seen: Observed) -> str:
-    """W_nn − μ W_nt < 0 for the contact alone, at the sample after the time that is named; without one, at the stop."""
+    """Check W_nn − μ W_nt < 0 for the contact alone, at the sample after the stated time; without one, at the stop."""
     touch, since = _touch(seen, match[1]), _at_latest(match[2])
     if touch is None:
         return "no such contact"
@@ -366,19 +366,19 @@ def _reversed(match: Match, seen: Observed) -> str:
     own = touch.normal[i] @ J @ np.linalg.solve(M, J.T @ touch.force[i]) / (touch.normal_force[i] or 1.0)
     size = touch.normal[i] @ J @ np.linalg.solve(M, J.T @ touch.normal[i])
     if touch.mode[i] != SLIDING:
-        # It slid between the samples: in the worst direction.
+        # It slid between the samples: assume the worst direction.
         answer = np.linalg.solve(M, J.T @ touch.normal[i]) @ J.T
         own = min(own, size - touch.contact.friction_at_rest * float(np.linalg.norm(answer - size * touch.normal[i])))
     return "" if own < 0.05 * size else f"the diagonal entry is {own:.3g} of {size:.3g} at t = {seen.time[i]:.4g} s"
 
 
 def _at_latest(said: str) -> float:
-    """The largest time that is written so, with four digits."""
+    """Return the largest time that is written like this with four digits."""
     value = float(said)
     return value + (0.5 * 10.0 ** (np.floor(np.log10(value)) - 3.0) if value > 0.0 else 0.0)
 
 
-# A runaway (8584: 5e9 rad/s at its stop) had another posture when it was warned of, which no sample shows [rad or m].
+# A runaway (8584: 5e9 rad/s at its stop) had another posture at its warning, which no sample shows [rad or m].
 ANOTHER_POSTURE = 0.1
 
 
@@ -461,7 +461,7 @@ def _drifted(match: Match, seen: Observed) -> str:
 
 
 def _at_step_ends(seen: Observed) -> NDArray[np.bool_]:
-    """Samples at ends of steps: within a step states and energies are linear, and the scheme has what does not fit."""
+    """Return samples at ends of steps: within a step states and energies are linear, with the rest in the scheme."""
     return np.abs(seen.steps_around[1] - seen.time) < AT_STEP * seen.step
 
 
@@ -471,7 +471,7 @@ def _scheme(match: Match, seen: Observed) -> str:
 
 
 def _gains(match: Match, seen: Observed) -> str:
-    """Something gives way, and the number is a share of the turnover and no less than a fall of the samples' loss."""
+    """Check that something is compliant, and the number is a share of the turnover, at least a fall of the loss."""
     from combinations.energy import residual_floor, turnover_and_residual
 
     if not seen.robot.ties and all(touch.contact.stiffness == 0.0 for touch in seen.touches()):
@@ -485,14 +485,14 @@ def _gains(match: Match, seen: Observed) -> str:
 
 
 def _sinks(match: Match, seen: Observed) -> str:
-    # A compliant surface gives way by f/k, whatever the steps.
+    # A compliant surface deforms by f/k, whatever the steps.
     rigid = [touch for touch in seen.touches() if touch.contact.stiffness == 0.0]
     deepest = max((-1e3 * float(touch.gap.min(initial=0.0)) for touch in rigid), default=0.0)
     return "" if deepest <= float(match[1]) * (1.0 + DIGITS) + 1e-3 else f"{deepest:.3g} mm in a sample"
 
 
 def _shared(match: Match, seen: Observed) -> str:
-    """Rows of closed contacts and resting joints depend on each other in some sample."""
+    """Check that rows of closed contacts and resting joints are dependent in some sample."""
     names = [name for name in re.split(r", | and ", match[1]) if name and not name.endswith(" more")]
     joints = [name for name in re.split(r", | and ", match[2] or "") if name and not name.endswith(" more")]
     known = {touch.contact.name for touch in seen.touches()}
@@ -507,7 +507,7 @@ def _shared(match: Match, seen: Observed) -> str:
 
 
 def _shared_by_joints(match: Match, seen: Observed) -> str:
-    """Rows of resting joints and of couplings depend on each other in some sample."""
+    """Check that rows of resting joints and of couplings are dependent in some sample."""
     joints = [name for name in re.split(r", | and ", match[1]) if name and not name.endswith(" more")]
     if any(name not in seen.joints for name in joints):
         return "it names unknown joints"
@@ -549,7 +549,7 @@ def _row_space(rows: Array) -> Array:
 
 
 def _below(match: Match, seen: Observed) -> str:
-    """The axis of the deepest body lies below the surface as deep as is said, and deeper than its radius."""
+    """Check that the axis of the deepest body is below the surface by the stated depth, and by more than its radius."""
     surface = seen.shapes.get(match[1])
     link = next((k for k, link in enumerate(seen.robot.links) if link.name == match[2]), None)
     if surface is None or link is None:
@@ -562,20 +562,20 @@ def _below(match: Match, seen: Observed) -> str:
     deepest, spacing = -float(surface.distance(start).min()), 0.0
     for end in ends:
         tip = seen.motion.point(link, end)
-        # The engine looks at points of the axis: within half their spacing distances change by as much at the most.
+        # The engine checks points of the axis: within half their spacing distances change by at most that much.
         spacing = max(spacing, float(np.linalg.norm(end)) / POINTS)
         for share in np.linspace(0.0, 1.0, 65):
             deepest = max(deepest, -float(surface.distance(start + share * (tip - start)).min()))
-        # A tangent point of a small ball lies between these: the least distance, not that of one of them.
+        # A tangent point of a small ball is between these points: use the least distance.
         deepest = max(deepest, -float(surface.distance(nearest(surface, start, tip)).min()))
     if abs(1e3 * deepest - float(match[3])) > 0.02 * abs(1e3 * deepest) + 0.02 + 0.5e3 * spacing:
         return f"it lies {1e3 * deepest:.4g} mm deep"
-    # Between the points that are looked at here it may be a little deeper.
+    # Between the points checked here it may be slightly deeper.
     return "" if deepest > own.radius - 2e-5 else f"that is within its radius of {own.radius:g} m"
 
 
 def _reference_beyond(match: Match, seen: Observed) -> str:
-    """The waypoints of the joint go beyond its stop; splines between them may, so that only the joint is looked at."""
+    """Check that waypoints exceed the stop; splines between them may, so that only the joint is checked."""
     i = _joint(seen, match[1])
     if i is None:
         return "no such joint"
@@ -624,7 +624,7 @@ def _would_slip(match: Match, seen: Observed) -> str:
 
 
 def _left_out(match: Match, seen: Observed) -> str:
-    """The joints give the point no velocity along the normal, in any sample."""
+    """Check that the joints give the point no velocity along the normal in any sample."""
     touch = _touch(seen, match[1])
     if touch is None:
         return "no such contact"
@@ -640,7 +640,7 @@ def _jumps(match: Match, seen: Observed) -> str:
 
 def _unstable(match: Match, seen: Observed) -> str:
     if seen.config.get("sensors"):
-        # Of encoders with their delay there is no own model; with true positions it is the slower loop.
+        # There is no separate model of encoders with delay; with true positions it is the slower loop.
         return ""
     from_then_on = re.search(rf"from t = {NUMBER} s on", match.string)
     q = None if from_then_on is None else seen.q[np.abs(seen.time - float(from_then_on[1])).argmin()]
@@ -649,7 +649,7 @@ def _unstable(match: Match, seen: Observed) -> str:
 
 
 def _unpressed(match: Match, seen: Observed) -> str:
-    """Each contact sticks somewhere, and would leave there if it had no force."""
+    """Check that each contact sticks at some time, and would leave then if it had no force."""
     for name, share in re.findall(rf"(\S+) \({NUMBER} % of the run\)", match[1]):
         touch = _touch(seen, name)
         if touch is None:
@@ -662,7 +662,7 @@ def _unpressed(match: Match, seen: Observed) -> str:
 
 
 def _leaves_in_impact(match: Match, seen: Observed) -> str:
-    """Each contact lifts off at the reported time."""
+    """Check that each contact lifts off at the reported time."""
     for name, time in re.findall(rf"(\S+) \({NUMBER} s\)", match[1]):
         lifts = [event.time for event in seen.record.events if event.kind == "lift_off" and event.name == name]
         if not any(abs(own - float(time)) <= 1e-5 * own for own in lifts):
@@ -671,7 +671,7 @@ def _leaves_in_impact(match: Match, seen: Observed) -> str:
 
 
 def _wedged(match: Match, seen: Observed) -> str:
-    """Each contact is closed at its time, can wedge itself from the coefficient on, and nothing else decides there."""
+    """Check that each contact is closed at its time, can wedge from the coefficient on, and nothing else decides."""
     said = rf"(\S+) against \S+ from a coefficient of {NUMBER} on \(it has {NUMBER}, t = {NUMBER} s\)"
     entries = re.findall(said, match[1])
     for name, least, friction, time in entries:
@@ -689,7 +689,7 @@ def _wedged(match: Match, seen: Observed) -> str:
 
 
 def _often_wedged(touch: Touch, seen: Observed) -> bool:
-    """Whether a contact can wedge itself in a tenth of the samples in which it is closed, one after another."""
+    """Whether a contact can wedge in a tenth of the samples in which it is closed, one after another."""
     mu, contact = touch.contact.friction_at_rest, touch.contact
     closed = np.flatnonzero(touch.mode != OPEN)
     if contact.stiffness > 0.0 or contact.grip_axis is not None or mu == 0.0 or not len(closed):
@@ -705,11 +705,11 @@ def _often_wedged(touch: Touch, seen: Observed) -> bool:
 
 
 def _wedges(touch: Touch, seen: Observed, i: int, margin: float) -> tuple[float, bool]:
-    """The least coefficient with which a contact wedges itself in a sample, and whether its load leaves that open.
+    """Return the least coefficient with which a contact wedges in a sample, and whether its load leaves that open.
 
-    Forces that no joint feels are looked for among all directions of the cone's axis and of a circle around it. The
-    load decides if forces without them, along the normal and along possible slip, are in the cone, but for a ``margin``
-    that is a share of the force.
+    Forces that no joint feels are searched in all directions of the cone's axis and of a circle around it. The load
+    decides if forces without them, along the normal and along possible slip, are in the cone, up to a ``margin``, a
+    fraction of the force.
     """
     n, closed = touch.normal[i], touch.mode[i] != OPEN
     rows = seen.bodies.jacobian(seen.motion, touch.body, touch.position)[i] @ seen.bodies.free_directions()
@@ -739,7 +739,7 @@ def _slips_at_once(match: Match, seen: Observed) -> str:
 
 
 def _moves_at_once(match: Match, seen: Observed) -> str:
-    """It has that acceleration, and a contact that would carry at rest does not."""
+    """Check that it has that acceleration, and a contact that would carry at rest does not."""
     j = seen.joints.index(match[1])
     if abs(seen.vdot[0, j] - float(match[2])) > DIGITS * abs(seen.vdot[0, j]):
         return f"{match[1]} starts with {seen.vdot[0, j]:.4g}"
@@ -751,7 +751,7 @@ def _moves_at_once(match: Match, seen: Observed) -> str:
 
 
 def _moved_at_the_start(match: Match, seen: Observed) -> str:
-    """The first sample differs from the scenario's posture by the reported amounts."""
+    """Check that the first sample differs from the scenario's posture by the reported amounts."""
     for name, angle in re.findall(rf"(\S+) by {NUMBER}", match[1]):
         joint = _joint(seen, name)
         if joint is None:
@@ -765,7 +765,7 @@ def _moved_at_the_start(match: Match, seen: Observed) -> str:
 
 
 def _not_carried_out(match: Match, seen: Observed) -> str:
-    """By the script with the limit on the hand's acceleration alone, and by where its target has got to."""
+    """Check the script with only the limit on the hand's acceleration, and the final position of its target."""
     operator = (seen.config.get("controller") or {}).get("operator")
     if operator is None:
         return "there is no operator"
@@ -778,11 +778,11 @@ def _not_carried_out(match: Match, seen: Observed) -> str:
         velocity = velocity + change * min(1.0, most / max(float(np.linalg.norm(change)), 1e-300))
         moved, path = moved + velocity / rate, path + float(np.linalg.norm(velocity)) / rate
     missed, asked = float(match[1]), float(match[2])
-    # Three digits are said, and a tick at the end may count.
+    # Three digits are printed, and a tick at the end may count.
     near = DIGITS * path + max(float(np.linalg.norm(command["hand"])) for command in commands) / rate
     if abs(asked - path) > near:
         return f"it was commanded to go {path:.3g} m"
-    # By the triangle inequality the ways add up to no less than the distance, nor to more than both ways together.
+    # By the triangle inequality the paths add up to at least the distance, and at most both paths together.
     least = 0.0
     if "target_position" in seen.record:
         target = seen.record["target_position"]
@@ -827,7 +827,7 @@ VERIFIERS: dict[str, Callable[[Match, Observed], str]] = {
     rf"^initial.equilibrium: the start slips at t = {NUMBER} s": _slips_at_once,
     rf"^operator: {NUMBER} m of the {NUMBER} m that the hand was commanded to go were not": _not_carried_out,
 }
-"""Pattern of each warning and its check: the groups and what the run shows → why it is not so, empty if it is."""
+"""Pattern of each warning and its check: groups and run → the reason why it is wrong, or an empty string."""
 
 UNVERIFIED: dict[str, str] = {
     r"contact problems were given up above": "the solver's count; forces and cones are checked",
@@ -840,4 +840,4 @@ UNVERIFIED: dict[str, str] = {
     r"^the support margin|^mode \d+ was|passes its limit by|"
     r"^the head is up to": "for the kinematic snake, which these scenes do not have",
 }
-"""Warnings that nothing outside the engine can tell, each with the reason."""
+"""Warnings that only the engine can verify, each with the reason."""

@@ -55,7 +55,7 @@ class Oracle:
         return self._seen(head, q)
 
     def from_pair_1(self, psi_3: float, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the same with pair 1 flat on the floor at the origin; ``psi_3`` is recorded, without lift."""
+        """Return the same with pair 1 flat on the floor at the origin; ``psi_3``: recorded angle, without lift."""
         pin.forwardKinematics(self.model, self.data, q)
         lifting = pin.SE3(pin.rpy.rpyToMatrix(0.0, q[JOINTS.index("psi3")] - psi_3, 0.0), np.zeros(3))
         floor = self.data.oMi[self.axle[0]] * lifting.inverse()
