@@ -25,6 +25,8 @@ PHRASES = {
     "reference": "its reference",
     "energy row": "electrical energy [J]",
     "impact row": "impact loss",
+    "impacts": "impacts",
+    "gear friction": "friction of the gear",
     "no posture": "could be brought onto the hand's path",
     "no forces": "carry the motion",
     "incomplete": "incomplete",

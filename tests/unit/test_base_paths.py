@@ -395,7 +395,9 @@ def test_the_hand_stays_on_its_path_in_the_world_while_the_base_drives(path: dic
 def test_a_hand_out_of_reach_of_a_base_that_drives_is_refused() -> None:
     overrides = {"controller.base.path": {"type": "straight", "distance_m": -1.0, "duration_s": 10}}
     scenario = load_scenario("mobile_elbow_comparison_driving", overrides=overrides)
-    with pytest.raises(UnreachableReference, match=r"the hand cannot follow .* at t = \d\.\d+ s it stays .* m from"):
+    with raises(
+        UnreachableReference, "controller.hand.path", "joint_1, joint_9, joint_10", re.compile(r"\bt = \d\.\d+ s\b")
+    ):
         build.controller(scenario, build.build_model(scenario))
 
 
@@ -422,8 +424,7 @@ def test_references_that_drive_an_elbow_off_its_surface_are_refused_with_time_an
     far = np.sqrt((1.0 + scenario.config.contacts.reference_tolerance_m) ** 2 - 1.0)
     fine = np.linspace(0.0, DURATION, 100_001)
     off = fine[np.argmax(0.2 * jerk_law(fine, 0.0, DURATION) > far)]
-    with pytest.raises(ModelError, match=r"contact elbow_4: the references of the joints take its point") as refused:
+    with raises(ModelError, "elbow_4", "floor", "contacts.reference_tolerance_m") as refused:
         prepare(scenario)
-    match = re.search(r"from t = ([\d.]+) s on", str(refused.value))
-    assert match is not None
-    assert float(match[1]) == pytest.approx(off, abs=0.006)
+    off_from = re.findall(r"\bt = ([\d.]+) s\b", str(refused.value))[-1]
+    assert float(off_from) == pytest.approx(off, abs=0.006)

@@ -68,7 +68,7 @@ def test_without_mujoco(small: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(precision, "RTOLS", precision.RTOLS[:1])
     result = run.run_bench(quick=True)
     assert mentions(result["unavailable"]["mujoco"], "mujoco", "pip install")
-    rows = [line for line in text(result).splitlines() if "MuJoCo " in line and "step), median" not in line]
+    rows = [line for line in text(result).splitlines() if "MuJoCo " in line and "µs" not in line]
     # Two each: times, the job of the one case; three: the snake.
     assert len(rows) == 7
     assert all("–" in row for row in rows)

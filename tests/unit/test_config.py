@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -47,5 +48,5 @@ def test_a_servo_map_takes_neither_texts_nor_flags_for_numbers(old: str, new: st
     text = (SHIPPED / "arm.yaml").read_text(encoding="utf-8")
     assert old in text
     (tmp_path / "map.yaml").write_text(text.replace(old, new, 1), encoding="utf-8")
-    with pytest.raises(ServoMapError, match=r"map.yaml:\d+: .*valid (number|integer)"):
+    with raises(ServoMapError, re.compile(rf"map\.yaml:\d+: \S+\.{new.partition(':')[0]} = ")):
         load_servo_map(tmp_path / "map.yaml")

@@ -1,12 +1,14 @@
 """Figures and tables of snake runs: files, axes and labels, charts of modes, values beside those of the paper."""
 
 import csv
+import re
 
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from matplotlib.colors import to_rgba
 from PIL import Image
+from support.messages import mentions, raises, says
 
 import dynsim
 from dynsim.draw.figures import snake as figures
@@ -50,7 +52,7 @@ def test_figures_as_functions_of_records(record):
     for name in figures.figures(record):
         assert dynsim.figure(record, name, title=False).axes
     assert dynsim.figure({"one": record, "two": record}, "comparison").get_suptitle()
-    with pytest.raises(RecordError, match="no figure 'energy' of such a record; figures: postures, overview"):
+    with raises(RecordError, "'energy'", "postures, overview"):
         dynsim.figure(record, "energy")
 
 
@@ -66,7 +68,7 @@ def test_geometry_is_that_of_the_scene(record):
     }
     for name, values in expected.items():
         np.testing.assert_allclose(getattr(geometry, name), values, atol=1e-15)
-    with pytest.raises(RecordError, match="no scene"):
+    with raises(RecordError):
         snake_geometry(Record(record.time))
 
 
@@ -116,7 +118,7 @@ def test_modes_are_numbers_above_the_chart_or_steps_below_it(every, numbered):
     figure = figures.redundancy(record)
     chart = figure.axes[0]
     assert bool(chart.texts) == numbered
-    assert chart.get_title(loc="left").startswith("mode, and the wheel pairs" if numbered else "wheel pairs")
+    assert chart.get_title(loc="left").startswith("mode") is numbered
     steps = [axis for axis in figure.axes if axis.get_ylabel() == "mode"]
     assert len(steps) == (not numbered)
     for axis in steps:
@@ -131,7 +133,7 @@ def test_modes_that_would_fill_the_chart_are_shares_of_time(monkeypatch):
     record = switching_all_the_time(0.06)
     figure = figures.redundancy(record)
     chart, steps = figure.axes[:2]
-    assert "share of each 0.15 s" in chart.get_title(loc="left")
+    assert mentions(chart.get_title(loc="left"), "0.15 s")
     starts = snake_view.turns(len(record))
     assert len(starts) == 20
     parts = np.split(np.arange(len(record)), starts[1:])
@@ -180,8 +182,9 @@ def test_an_exact_first_sample_does_not_stretch_the_error_axis(record):
 
 def test_a_joint_that_is_never_straightened_has_no_time(simulated):
     rows = tables("snake_joint_limits", {v: simulated("snake_joint_limits", v) for v in JOINT_LIMITS})["joint_limits"]
-    (fixed,) = [row[4] for row in rows if row[1] == "the same without switching"]
-    assert fixed.endswith("theta4 never, theta8 never")
+    (fixed,) = [row[4] for row in rows if row[3] == "fixed"]
+    assert mentions(fixed, "theta4", "theta8")
+    assert not re.search(r"theta[48] [\d.]", fixed)
     assert "22.0" not in fixed
 
 
@@ -199,6 +202,12 @@ def test_table_iii_sets_measured_and_simulated_side_by_side(simulated, tmp_path)
 JOINT_LIMITS = ("fixed", "cyclic", "predictive", "eq20", "eq20_min")
 
 
+def row_of(rows, section, unit, variant):
+    """The row of one section of the paper, unit and variant."""
+    (row,) = [row for row in rows if row[0] == section and unit in row[1] and row[3] == variant]
+    return row
+
+
 @pytest.mark.usefixtures("unwritten")
 def test_what_the_paper_says_of_figures_8_to_10_and_16_beside_what_was_simulated(simulated, tmp_path):
     records = {variant: simulated("snake_joint_limits", variant) for variant in JOINT_LIMITS}
@@ -207,14 +216,13 @@ def test_what_the_paper_says_of_figures_8_to_10_and_16_beside_what_was_simulated
     assert expected <= {path.name for path in written}
     rows = list(csv.reader((tmp_path / "joint_limits.csv").read_text().splitlines()))
     assert {len(row) for row in rows} == {5}
-    by_what = {(row[1], row[3]): row for row in rows}
-    error = by_what["position error of the head, largest [mm]", "cyclic"]
-    assert error[2] == "about 30"
+    error = row_of(rows, "V.B, Fig 9", "[mm]", "cyclic")
+    assert mentions(error[2], "30")
     assert float(error[4]) < 1e-3
     # the wheels of every mode that was used are those of Table II
-    wheels = by_what["lifted pairs of every mode that was used", "cyclic"]
+    wheels = next(row for row in rows if row[0] == "IV.C.5, Table II" and "3, 6" in row[2])
     assert wheels[4].replace("mode ", "") == wheels[2].replace("mode ", "")
-    area = [float(by_what["area of the support polygon [m^2], end", v][4]) for v in ("cyclic", "eq20_min")]
+    area = [float(row_of(rows, "V.E, Fig 16", "[m^2]", v)[4]) for v in ("cyclic", "eq20_min")]
     assert area[1] > area[0]
 
 
@@ -222,22 +230,22 @@ def test_policies_side_by_side(simulated):
     records = {variant: simulated("snake_joint_limits", variant) for variant in JOINT_LIMITS}
     rows = {row[0]: row[1:] for row in tables("snake_joint_limits", records)["policies"]}
     assert rows[""] == ["fixed", "cyclic", "predictive"]
-    assert rows["mode switches"] == [str(records[p].summary["mode_switches"]) for p in rows[""]]
-    assert rows["modes"][:2] == ["1", "1" + " 2 3 4 5 6" * 4]
+    assert [str(records[p].summary["mode_switches"]) for p in rows[""]] in rows.values()
+    assert ["1", "1" + " 2 3 4 5 6" * 4] in [row[:2] for row in rows.values()]
 
 
 @pytest.mark.usefixtures("unwritten")
 def test_the_door_of_figure_14(simulated, tmp_path):
     records = {variant: simulated("snake_door_arc", variant) for variant in ("pull", "pull_switching")}
     figure = tanaka2019.door(records["pull_switching"])
-    panels = {axis.get_title().split("\n")[0]: axis for axis in figure.axes if axis.get_visible()}
+    panels = {axis.get_title()[:3]: axis for axis in figure.axes if axis.get_visible()}
     figure.draw_without_rendering()
-    assert any(text.get_visible() and text.get_text() for text in panels["(c) joint at its limit"].get_xticklabels())
+    assert any(text.get_visible() and text.get_text() for text in panels["(c)"].get_xticklabels())
     plt.close(figure)
     written = figures.draw_comparison(records, tmp_path)
     assert {"door.csv", "fig_14.png"} <= {path.name for path in written}
     rows = list(csv.reader((tmp_path / "door.csv").read_text().splitlines()))
-    opened = {row[3]: float(row[4]) for row in rows if row[1] == "opened to [deg]"}
+    opened = {row[3]: float(row[4]) for row in rows if "[deg]" in row[1]}
     assert opened["pull"] < 20 < 25 == opened["pull_switching"]
 
 
@@ -280,8 +288,9 @@ def test_servos_beside_their_limits(simulated):
     assert len(figure.axes) == 2  # joints and wheels
     for axis, (stall, friction) in zip(figure.axes, ((8.4, 0.8), (2.5, 0.0)), strict=True):
         by_name = lines(axis)
-        np.testing.assert_allclose(by_name[f"± stall torque {stall:g} N m"].get_ydata(), stall)
-        assert any("friction of the gear" in text.get_text() for text in axis.get_legend().texts) == (friction > 0.0)
+        (stalled,) = [line for name, line in by_name.items() if mentions(name, f"{stall:g} N m")]
+        np.testing.assert_allclose(stalled.get_ydata(), stall)
+        assert any(says(text.get_text(), "gear friction") for text in axis.get_legend().texts) == (friction > 0.0)
         assert axis.get_ylim()[0] < -stall < stall < axis.get_ylim()[1]
     worst = record.summary["worst_joint"]
     (line,) = [line for name, line in lines(figure.axes[0]).items() if name.startswith("ψ2: rms")]
@@ -295,7 +304,8 @@ def test_the_gripper_with_its_bounds_states_and_events(simulated):
     figure = drawn(snake_tasks.gripper, record)
     distance, force, torque = figure.axes
     np.testing.assert_array_equal(lines(distance)["distance"].get_ydata(), 1e3 * record["grasp_distance"])
-    np.testing.assert_allclose(lines(distance)["captures within 15 mm"].get_ydata(), 15.0)
+    (limit,) = [line for name, line in lines(distance).items() if mentions(name, "15 mm")]
+    np.testing.assert_allclose(limit.get_ydata(), 15.0)
     # On the object: against the tie's force on its first body, the gripper. The valve's friction is 0.3 N m.
     about_x = lines(torque)["about x"].get_ydata()
     np.testing.assert_array_equal(about_x, -record["tie_force"][:, 3])
@@ -351,7 +361,7 @@ def test_the_pipe_is_drawn_and_rises(simulated):
     record = simulated("snake_pick_up", "lifts")
     makers = figures.figures(record)
     height, ground = drawn(makers["object"], record).axes
-    (pipe,) = [line for name, line in lines(height).items() if name.startswith("pipe: rises by")]
+    (pipe,) = [line for name, line in lines(height).items() if name.startswith("pipe: ")]
     assert np.ptp(pipe.get_ydata()) == pytest.approx(160.0, abs=5.0)
     weight = 0.2 * 9.81
     rows = record.time.searchsorted([10.0, 25.0])
