@@ -14,7 +14,7 @@ from support.messages import mentions, says
 
 import dynsim
 from dynsim.draw import figures
-from dynsim.draw.figures import arm, base, posture, style
+from dynsim.draw.figures import arm, base, energy, posture, style
 from dynsim.record import Event, Record, measures
 from dynsim.record.joint_motion import export_record, joint_motion
 from dynsim.record.measures import percent
