@@ -5,7 +5,7 @@ between ``<!-- table: NAME -->`` and ``<!-- end -->``, NAME being that of a func
 files in results/, which say which version made them; results/README.md has the commands. ``--check`` changes nothing
 and ends with 1 where a page is stale (tests/unit/test_pages.py).
 
-Times are those of the last ``PYTHONPATH=tests python -m studies.bench`` and ``… -m support.start_up``; other numbers
+Times are those of the last ``PYTHONPATH=tests python -m studies.bench`` and ``… -m studies.start_up``; other numbers
 are the same on every machine, to the digits shown.
 """
 
@@ -44,7 +44,7 @@ from studies.bench.programs import (  # noqa: E402
     SAME_TASK,
 )  # fmt: skip
 from studies.bench.snake import BETA, Z  # noqa: E402
-from support.fault_table import markdown  # noqa: E402
+from studies.fault_table import markdown  # noqa: E402
 
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")))
 NUMBER = re.compile(r"[−+-]?\d[\d.,]*(?:e[−+-]?\d+)?(?=<!-- = (\w+) -->)")

@@ -9,8 +9,8 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from studies.planner_scenes import scene
 from support.messages import check_message, mentions, says
-from support.planner_scenes import scene
 from typer.testing import CliRunner
 
 from dynsim.cli.app import app

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from support.fault_table import GOAL_ADDRESSES, MAP, TORQUE_ADDRESS, Rig, Run, goals_in, swing
+from studies.fault_table import GOAL_ADDRESSES, MAP, TORQUE_ADDRESS, Rig, Run, goals_in, swing
 
 from dynsim.hardware.replay.check import velocity_limit
 from dynsim.hardware.servo_map import load_servo_map

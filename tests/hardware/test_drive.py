@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.fault_table import CASES, Case
+from studies.fault_table import CASES, Case
 from support.messages import check_message, raises
 
 from dynsim.errors import CheckRefused, DynsimError

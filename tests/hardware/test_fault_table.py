@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
-from support.fault_table import CASES, POLICIES, STATES, TORQUE_ADDRESS, broken_promises, cells, markdown, rig
+from studies.fault_table import CASES, POLICIES, STATES, TORQUE_ADDRESS, broken_promises, cells, markdown, rig
 
 from dynsim.hardware.bus.packet import Instruction, Packet
 

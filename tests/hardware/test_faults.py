@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.fault_table import CASES, POLICIES, Case, broken_promises
+from studies.fault_table import CASES, POLICIES, Case, broken_promises
 
 from dynsim.hardware.bus.control_table import RAD_PER_TICK
 from dynsim.hardware.bus.packet import Instruction

@@ -13,7 +13,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from support.lifted_wheels import (
+from studies.lifted_wheels import (
     BLEND,
     CLEARANCE,
     JOINTS,

@@ -10,7 +10,7 @@ from typing import Any
 
 import h5py
 import numpy as np
-from support import fault_table
+from studies import fault_table
 
 import dynsim
 from dynsim import scenario

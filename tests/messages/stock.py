@@ -8,7 +8,7 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-from support.fault_table import swing
+from studies.fault_table import swing
 
 import dynsim
 

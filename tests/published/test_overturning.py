@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from support import overturning as study
+from studies import overturning as study
 
 from dynsim import load_scenario, simulate
 from dynsim.scenario import variant_names

@@ -7,8 +7,8 @@ import csv
 
 import numpy as np
 import pytest
-from support.snake_observations import by_wheel, head_motion, lifted, settled, switching_run
-from support.snake_steps import end_values, fall_errors
+from studies.snake_observations import by_wheel, head_motion, lifted, settled, switching_run
+from studies.snake_steps import end_values, fall_errors
 
 from dynsim.draw.figures.snake import draw_comparison
 from dynsim.snake.published import TABLE_III, displacement, table_iii_dynamic
@@ -62,7 +62,7 @@ def test_whole_runs_close_their_ledger_and_solve_their_contacts(simulated, moved
 
 @pytest.mark.long
 def test_end_values_hardly_depend_on_the_step(ends):
-    """The run that they do most of all, see results/snake/steps.json (``tests/support/snake_steps.py``)."""
+    """The run that they do most of all, see results/snake/steps.json (``tests/studies/snake_steps.py``)."""
     values = np.array([end_values("alpha", 1.0), ends["alpha"], end_values("alpha", 5.0)])
     spread = np.ptp(values, axis=0)
     assert spread[:3].max() < 5e-4

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from support import endings
-from support.endings import FINISHED, METHODS, REFUSED, SURFACES, account, end, scene, write_terrains
+from studies import endings
+from studies.endings import FINISHED, METHODS, REFUSED, SURFACES, account, end, scene, write_terrains
 
 from dynsim.engine.stopping import KINDS
 

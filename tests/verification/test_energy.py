@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from support.validation import FREE, free_scenario
+from studies.validation import FREE, free_scenario
 
 import dynsim
 from dynsim.engine import recording as metrics

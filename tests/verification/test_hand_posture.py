@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from support.planner_scenes import scene
+from studies.planner_scenes import scene
 
 import dynsim
 from dynsim.compile.hand_posture import hand_turns, turn_error

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from support.planner_scenes import scene, scene_scenario
+from studies.planner_scenes import scene, scene_scenario
 
 import dynsim
 from dynsim.compile.bracing import Brace

@@ -25,8 +25,8 @@ faults:
 
 
 def make_motion(folder: Path) -> None:
-    """Make a short record of the small robot of ``support.fault_table``, and its map."""
-    from support.fault_table import MAP, swing
+    """Make a short record of the small robot of ``studies.fault_table``, and its map."""
+    from studies.fault_table import MAP, swing
 
     swing(0.1).save(folder / "rig.h5")
     (folder / "rig.yaml").write_text(MAP.replace("run_up: 20", "run_up: 20, approach_velocity: 1.0"), encoding="utf-8")

@@ -1,6 +1,6 @@
 """Motions for servos: the check of a record, replays on virtual servos, comparisons, and records that are recovered."""
 
-from support.fault_table import CASES, MAP, Case
+from studies.fault_table import CASES, MAP, Case
 
 from messages.case import Calls, Commands
 from messages.stock import SWING

@@ -1,6 +1,6 @@
 """Servo maps, fault scripts and gates."""
 
-from support.fault_table import MAP
+from studies.fault_table import MAP
 
 from messages.case import ALL, Commands, Edits
 from messages.stock import SWING

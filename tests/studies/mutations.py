@@ -1,6 +1,6 @@
 """Mutation study: small errors put into kernel lines one at a time, and the fraction that tests detect.
 
-``NUMBA_DISABLE_JIT=1 PYTHONPATH=tests python -m support.mutations OUT.json`` draws lines of the kernels at random,
+``NUMBA_DISABLE_JIT=1 PYTHONPATH=tests python -m studies.mutations OUT.json`` draws lines of the kernels at random,
 writes which tests reach each of them, then the result for each error. Kernels run as Python: an error is a code object
 exchanged in a forked process, and nothing is compiled. Numbers: docs/dev/tests.md.
 """

@@ -1,6 +1,6 @@
 """Study: energies, errors, forces and residuals of scenarios quoted in README.md and docs/, simulated again.
 
-``PYTHONPATH=tests python -m support.validation`` writes results/reference/validation.json in about four minutes;
+``PYTHONPATH=tests python -m studies.validation`` writes results/reference/validation.json in about four minutes;
 ``python .ci/pages.py`` writes them into the pages.
 """
 
@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from support.rotors import rotor_energies
+from support.wang_minami import ELBOWS, elbow_forces, elbow_numbers
 
 from dynsim._version import __version__
 from dynsim.engine import simulate
@@ -21,8 +23,6 @@ from dynsim.record import Record
 from dynsim.scenario import Scenario, load_scenario, scenario_from_resolved, shipped_scenarios, variant_names
 from dynsim.studies.compare import compare
 from dynsim.system.files import write_json
-from support.rotors import rotor_energies
-from support.wang_minami import ELBOWS, elbow_forces, elbow_numbers
 
 FILE = Path("results/reference/validation.json")
 # Keys of a summary that depend on the machine.

@@ -1,6 +1,6 @@
 """Study: final state after every fault under every policy in every state of a replay, on virtual servos.
 
-    PYTHONPATH=tests python -m support.fault_table --runs 100 --out results/reference/bridge_faults.json
+    PYTHONPATH=tests python -m studies.fault_table --runs 100 --out results/reference/bridge_faults.json
 
 prints the table of docs/hardware.md. A cell is a fault, the state of the replay in which it strikes, and a policy; its
 runs differ in their seed: servo, time, and random parts of the fault. Each run is checked against the bytes on the line

@@ -1,6 +1,6 @@
 """Study: sensitivity of the elbow comparison to assumptions that the paper leaves open, one at a time.
 
-``PYTHONPATH=tests python -m support.assumptions`` writes results/reference/assumptions.json, which docs/validation.md
+``PYTHONPATH=tests python -m studies.assumptions`` writes results/reference/assumptions.json, which docs/validation.md
 quotes.
 """
 
@@ -8,9 +8,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from support.wang_minami import changed_assumptions
+
 from dynsim._version import __version__
 from dynsim.system.files import write_json
-from support.wang_minami import changed_assumptions
 
 if __name__ == "__main__":
     rows = changed_assumptions()

@@ -1,6 +1,6 @@
 """Study: the published arm with its elbows held on the floor, on a real floor, and with all links as candidates.
 
-``PYTHONPATH=tests python -m support.contact`` writes results/contact/, which README.md and docs/validation.md quote, in
+``PYTHONPATH=tests python -m studies.contact`` writes results/contact/, which README.md and docs/validation.md quote, in
 about ten seconds once the kernels are compiled.
 """
 

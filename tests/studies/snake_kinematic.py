@@ -1,6 +1,6 @@
 """Study: results of the kinematic snake scenarios, and their sensitivity to settings.
 
-``PYTHONPATH=tests python -m support.snake_kinematic`` writes results/snake/kinematic.json, which docs/snake.md quotes,
+``PYTHONPATH=tests python -m studies.snake_kinematic`` writes results/snake/kinematic.json, which docs/snake.md quotes,
 in half a minute with compiled kernels.
 """
 

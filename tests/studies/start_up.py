@@ -1,6 +1,6 @@
 """Study: duration of the very first run, which compiles the kernels, and of a later one.
 
-``PYTHONPATH=tests python -m support.start_up`` writes results/reference/start_up.json in two minutes, on an otherwise
+``PYTHONPATH=tests python -m studies.start_up`` writes results/reference/start_up.json in two minutes, on an otherwise
 idle machine, the machine of results/reference/bench.json.
 """
 
@@ -15,10 +15,9 @@ import time
 from pathlib import Path
 from typing import Any
 
+from dynsim.system.files import write_json
 from studies.bench.programs import SCENARIO
 from studies.bench.run import machine, versions
-
-from dynsim.system.files import write_json
 
 FILE = Path("results/reference/start_up.json")
 METHODS = ("radau5", "dopri5")

@@ -1,9 +1,9 @@
 """Random scenes for the planner of braces, and studies of its plans and of the published arm's postures.
 
-    PYTHONPATH=tests python -m support.planner_scenes --out results/planner
-    PYTHONPATH=tests python -m support.planner_scenes --study reference --effort 100 --out results/planner
-    PYTHONPATH=tests python -m support.planner_scenes --study gains --out results/planner
-    PYTHONPATH=tests python -m support.planner_scenes --study posture --out results/planner
+    PYTHONPATH=tests python -m studies.planner_scenes --out results/planner
+    PYTHONPATH=tests python -m studies.planner_scenes --study reference --effort 100 --out results/planner
+    PYTHONPATH=tests python -m studies.planner_scenes --study gains --out results/planner
+    PYTHONPATH=tests python -m studies.planner_scenes --study posture --out results/planner
 
 The first command plans each scene. The second searches each scene with ``--effort`` times the usual rounds, for the
 best known answer; rows of other scenes in its file are kept. The third runs the best plans, and those of the published

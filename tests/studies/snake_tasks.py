@@ -1,6 +1,6 @@
 """Study: the snake's tasks on both levels, each with the variants that fail.
 
-``PYTHONPATH=tests python -m support.snake_tasks`` writes results/snake/tasks.json, whose table is in docs/snake.md, in
+``PYTHONPATH=tests python -m studies.snake_tasks`` writes results/snake/tasks.json, whose table is in docs/snake.md, in
 two minutes.
 """
 

@@ -1,6 +1,6 @@
 """Wheel pairs of a snake on servos, posed in Pinocchio, and the study of their heights and directions.
 
-``PYTHONPATH=tests python -m support.lifted_wheels`` writes results/snake/lifted_wheels.json, which docs/hardware.md
+``PYTHONPATH=tests python -m studies.lifted_wheels`` writes results/snake/lifted_wheels.json, which docs/hardware.md
 quotes. The robot gets the recorded head pose and the angles sent to the servos, but no data of the base.
 """
 

@@ -1,6 +1,6 @@
 """Study: tracking with measured feedback, motion of the head during mode changes, and heights of lifted wheels.
 
-``PYTHONPATH=tests python -m support.snake_observations`` writes results/snake/observations.json, which docs/snake.md
+``PYTHONPATH=tests python -m studies.snake_observations`` writes results/snake/observations.json, which docs/snake.md
 quotes, in a minute. All runs use the dynamic snake.
 """
 

@@ -4,7 +4,7 @@ Arms of 3 to 12 joints with DC motors lean on planes, pipes, spheres, boxes and 
 all links may touch, with static friction equal to kinetic friction or larger, payloads, pushes, soft and stiff gains,
 and hand paths.
 
-    PYTHONPATH=tests python -m support.endings --count 10000 --jobs 2
+    PYTHONPATH=tests python -m studies.endings --count 10000 --jobs 2
 
 writes results/endings/endings.json, which docs/validation.md quotes, in about half an hour; ``--journal FILE`` stores
 completed scenes and resumes from them.
@@ -353,7 +353,7 @@ def _why(reason: str) -> str:
 
 
 def _options() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog="python -m support.endings", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m studies.endings", description=__doc__)
     parser.add_argument("--count", type=int, default=10_000, help="scenes")
     parser.add_argument("--first", type=int, default=0, help="number of the first")
     parser.add_argument("--jobs", type=int, default=2, help="processes")
@@ -398,6 +398,6 @@ def main() -> None:
 
 if __name__ == "__main__":
     # Imported by name, because other processes look it up by this name.
-    from support import endings as module
+    from studies import endings as module
 
     module.main()
