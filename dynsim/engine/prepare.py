@@ -34,7 +34,6 @@ from dynsim.dynamics import state as kst
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.derivative import System, new_workspace
 from dynsim.dynamics.drive.law import dc_block, servo_block
-from dynsim.dynamics.simd.forms import has_forms
 from dynsim.dynamics.state import OutputLayout, StateLayout, block, output_layout, state_layout
 from dynsim.dynamics.tree import support as ks
 from dynsim.engine import REFERENCES, Progress
@@ -49,6 +48,7 @@ from dynsim.integrators.contacts import events as ke
 from dynsim.integrators.events import TIP_MARGIN
 from dynsim.integrators.methods import METHODS, by_number
 from dynsim.integrators.run import RATE_TOLERANCE
+from dynsim.integrators.simd.forms import has_forms
 from dynsim.integrators.stepping.tables import stepping_arrays
 from dynsim.model.description import Array, Contact, Load, Robot
 from dynsim.model.drives import Drive, Motor

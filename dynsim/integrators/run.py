@@ -16,7 +16,6 @@ from dynsim.dynamics.contact.rows import force_vectors, row_errors
 from dynsim.dynamics.contact.unilateral import UnilateralArrays
 from dynsim.dynamics.derivative import System, derivative
 from dynsim.dynamics.ledger import kinetic_energy, magnetic_energy, potential_energy
-from dynsim.dynamics.simd.forms import stage_lanes
 from dynsim.dynamics.state import OutputLayout, StateLayout, block
 from dynsim.dynamics.tables import Workspace, row_limit, workspace
 from dynsim.dynamics.tree import support as ks
@@ -26,6 +25,7 @@ from dynsim.dynamics.tree.support import SupportArrays, ground_reaction, no_supp
 from dynsim.integrators import methods
 from dynsim.integrators.radau5 import tables as kn
 from dynsim.integrators.radau5.tables import NODE_RADAU, NewtonArrays, newton_arrays
+from dynsim.integrators.simd.forms import stage_lanes
 from dynsim.integrators.stepping import tables as kt
 from dynsim.integrators.stepping.tables import SteppingArrays
 from dynsim.jit.kernel import inline_kernel, integers, internal_kernel, kernel, reals
@@ -193,7 +193,7 @@ def new_run(
     stepping : SteppingArrays, optional
         Arrays of time stepping.
     lanes : bool, optional
-        RADAU5 evaluates right-hand sides together, see dynsim.dynamics.simd.forms.has_forms.
+        RADAU5 evaluates right-hand sides together, see dynsim.integrators.simd.forms.has_forms.
 
     Raises
     ------

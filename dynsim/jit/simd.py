@@ -2,7 +2,7 @@
 
 Arithmetic, roots and ``min``/``max`` work lane by lane in vector instructions. A comparison gives a :class:`Mask`. It
 has no truth value: a branch on it does not compile, because lanes could not take different branches. Kernels that
-branch on data have variants for lanes, made with :func:`select` and :func:`every`, see dynsim.dynamics.simd.forms.
+branch on data have variants for lanes, made with :func:`select` and :func:`every`, see dynsim.integrators.simd.forms.
 
 LLVM maps ``<N x double>`` to the registers of the processor: eight lanes are one register of AVX-512, two of AVX2 or
 four of SSE2.

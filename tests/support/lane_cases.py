@@ -7,9 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import pytest
 
-from dynsim.dynamics import derivative as system
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.rows import set_modes
@@ -17,7 +15,6 @@ from dynsim.dynamics.derivative import new_workspace
 from dynsim.jit.kernel import integers, reals
 from dynsim.model.description import Contact, Coupling, Inertia, Link, Load, Quadric, Robot
 from dynsim.model.drives import Motor, Servo, TorqueSource
-from support import lanes
 from support.random_robots import (
     CompiledSystem,
     assemble,
@@ -100,8 +97,8 @@ def held(modes: list[int]) -> Case:
 def stick(case: Case, modes: list[int]) -> None:
     """Set the modes of the contacts; sticking points stick at their present positions."""
     b = case.compiled
-    _, b.ws = run(case, [case.y], 0.0)
-    lanes.plain(set_modes)(b.system.contacts, b.system.couplings, None, b.ws, integers(modes))
+    b.derivative(case.y, 0.0)
+    set_modes(b.system.contacts, b.system.couplings, None, b.ws, integers(modes))
 
 
 def curved() -> Case:
@@ -248,15 +245,8 @@ TIMED = {
 }
 
 
-def run(case: Case, states: list[np.ndarray], t: Any, **forms: Callable[..., Any]) -> tuple[np.ndarray, ka.Workspace]:
-    """Return derivative and workspace of states as lanes, or of one state; ``forms`` replace kernels."""
-    b, count = case.compiled, len(states)
-    parts, ws, dense = b.system, lanes.copies(b.ws), lanes.copies(b.system.dense)
-    y, dy = states[0], np.zeros_like(states[0])
-    if count > 1:
-        parts, ws, dense = lanes.constants(parts), lanes.in_lanes(ws, count), lanes.in_lanes(dense, count)
-        y, dy = lanes.stacked(states), lanes.stacked([dy] * count)
-    with pytest.MonkeyPatch.context() as patches, np.errstate(all="ignore"):
-        lanes.patch(patches, system.derivative, **forms)
-        lanes.plain(system.derivative)(parts._replace(dense=dense), t, y, ws, dy)
-    return dy, ws
+def copies(tables: Any) -> Any:
+    """Return a named tuple, however nested, with copies of its tables."""
+    if isinstance(tables, tuple):
+        return type(tables)(*map(copies, tables))
+    return np.copy(tables) if isinstance(tables, np.ndarray) else tables

@@ -25,13 +25,13 @@ from dynsim.compile.tables import (
 )
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.derivative import System, derivative, new_workspace
-from dynsim.dynamics.simd.forms import has_forms
 from dynsim.dynamics.state import ELASTIC_SIZE, LOSSES, block, output_layout, state_layout
 from dynsim.engine.prepare import guards
 from dynsim.integrators.driver import advance
 from dynsim.integrators.methods import METHODS
 from dynsim.integrators.radau5.tables import CLOSE
 from dynsim.integrators.run import FINISHED, STATUS, TIME_STEPPING, Run, new_run
+from dynsim.integrators.simd.forms import has_forms
 from dynsim.integrators.stepping.tables import stepping_arrays
 from dynsim.jit.kernel import integers, reals
 from dynsim.model.description import Contact, Inertia, Link, Load, Quadric, Robot

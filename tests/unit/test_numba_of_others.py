@@ -24,7 +24,7 @@ from collections import namedtuple
 
 if "imported" in sys.argv or "compiled" in sys.argv:
     import dynsim.jit.kernel as jit
-    import dynsim.dynamics.simd.forms
+    import dynsim.integrators.simd.forms
 
 if "compiled" in sys.argv:
     from typing import NamedTuple

@@ -1,8 +1,7 @@
 """SIMD right-hand sides in machine code: rates of four states at once equal those of each state alone, to rounding.
 
-``test_lanes`` evaluates the Python source of the kernels on four states at once; this file tests the compiled code,
-with the replacements of ``dynsim.dynamics.simd.forms`` for kernels that branch. A short run agrees between Python, SSE2
-and AVX2.
+The cases reach the branches of the right-hand side, whose variants are in ``dynsim.integrators.simd.forms``; a branch
+without a variant does not compile. A short run agrees between Python, SSE2 and AVX2.
 """
 
 from __future__ import annotations
@@ -14,8 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.lane_cases import CASES, TIMED, Case, random_case, random_plane
-from support.lanes import copies
+from support.lane_cases import CASES, TIMED, Case, copies, random_case, random_plane
 from support.random_robots import (
     CompiledSystem,
     assemble,
@@ -29,7 +27,7 @@ from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact.rows import set_modes
 from dynsim.dynamics.contact.unilateral import FROZEN, REFERENCE
 from dynsim.dynamics.derivative import System, derivative
-from dynsim.dynamics.simd.forms import WIDTH, StageLanes, evaluate_four, has_forms, stage_lanes
+from dynsim.integrators.simd.forms import WIDTH, StageLanes, evaluate_four, has_forms, stage_lanes
 from dynsim.jit.kernel import integers, kernel, reals
 
 pytestmark = pytest.mark.long

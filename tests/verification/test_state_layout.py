@@ -14,11 +14,11 @@ from support.random_robots import ADAPTIVE, CompiledSystem, assemble, random_con
 
 import dynsim
 from dynsim.dynamics.derivative import new_workspace
-from dynsim.dynamics.simd.forms import aligned
 from dynsim.dynamics.state import OutputLayout, StateLayout, block
 from dynsim.engine.force_indeterminacy import acceleration_range
 from dynsim.integrators.methods import METHODS
 from dynsim.integrators.run import FINISHED, PROJECTIONS, STATUS, STEPS, Run
+from dynsim.integrators.simd.forms import aligned
 
 PACKAGE, TESTS = Path(dynsim.__file__).parent, Path(__file__).parents[1]
 

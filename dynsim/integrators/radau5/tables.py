@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dynsim.dynamics import tables as ka
-from dynsim.dynamics.simd.forms import StageLanes, aligned
+from dynsim.integrators.simd.forms import StageLanes, aligned
 from dynsim.jit.kernel import internal_kernel
 
 # Radau IIA of order 5, coefficients of Hairer and Wanner (Solving Ordinary Differential Equations II, IV.8): T⁻¹ A⁻¹ T
@@ -61,7 +61,10 @@ class NewtonArrays(NamedTuple):
 
     along: np.ndarray  # (2 n + k, n) ∂v̇/∂(θ, v, i), θ being displacements along the rates
     linear: np.ndarray  # (na, BLOCK_SIZE) linear blocks of the drives
-    inverse: np.ndarray  # (2, n, n) complex: inverses of the real and complex Newton matrix, not compiled
+    real_inverse: np.ndarray  # (n, n) inverse of the real reduced matrix; without lanes, as the next three
+    complex_inverse: np.ndarray  # (n, n) complex
+    real_room: np.ndarray  # (2, s)
+    complex_room: np.ndarray  # (2, s) complex
     pivot: np.ndarray  # (n,) int
     z: np.ndarray  # (3, m) stages of the step tried, from y on
     w: np.ndarray  # (3, s) the same, T⁻¹ z
@@ -71,7 +74,7 @@ class NewtonArrays(NamedTuple):
     weight: np.ndarray  # (s,) 1 / tolerance
     one: np.ndarray  # (s,) right side and solution of the real system
     two: np.ndarray  # (s,) complex
-    direct: np.ndarray  # (n, n, 4) inverses of both matrices, see dynsim.integrators.radau5.step
+    direct: np.ndarray  # (n, n, 4) inverses of both matrices on lanes, as the next five, see simd.radau5
     crossed: np.ndarray  # (n, n, 4)
     over: np.ndarray  # (2, 4) 1/g
     circuit: np.ndarray  # (na, 2, 4) and 1/(g − ∂(di/dt)/∂i)
@@ -91,7 +94,10 @@ def newton_arrays(n: int, na: int, circuits: int, tracked: int, m: int) -> Newto
     return NewtonArrays(
         along=np.zeros((2 * n + circuits, n)),
         linear=np.zeros((na, ka.BLOCK_SIZE)),
-        inverse=np.zeros((2, n, n), dtype=np.complex128),
+        real_inverse=np.zeros((n, n)),
+        complex_inverse=np.zeros((n, n), dtype=np.complex128),
+        real_room=np.zeros((2, tracked)),
+        complex_room=np.zeros((2, tracked), dtype=np.complex128),
         pivot=np.zeros(n, dtype=np.int64),
         z=np.zeros((3, m)),
         w=np.zeros((3, tracked)),

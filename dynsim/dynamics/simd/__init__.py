@@ -1,1 +1,0 @@
-"""The right-hand side on SIMD lanes: variants of kernels, tables, and four states at once."""
