@@ -32,6 +32,13 @@ PHRASES = {
     "sent": "was sent",
     "takes": "seconds to two minutes",
     "unconfirmed": "NOT confirmed",
+    "simulation gone": "the process of the simulation is gone",
+    # Ends and states of a drive.
+    "by pilot": "ended by the pilot",
+    "hold stick": "hold a stick",
+    "last browser": "the last browser was closed",
+    "pilot silent": "the pilot is silent",
+    "release key": "let the key go once",
     # Rows of tables.
     "energy row": "electrical energy [J]",
     "impact row": "impact loss",
