@@ -12,6 +12,7 @@ from typing import Any
 from urllib.parse import unquote, urlsplit
 
 import pytest
+from support.messages import lines_with, says
 
 import dynsim
 from dynsim.hardware.servo_map import Safety, ServoEntry, _MapFile
@@ -77,7 +78,7 @@ def test_the_reference_has_every_command_and_every_key(site: Path) -> None:
         assert f'id="{file.stem}"' in gallery
     for kept in ("still.png", "view.html"):
         assert (site / "gallery" / "single_pendulum" / kept).is_file()
-    assert "ledger residual" in gallery
+    assert says(gallery, "ledger row")
 
 
 @pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
@@ -130,7 +131,7 @@ def reference() -> Any:
 def test_titles_of_keys_are_those_of_families() -> None:
     text = reference().scenario_page()
     assert "## Plant serial_arm\n" in text
-    assert "| `duration_s` | number > 0 | required |" in text
+    assert lines_with(text, re.compile(r"^\| `duration_s` \|"), "> 0")
     assert links_without_heading(text) == set()
 
 
@@ -142,8 +143,8 @@ def links_without_heading(text: str) -> set[str]:
 
 def test_every_key_of_servo_maps_has_a_meaning_and_its_default() -> None:
     text = reference().servo_map_page()
-    assert "| `watchdog` | number ≥ 0.02 ≤ 2.54 | `0.2` | servos stop by themselves when the bus is" in text
-    assert "| `velocity` | number > 0 | required | highest joint speed [rad/s] |" in text
+    assert lines_with(text, re.compile(r"^\| `watchdog` \|"), "0.02", "2.54", "`0.2`")
+    assert lines_with(text, re.compile(r"^\| `velocity` \|"), "> 0", "[rad/s]")
     rows = [line for line in text.splitlines() if line.startswith("| `")]
     assert len(rows) > 40
     assert [row for row in rows if row.endswith("|  |")] == []

@@ -30,6 +30,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from support.messages import says
+
 from fuzz import broken
 from fuzz.case import SHIPPED, Draft, draw, put
 from fuzz.inputs.sweep import forget_commit
@@ -84,7 +86,7 @@ def run_case(case: Draft, folder: Path, limit: float) -> Outcome:
         reads_only = (
             (ended.outcome != OK and not replays) or command[0] == "check" or (command[0] == "hw" and not replays)
         )
-        if reads_only and "marked incomplete" not in ended.detail and before != after:
+        if reads_only and not says(ended.detail, "incomplete") and before != after:
             changed = sorted(name for name in {*before, *after} if before.get(name) != after.get(name))
             return Outcome(
                 FILES, f"{' '.join(command[:2])} changed {', '.join(changed)[:200]}", command[0], ended.detail
@@ -131,7 +133,7 @@ def _run_command(command: list[str], folder: Path, limit: float) -> Outcome:
         finally:
             sys.argv = argv
     if said.rang_at:
-        if command[0] == "run" and code == 130 and "interrupted at t" in said.errors:
+        if command[0] == "run" and code == 130 and says(said.errors, "interrupted"):
             return Outcome(INTERRUPTED, detail=said.errors)
         return Outcome(HANG, f"{command[0]} takes more than {limit:g} s", _place(said.rang_at), said.errors[-500:])
     return _judge(command, 0 if code is None else code, said.output, said.errors)
@@ -177,7 +179,7 @@ def _loose(lines: list[str], after: str) -> list[str]:
     loose = []
     warned = False
     for line in lines:
-        if line == after or line.startswith((" ", "what was simulated")) or not line.strip():
+        if line == after or line.startswith(" ") or says(line, "saved part") or not line.strip():
             continue
         warned = warned or "Warning: " in line or line.startswith("warning: ")
         if not warned:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.messages import mentions, raises
 
 import dynsim
 from dynsim import Record, Scenario, load_scenario, simulate
@@ -154,7 +155,7 @@ def test_hand_waits_where_it_cannot_go() -> None:
     for _ in range(1000):
         session.tick(Command((0.0, 0.0, 0.5)))
     top = session.frame().hand.copy()
-    assert "would speed up too fast" in session.frame().hindrance
+    assert mentions(session.frame().hindrance, "elbow_pitch")
     assert top[2] < 3.0
     rates = np.abs(session.record()["v"])
     assert rates.max() < 2.5
@@ -245,25 +246,33 @@ def test_stepper_follows_the_script_and_goes_back() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "change", "reason"),
+    ("name", "change", "names"),
     [
-        ("single_pendulum", {}, "nothing to drive|no controller"),
-        ("elbow_comparison", {"controller.operator": {"joints": ["joint_9"]}}, "remove hand"),
-        ("six_axis_arm", {"controller.hand": None, "controller.operator": {"joints": ["knee"]}}, "no joint"),
+        ("single_pendulum", {}, ["single_pendulum.yaml"]),
+        (
+            "elbow_comparison",
+            {"controller.operator": {"joints": ["joint_9"]}},
+            ["elbow_comparison.yaml:27: controller.hand"],
+        ),
+        (
+            "six_axis_arm",
+            {"controller.hand": None, "controller.operator": {"joints": ["knee"]}},
+            ["controller.operator.joints", "'knee'", "base_yaw"],
+        ),
         (
             "six_axis_arm",
             {"controller.hand": None, "controller.operator": {"commands": [{"at_s": 0, "base": [1, 0]}]}},
-            "no mobile base",
+            ["controller.operator", "pws_arm"],
         ),
         (
             "six_axis_arm",
             {"controller.hand": None, "controller.operator": {"commands": [{"at_s": 1}, {"at_s": 0}]}},
-            "order of their at_s",
+            ["controller.operator", "at_s"],
         ),
     ],
 )
-def test_what_cannot_be_driven_is_refused(name: str, change: dict[str, Any], reason: str) -> None:
-    with pytest.raises(DynsimError, match=reason):  # noqa: PT012 (whichever of them finds it)
+def test_what_cannot_be_driven_is_refused(name: str, change: dict[str, Any], names: list[str]) -> None:
+    with raises(DynsimError, *names):
         scenario = load_scenario(name, None, change)
         if "commands" in change.get("controller.operator", {}):
             simulate(scenario)
@@ -271,7 +280,7 @@ def test_what_cannot_be_driven_is_refused(name: str, change: dict[str, Any], rea
 
 
 def test_an_operator_needs_something_to_move() -> None:
-    with pytest.raises(ScenarioError, match=r"controller\.operator"):
+    with raises(ScenarioError, "controller.operator"):
         dynsim.Simulation(load_scenario("six_axis_arm"), operator=object())  # type: ignore[arg-type]
 
 

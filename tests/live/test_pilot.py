@@ -6,6 +6,7 @@ import itertools
 import json
 
 import pytest
+from support.messages import raises
 
 from dynsim.snake.description import SWITCHING
 from dynsim.teleop.snake import PilotAxis
@@ -35,33 +36,33 @@ def test_parse_takes_a_command() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "reason"),
+    ("text", "names"),
     [
-        ("", "no JSON"),
-        ("[" * 4000, "no JSON"),
-        ("[1]", "no JSON object"),
-        (b"\x00", "binary"),
-        ('{"n": 1, "axes": [NaN, 0], "held": true}', "NaN is no number"),
-        ('{"n": 1, "axes": [Infinity, 0], "held": true}', "Infinity is no number"),
-        ('{"n": 1, "axes": [1e999, 0], "held": true}', "axes: must be finite"),
-        ('{"n": 1, "axes": [' + "9" * 3900 + ', 0], "held": true, "closed": 1}', "closed: must be true or false"),
-        (said(axes=[True, 0.0]), "axes: must be finite"),
-        (said(axes=["1", 0.0]), "axes: must be finite"),
-        (said(axes=[0.0]), "axes: must be a list of 2"),
-        (said(axes=None), "axes: must be a list of 2"),
-        (said(held=1), "held: must be true or false"),
-        (said(n=-1), "n: must count"),
-        (said(n=1.5), "n: must count"),
-        (said(n=True), "n: must count"),
-        (said(mode=7), "mode: no such mode"),
-        (said(mode="up"), "mode: no such mode"),
-        (said(speed=3), "unknown key 'speed'"),
-        ('{"do": "format"}', "do: one of"),
-        ('{"do": []}', "do: one of"),
+        ("", "JSON"),
+        ("[" * 4000, "JSON"),
+        ("[1]", "JSON"),
+        (b"\x00", ""),
+        ('{"n": 1, "axes": [NaN, 0], "held": true}', "NaN"),
+        ('{"n": 1, "axes": [Infinity, 0], "held": true}', "Infinity"),
+        ('{"n": 1, "axes": [1e999, 0], "held": true}', "axes"),
+        ('{"n": 1, "axes": [' + "9" * 3900 + ', 0], "held": true, "closed": 1}', "closed"),
+        (said(axes=[True, 0.0]), "axes"),
+        (said(axes=["1", 0.0]), "axes"),
+        (said(axes=[0.0]), "axes 2"),
+        (said(axes=None), "axes 2"),
+        (said(held=1), "held"),
+        (said(n=-1), "n"),
+        (said(n=1.5), "n"),
+        (said(n=True), "n"),
+        (said(mode=7), "mode switching, fixing, 1, 2"),
+        (said(mode="up"), "mode switching, fixing, 1, 2"),
+        (said(speed=3), "'speed'"),
+        ('{"do": "format"}', "do take, leave, end"),
+        ('{"do": []}', "do take, leave, end"),
     ],
 )
-def test_parse_refuses(text: str | bytes, reason: str) -> None:
-    with pytest.raises(Refused, match=reason):
+def test_parse_refuses(text: str | bytes, names: str) -> None:
+    with raises(Refused, *names.split()):
         parse(text, 2, (1, 2))
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.messages import check_message, raises
 from typer.testing import CliRunner
 
 import dynsim
@@ -163,12 +164,12 @@ def test_dry_friction_of_bearing_and_gear_is_that_of_the_joint_in_mujoco() -> No
 def test_ties_are_refused_in_words() -> None:
     robot = tree()
     tie = Tie("rope", "tip", "plate", np.array([0.0, 0.0, 1.0]), 100.0)
-    with pytest.raises(dynsim.DynsimError, match="rope: ties between bodies have no counterpart in MJCF"):
+    with raises(dynsim.DynsimError, "rope", "MJCF"):
         Model(replace(robot, q0=robot.configuration({}), ties=(tie,))).to_mjcf()
 
 
 def test_wheels_that_roll_without_slip_are_refused_in_words() -> None:
-    with pytest.raises(dynsim.DynsimError, match="base: is made of left_wheel, right_wheel; MJCF has no such joint"):
+    with raises(dynsim.DynsimError, "base", "left_wheel, right_wheel", "MJCF"):
         dynsim.build_model(load_scenario("mobile_reach")).to_mjcf()
 
 
@@ -350,7 +351,7 @@ def test_a_run_that_stopped_after_its_first_sample_is_a_bag_too(tmp_path: Path) 
     record = simulation.record(scenario)
     assert len(record) == 1
     assert write_mcap(record, tmp_path / "run.mcap").stat().st_size > 1000
-    with pytest.raises(dynsim.errors.RecordError, match="only one sample"):
+    with raises(dynsim.errors.RecordError):
         export_record(record, tmp_path / "run.csv", "csv")
 
 
@@ -369,15 +370,15 @@ def test_the_description_in_the_bag_is_the_scene_in_pinocchio(bag: tuple[dynsim.
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words"),
+    ("arguments", "names"),
     [
-        (["record.h5", "--format", "mjcf"], "is a record; mjcf is of a scenario"),
-        (["elbow_comparison", "--format", "urdf", "--rate", "10"], "--rate and --trust are for records"),
-        (["record.h5", "--format", "csv", "--variant", "a"], "--variant and --set are for urdf and mjcf"),
-        (["elbow_comparison", "--format", "mcap"], "elbow_comparison"),
+        (["record.h5", "--format", "mjcf"], ("record.h5", "mjcf")),
+        (["elbow_comparison", "--format", "urdf", "--rate", "10"], ("--rate", "--trust", "urdf")),
+        (["record.h5", "--format", "csv", "--variant", "a"], ("--variant", "--set", "urdf", "mjcf", "csv")),
+        (["elbow_comparison", "--format", "mcap"], ("elbow_comparison",)),
     ],
 )
-def test_what_does_not_fit_is_refused_in_words(arguments: list[str], words: str) -> None:
+def test_what_does_not_fit_is_refused_in_words(arguments: list[str], names: tuple[str, ...]) -> None:
     done = CliRunner().invoke(app, ["export", *arguments])
     assert done.exit_code != 0
-    assert words in (done.output + str(done.exception))
+    check_message(done.output + str(done.exception), *names)

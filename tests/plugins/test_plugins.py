@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 from ruamel.yaml import YAML
 from support.documented_arm import plant
+from support.messages import check_message, lines_with
 
 from dynsim.record import Record
 
@@ -123,13 +124,13 @@ def test_list_and_schema_know_the_parts_from_outside(installed: Path) -> None:
 
 # What is replaced in the scenario of the cart, by what, and the error.
 MISTAKES = [
-    ("type: cart_pole", "type: cart_polo", ":2: plant.type: unknown type 'cart_polo'; did you mean 'cart_pole'?"),
-    ("motor: {", "pole_kgs: 1, motor: {", ":2: plant.pole_kgs: unknown key; did you mean 'pole_kg'?"),
-    ("motor: {", "pole_kg: -1, motor: {", ":2: plant.pole_kg = -1: must be greater than 0"),
-    ("motor: {", "pole_kg: true, motor: {", ":2: plant.pole_kg = True: must be a valid number"),
-    ("small_servo}", "small_servo, ratio: 1}", ":2: plant.motor.ratio: unknown key; did you mean 'gear_ratio'?"),
-    (", motor: {type: small_servo}", "", "plant.motor: is missing; add it"),
-    ("{slide: 0.1}", "{wheel: 0.1}", "'wheel' is no joint with a motor; those are: slide"),
+    ("type: cart_pole", "type: cart_polo", [":2: plant.type", "'cart_polo'", "'cart_pole'"]),
+    ("motor: {", "pole_kgs: 1, motor: {", [":2: plant.pole_kgs", "'pole_kg'"]),
+    ("motor: {", "pole_kg: -1, motor: {", [":2: plant.pole_kg = -1"]),
+    ("motor: {", "pole_kg: true, motor: {", [":2: plant.pole_kg = True"]),
+    ("small_servo}", "small_servo, ratio: 1}", [":2: plant.motor.ratio", "'gear_ratio'"]),
+    (", motor: {type: small_servo}", "", ["plant.motor"]),
+    ("{slide: 0.1}", "{wheel: 0.1}", ["'wheel'", "slide"]),
 ]
 
 
@@ -140,10 +141,10 @@ def test_errors_in_a_section_of_a_part_from_outside_name_line_and_key(installed:
     answer = dynsim(installed, "check", *(f"case{k}.yaml" for k in range(len(MISTAKES))))
     assert answer.returncode == 2
     # Where it starts is said before what is wrong with its path.
-    assert all(line.startswith(("  at the start", "    hand")) for line in answer.stdout.splitlines())
-    for k, (line, (_, _, expected)) in enumerate(zip(answer.stderr.splitlines(), MISTAKES, strict=True)):
+    assert all(line.endswith("[m]:") or line.split()[0] == "hand" for line in answer.stdout.splitlines())
+    for k, (line, (_, _, names)) in enumerate(zip(answer.stderr.splitlines(), MISTAKES, strict=True)):
         assert line.startswith(f"error: case{k}.yaml:")
-        assert expected in line
+        check_message(line, *names)
 
 
 GOOD = """from typing import Literal
@@ -156,13 +157,13 @@ def build(config, context):
 """
 # Module → its source, and what the one line about it says.
 BROKEN = {
-    "fails": ("import no_such_module", "importing 'fails' fails with ModuleNotFoundError: No module named 'no_such_"),
-    "exits": ("raise SystemExit(3)", "importing 'exits' fails with SystemExit: 3"),
-    "no_config": ("", "'no_config' has no class Config derived from dynsim.config.base.StrictConfig"),
-    "no_build": (GOOD.replace("def build", "def make"), "'no_build' has no function build(config, context)"),
-    "no_engine": (GOOD.replace("ENGINE", "engine"), "'no_engine' has no text ENGINE"),
-    "old_build": (GOOD.replace(", context", ""), "'old_build' has a build that does not take (config, context)"),
-    "misnamed": (GOOD.replace("NAME", "other"), "'misnamed' has a Config whose type is not Literal[\"misnamed\"]"),
+    "fails": ("import no_such_module", ["ModuleNotFoundError", "no_such_module"]),
+    "exits": ("raise SystemExit(3)", ["SystemExit: 3"]),
+    "no_config": ("", ["Config", "dynsim.config.base.StrictConfig"]),
+    "no_build": (GOOD.replace("def build", "def make"), ["build(config, context)"]),
+    "no_engine": (GOOD.replace("ENGINE", "engine"), ["ENGINE"]),
+    "old_build": (GOOD.replace(", context", ""), ["build", "(config, context)"]),
+    "misnamed": (GOOD.replace("NAME", "other"), ["Config", 'Literal["misnamed"]']),
 }
 
 
@@ -180,27 +181,20 @@ def test_a_part_that_does_not_work_is_named_with_its_distribution_and_harms_nobo
 
     checked = dynsim(tmp_path, "check", "single_pendulum", *(f"{name}.yaml" for name in (*BROKEN, "useless", "twice")))
     assert checked.returncode == 2
-    assert "single_pendulum: ok" in checked.stdout
+    assert "single_pendulum: " in checked.stdout
     assert "Traceback" not in checked.stderr
     said, lines = checked.stderr.splitlines(), {}
     for line in said:
         if line.startswith("error: ") and (match := re.match(r"error: (?:.*/)?(\w+)\.yaml", line)):
             lines[match[1]] = line
-    for name, (_, reason) in BROKEN.items():
-        title = f"plant.type = '{name}': plant '{name}' of broken-parts 0.1 cannot be used: "
-        assert f"{name}.yaml:3: {title}{reason}" in lines[name]
-    assert "plant 'useless': its build must return a Robot, not 'nothing'" in lines["useless"]
-    assert re.search(
-        r"plant 'twice' is in (broken-parts 0.1 and more-parts 2.0|more-parts 2.0 and broken-parts 0.1): "
-        "uninstall all but one",
-        lines["twice"],
-    )
+    for name, (_, names) in BROKEN.items():
+        check_message(lines[name], f"{name}.yaml:3: plant.type = '{name}'", "broken-parts 0.1", *names)
+    check_message(lines["useless"], "'useless'", "Robot", "'nothing'")
+    check_message(lines["twice"], "'twice'", "broken-parts 0.1", "more-parts 2.0")
     # What a scenario does not use is a warning, here and where all members are shown, and only there.
     warnings = [line for line in said if line.startswith("warning: ")]
-    assert "warning: surface 'plane' of more-parts 2.0 is not used: dynsim has its own of that name" in warnings
-    assert any(
-        "plant 'attribute' of broken-parts 0.1 cannot be used: 'no_config:__name__' is no module" in w for w in warnings
-    )
+    assert lines_with(warnings, "'plane'", "more-parts 2.0")
+    assert lines_with(warnings, "'attribute'", "broken-parts 0.1", "'no_config:__name__'")
     assert len(warnings) == len(BROKEN) + 3
     assert [line for line in said if line not in warnings and not line.startswith("error: ")] == []
     for command in ("list", "schema"):
@@ -217,9 +211,9 @@ def test_a_build_that_fails_is_named_with_its_line(tmp_path: Path) -> None:
     (tmp_path / "fails.yaml").write_text("duration_s: 1\nplant: {type: fails}\n", encoding="utf-8")
     distribution(tmp_path, "broken-parts", {"dynsim.plants": {"fails": "fails"}})
     answer = dynsim(tmp_path, "check", "fails.yaml")
-    expected = "plant 'fails': its build fails with ZeroDivisionError: division by zero (fails.py:7)"
     assert answer.returncode == 2
-    assert answer.stderr == f"error: fails.yaml: {expected}\n"
+    names = ["'fails'", "ZeroDivisionError: division by zero", "fails.py:7"]
+    check_message(answer.stderr, re.compile("^error: fails.yaml: "), *names)
 
 
 def test_a_scenario_of_the_packages_own_members_looks_for_no_others(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.messages import raises
 
 import dynsim
 from dynsim.engine import check
@@ -138,5 +139,5 @@ def test_the_same_motion_can_be_commanded_with_and_without_the_brace() -> None:
 
 
 def test_a_disabled_point_cannot_press() -> None:
-    with pytest.raises(ModelError, match="contact 'elbow' is disabled and cannot press; enable it"):
+    with raises(ModelError, "'elbow'"):
         check(on_path(False, brace={"elbow": 2.0}))

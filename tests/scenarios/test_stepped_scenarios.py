@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import numpy as np
 import pytest
+from support.messages import check_message, raises
 
 import dynsim
 from dynsim.engine.warnings import capped
@@ -91,10 +91,7 @@ def test_the_published_arm_on_a_real_floor_is_approached_at_first_order():
 
 def test_events_cannot_be_watched(falling: Path):
     simulation = dynsim.Simulation(dynsim.load_scenario(falling, overrides=stepping(1e-3, 0.5)))
-    with pytest.raises(
-        ScenarioError,
-        match=r"Simulation.watch requires integrator.method: auto.*every\(\)",
-    ):
+    with raises(ScenarioError, "Simulation.watch", "integrator.method: auto", "every()"):
         simulation.watch("joint_position", "joint_1", 0.1)
     ticks: list[float] = []
     simulation.every(0.01, lambda s: ticks.append(s.time))
@@ -103,13 +100,13 @@ def test_events_cannot_be_watched(falling: Path):
 
 
 def test_what_it_does_not_do_is_refused(falling: Path):
-    for more, message in (
-        ({"integrator.solver": "m_star"}, "integrator.solver = 'm_star': requires integrator.method: auto"),
+    for more, names in (
+        ({"integrator.solver": "m_star"}, ("integrator.solver = 'm_star'", "integrator.method: auto")),
         ({"contacts.law": "bilateral", "contacts.candidates": "points", "contacts.points.hand.body": "link_2",
           "surfaces.floor.point_m": [0, 0, 0.15]},
-         "integrator.method = 'time_stepping': requires contacts.law: unilateral (here: bilateral)"),
+         ("integrator.method = 'time_stepping'", "contacts.law: unilateral", "bilateral")),
     ):  # fmt: skip
-        with pytest.raises(ScenarioError, match=re.escape(message)):
+        with raises(ScenarioError, *names):
             dynsim.simulate(dynsim.load_scenario(falling, overrides=stepping(1e-3, 0.5) | more))
 
 
@@ -128,6 +125,4 @@ def test_contact_problems_that_were_given_up_are_told(falling: Path, monkeypatch
     solved = {"contact_solves": 10, "capped_solves": 0, "residual_max_m_s": 1e-9}
     assert capped(solved) == []
     (text,) = capped(solved | {"capped_solves": 2, "residual_max_m_s": 3e-4})
-    assert "2 of 10 contact problems" in text
-    assert "3.0e-04 m/s" in text
-    assert "integrator.step_s" in text
+    check_message(text, "2", "10", "3.0e-04 m/s", "integrator.step_s")

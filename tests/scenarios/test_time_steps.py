@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.messages import check_message, lines_with, raises
 from support.stepping_systems import snake
 
 import dynsim
@@ -77,7 +78,7 @@ def test_a_joint_is_moved_back_to_the_stop_that_it_has_passed(friction, step, tm
     assert record.summary["stop_loss_J"] == pytest.approx(taken, abs=(2.0 + friction) * passed[deepest])
     assert record.summary["energy_residual_relative"] < 1e-13
     (warning,) = record.summary["warnings"]
-    assert "time stepping has moved it back to its stop" in warning
+    check_message(warning, "joint_1", "integrator.step_s")
     weight = 0.8 * G * 0.25 * np.sin(np.radians(120.0))
     assert np.abs(record["stop_force"][-1]).max() == pytest.approx(weight, abs=friction + 1e-6)
 
@@ -97,9 +98,7 @@ def test_a_state_beyond_a_stop_is_refused_by_every_method(method, tmp_path: Path
         if degrees == 120.0:
             dynsim.Simulation(scenario, state=state)
             continue
-        with pytest.raises(
-            ModelError, match=r"joint_1: starts at 120\.5° .*, beyond its stop at 120° .* within its stops"
-        ):
+        with raises(ModelError, "joint_1", "120.5°", "120°"):
             dynsim.Simulation(scenario, state=state)
 
 
@@ -183,19 +182,19 @@ def test_wheels_roll_along_their_axis(ratio, axis):
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "names"),
     [
         (
             {"integrator.method": "dopri5", "integrator.step_s": None},
-            r"grip: requires .*method: time_stepping \(here: dopri5\)",
+            ("contacts.points.foot.grip", "integrator.method: time_stepping", "dopri5"),
         ),
-        ({"contacts.points.foot.grip.axis": [0, 0, 0]}, "no direction"),
-        ({"contacts.points.foot.grip.ratio": 1.5}, "ratio"),
+        ({"contacts.points.foot.grip.axis": [0, 0, 0]}, ("contacts.points.foot.grip.axis",)),
+        ({"contacts.points.foot.grip.ratio": 1.5}, ("contacts.points.foot.grip.ratio = 1.5",)),
     ],
 )
-def test_grips_that_cannot_be(change, says):
+def test_grips_that_cannot_be(change, names):
     grip = {"contacts.points.foot.grip": {"axis": [1, 0, 0], "ratio": 0.1}}
-    with pytest.raises(ScenarioError, match=says):
+    with raises(ScenarioError, *names):
         dynsim.load_scenario("block_on_slope", "slides", overrides={**STEPS, **grip, **change})
 
 
@@ -239,12 +238,9 @@ def test_steps_that_are_too_long_are_told():
         "penetration_max_m": 3 * PENETRATION_LIMIT_M,
     }
     scheme, blurred, depth = coarse(stepping, 1.0)
-    assert "made up to 0.05 J, 5 % of the turnover" in scheme
-    assert scheme.endswith("take 0.0002")
-    assert "known to 0.04 J only, 4 % of the turnover" in blurred
-    assert blurred.endswith("take 0.0005")
-    assert "3 mm" in depth
-    assert depth.endswith("take 0.0003")
+    check_message(scheme, "0.05 J", "5 %", "integrator.step_s", "0.0002")
+    check_message(blurred, "0.04 J", "4 %", "integrator.step_s", "0.0005")
+    check_message(depth, "3 mm", "integrator.step_s", "0.0003")
     stepping |= {
         "scheme_loss_worst_J": 0.5 * SCHEME_LIMIT,
         "half_step_energy_J": 0.5 * HALF_STEP_LIMIT,
@@ -253,9 +249,8 @@ def test_steps_that_are_too_long_are_told():
     assert coarse(stepping, 1.0) == []
     stepping |= {"scheme_loss_worst_J": -0.05, "scheme_gain_J": 0.05, "spring_rate_rad_per_s": 1e-3**0.5 / 1e-4}
     (gain,) = coarse(stepping, 1.0)
-    assert "give way get 0.05 J from the steps themselves, 5 % of the turnover (limit 0.1 %)" in gain
+    check_message(gain, "0.05 J", "5 %", "0.1 %", "integrator.step_s", "0.0001")
     # Rounding of a logarithm made 0 of what is just below a power of ten.
-    assert gain.endswith("take 0.0001")
 
 
 def test_the_energy_of_a_run_is_known_to_what_half_a_step_of_its_power_says():
@@ -269,7 +264,7 @@ def test_the_energy_of_a_run_is_known_to_what_half_a_step_of_its_power_says():
         error = abs(record.summary["electrical_energy_J"] - known)
         blurred = record.summary["time_stepping"]["half_step_energy_J"]
         assert error <= blurred <= 4.0 * error
-        assert any("known to" in text for text in record.summary["warnings"]) is warned
+        assert bool(lines_with(record.summary["warnings"], f"{blurred:.3g} J")) is warned
     record = with_steps("wall_push", "weak_hold")
     (contact,), (other,) = record.summary["contacts"], exact.summary["contacts"]
     assert record.summary["electrical_energy_J"] == pytest.approx(known, rel=5e-4)

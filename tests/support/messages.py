@@ -5,37 +5,54 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
-import pytest
+if TYPE_CHECKING:
+    import pytest
 
 Name = str | re.Pattern[str]
 
 # The only wordings that tests know: where several messages with the same names are possible, these tell which one it
 # is. A reworded message changes one line here.
 PHRASES = {
-    "outside": "outside the triangle",
-    "unloaded": "a wheel carries nothing",
-    "pulls": "surface pulls",
-    "slides": "slides",
-    "takes": "seconds to two minutes",
-    "no scene": "has no scene",
-    "no poses": "not every joint was recorded",
-    "other bodies": "other bodies than the record",
+    # Warnings and errors.
+    "all silent": "is the supply or the line lost?",
+    "busy": "too busy",
     "fails": "does not survive",
+    "incomplete": "incomplete",
+    "interrupted": "interrupted at t",
+    "late answers": "earlier requests",
+    "no browser": "No browser",
+    "no forces": "carry the motion",
+    "no posture": "could be brought onto the hand's path",
+    "output failed": " failed: ",
+    "pulls": "pulls on this brace",
     "reference": "its reference",
+    "saved part": "what was simulated",
+    "sent": "was sent",
+    "takes": "seconds to two minutes",
+    "unconfirmed": "NOT confirmed",
+    "simulation gone": "the process of the simulation is gone",
+    # Ends and states of a drive.
+    "by pilot": "ended by the pilot",
+    "hold stick": "hold a stick",
+    "last browser": "the last browser was closed",
+    "pilot silent": "the pilot is silent",
+    "release key": "let the key go once",
+    # Rows of tables.
     "energy row": "electrical energy [J]",
     "impact row": "impact loss",
-    "impacts": "impacts",
+    "ledger row": "ledger residual",
+    # Legends and titles of figures.
     "gear friction": "friction of the gear",
-    "no posture": "could be brought onto the hand's path",
-    "no forces": "carry the motion",
-    "incomplete": "incomplete",
-    "all silent": "is the supply or the line lost?",
-    "late answers": "earlier requests",
-    "output failed": " failed: ",
-    "busy": "too busy",
-    "sent": "was sent",
-    "unconfirmed": "NOT confirmed",
+    "impacts": "impacts",
+    "no poses": "not every joint was recorded",
+    "no scene": "has no scene",
+    "other bodies": "other bodies than the record",
+    "outside": "outside the triangle",
+    "pulling": "surface pulls",
+    "slides": "slides",
+    "unloaded": "a wheel carries nothing",
 }
 
 
@@ -60,7 +77,7 @@ def check_message(text: object, *names: Name, phrase: str = "") -> None:
     __tracebackhide__ = True
     message = str(text).rstrip()
     assert len(re.findall(r"[^\W\d_]{2,}", message)) > 1, f"no words: {message!r}"
-    assert not re.search(r"\n(?!  )|\n\s*(\n|$)", message), f"further lines must be indented and not blank: {message!r}"
+    assert not re.search(r"\n(?!  )|\n\s*(\n|$)", message), f"further lines are not indented, or blank: {message!r}"
     assert not re.search(r"Traceback|\bat 0x[0-9a-f]{6}", message), message
     assert not _missing(message, names), f"without {_missing(message, names)}: {message!r}"
     assert not phrase or says(message, phrase), f"is not {phrase!r}: {message!r}"
@@ -71,6 +88,8 @@ def raises(
     error: type[BaseException] | tuple[type[BaseException], ...], *names: Name, phrase: str = ""
 ) -> Iterator[pytest.ExceptionInfo[BaseException]]:
     """``pytest.raises``, and :func:`check_message` of the message."""
+    import pytest  # the processes of the fuzz campaign need the phrases alone
+
     with pytest.raises(error) as caught:
         yield caught
     check_message(caught.value, *names, phrase=phrase)
@@ -79,6 +98,8 @@ def raises(
 @contextmanager
 def warns(category: type[Warning], *names: Name, phrase: str = "") -> Iterator[pytest.WarningsRecorder]:
     """``pytest.warns``, with a warning that has every name and the phrase."""
+    import pytest
+
     with pytest.warns(category) as caught:
         yield caught
     rows = [str(warning.message) for warning in caught]

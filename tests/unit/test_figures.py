@@ -484,7 +484,7 @@ def test_real_contacts_have_bands_that_end_at_their_events(real: Record) -> None
 
 def test_real_contact_figure_names_modes_and_marks_events(real: Record) -> None:
     figure = drawn(contacts.forces(real))
-    assert not says(texts(figure), "pulls")
+    assert not says(texts(figure), "pulling")
     for contact in real.summary["contacts"]:
         assert lines_with(texts(figure), contact["name"], f"{100 * contact['closed_fraction']:.1f} %")
         assert lines_with(texts(figure), f"{100 * contact['sliding_fraction']:.1f} %", phrase="slides")
@@ -605,7 +605,7 @@ def test_contacts_that_never_touch_are_not_drawn(real: Record) -> None:
     assert {axes.get_ylabel().split("\n")[0] for axes in mixed.axes} - {""} == {
         "elbow_4", "elbow_7", "joint_4", "joint_7",
     }  # fmt: skip
-    assert not says(texts(mixed), "pulls")
+    assert not says(texts(mixed), "pulling")
 
 
 @pytest.mark.long
@@ -613,7 +613,7 @@ def test_glued_beside_real(real: Record, braced: Record, tmp_path: Path) -> None
     figure = drawn(contacts.forces_comparison({"glued": braced, "real": real}))
     assert lines_with(texts(figure), "glued")
     assert lines_with(texts(figure), "real")
-    assert says(texts(figure), "pulls")
+    assert says(texts(figure), "pulling")
     assert_pngs(figures.draw_comparison({"glued": braced, "real": real}, tmp_path), tmp_path, COMPARISONS)
 
 
