@@ -274,7 +274,7 @@ def paradox(
         forces = " and ".join(matrices.described(solution) for solution in solutions)
         count = "two" if len(solutions) == 2 else len(solutions)
         finding = (
-            f"{count} consistent solutions (Painlevé's paradox) at {names}: normal forces {forces} are both "
+            f"{count} consistent solutions (Painlevé's paradox) at {names}: normal forces {forces} are "
             "consistent with dissipative friction, so the motion is not determined"
         )
     elif near:

@@ -471,7 +471,7 @@ def _reason(scenario: Scenario, prepared: Prepared) -> str:
     if status == ki.STOPPED:
         return (
             f"{where}: the base tips over (tip margin zero) and plant.base.on_overturn is stop; brace it, move its "
-            "caster or make it heavier, or use on_overturn: warn to continue as if the base were fixed"
+            "caster or make it heavier, or use on_overturn: warn to continue as if the base were held down"
         )
     if status == ki.NO_CONTACT_FORCES:
         names = _listed(prepared, prepared.workspace.active[:, ka.MODE] != ka.OPEN)

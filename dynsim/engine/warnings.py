@@ -264,8 +264,8 @@ def _undetermined(record: Record, prepared: Prepared, stepped: bool) -> list[str
     if spread is not None:
         warnings.append(
             f"with friction, dependent contact rows also leave the motion undetermined: at t = {spread.time:.4g} s the "
-            f"acceleration of {spread.joint} may be from {spread.low:.4g} to {spread.high:.4g} {spread.unit} for "
-            "splits of the normal forces that keep their signs "
+            f"acceleration of {spread.joint} can be anywhere from {spread.low:.4g} to {spread.high:.4g} {spread.unit} "
+            "for splits of the normal forces that keep their signs "
             f"(this run: {spread.taken:.4g}); remove braces until the remaining ones are independent"
         )
     return warnings
@@ -645,7 +645,7 @@ def _base_warnings(record: Record, scenario: Scenario, prepared: Prepared, begun
         else:
             warnings.append(
                 f"the base {tips} at t = {first:.4f} s, with a tip margin below zero in {beyond}; the run continues "
-                f"as if the base were fixed{least}; use plant.base.on_overturn: stop to end it there"
+                f"as if the base were held down{least}; use plant.base.on_overturn: stop to end it there"
             )
     lifted = load.sum(axis=1) <= 0.0
     if lifted.any():

@@ -11,7 +11,7 @@ from dynsim.dynamics.derivative import System, derivative
 from dynsim.dynamics.tables import Workspace
 from dynsim.integrators import run as ki
 from dynsim.integrators.dopri5 import combine, explicit_error
-from dynsim.integrators.driver import conclude, propose, waiting
+from dynsim.integrators.driver import conclude, propose, can_step
 from dynsim.integrators.events import note_inside
 from dynsim.integrators.run import Run
 from dynsim.integrators.steps import finished, stalled
@@ -48,7 +48,7 @@ def advance_bogacki_shampine(system: System, ws: Workspace, run: Run, limit):
     taken, error = 0, 0.0
     if limit < 0:
         return
-    while waiting(system, ws, run):
+    while can_step(system, ws, run):
         if taken >= limit or finished(run) or stalled(run):
             return
         taken += 1

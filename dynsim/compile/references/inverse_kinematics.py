@@ -350,8 +350,8 @@ def _check_gaps(name: str, contact: Contact, times: Array, gaps: Array) -> None:
     k = int(np.abs(gaps).argmax())
     if abs(gaps[k]) > GAP_MAX:
         raise ModelError(
-            f"controller.brace: the references take {name} {gaps[k]:+.4g} m off surface {contact.surface_name!r} at "
-            f"t = {times[k]:.3f} s (limit {GAP_MAX:g} m); let controller.hand.braces keep it there, or take "
+            f"controller.brace: the references move {name} {gaps[k]:+.4g} m off surface {contact.surface_name!r} at "
+            f"t = {times[k]:.3f} s (limit {GAP_MAX:g} m); list it in controller.hand.braces, or use "
             "initial.on_surface",
             keys=("controller", "brace"),
         )
