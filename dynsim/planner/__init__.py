@@ -1,1 +1,1 @@
-"""The brace planner: problem, local solver, search over brace sets, verification, result and its files."""
+"""Brace planner: problem, local solver, search over brace sets, verification, result and output files."""

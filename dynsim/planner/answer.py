@@ -1,4 +1,4 @@
-"""Entry to the planner, and its result: the best sets for each number of braces with their verification."""
+"""Entry point of the brace planner, and its result: the best verified brace set for each number of braces."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from dynsim.record import Record
 from dynsim.scenario import Scenario, require_scenario
 from dynsim.scenario.schema import Payload
 
-# Two rounds agree if their heats differ by less than this share.
+# Relative difference of the heats below which two rounds agree.
 AGREE = 0.01
-# Gains of plans that are not verified, and of those without braces.
+# Gain k_p of plans that are not verified or have no braces [V/rad].
 K_P = 500.0
 GAP = (
-    "statistical: the best of independent rounds of a search by local optima, and how many of them came within 1 % of "
-    "it; no bound is proved"
+    "statistical: best result of independent search rounds with local optima, and number of rounds within 1 % of it; "
+    "not a proven bound"
 )
 
 Tell = Callable[[str, float], None]
@@ -36,16 +36,25 @@ Tell = Callable[[str, float], None]
 
 @dataclass(frozen=True)
 class Size:
-    """The answer for one number of braces.
+    """Best plan for one number of braces.
 
     Attributes
     ----------
-    planned : the set with its references; None: nothing was found, and ``reason`` says why
-    verdict : of the corners; None where nothing was verified
-    agreed, rounds : how many rounds of the search found this heat, of how many
-    tolerance : error of the surfaces [m] and share of friction that do hold, each alone; None unless asked for, and
-        where the run as planned is refused already
-    cheaper : sets of less heat that were refused, and why
+    count : int
+        Number of braces.
+    planned : Planned or None
+        Brace set with its references; None if no plan was found (see ``reason``).
+    verdict : Verdict or None
+        Result of the verification; None if the plan was not verified.
+    agreed, rounds : int
+        Number of search rounds that found this heat, and number of rounds.
+    reason : str
+        Why no plan was found, or why the plan was rejected; otherwise empty.
+    tolerance : tuple of float or None
+        Tolerated error of the surface height [m] and of friction (relative), each alone. None unless requested, or if
+        the nominal run is already rejected.
+    cheaper : tuple
+        Brace sets with less heat that were rejected, each with the reason.
     """
 
     count: int
@@ -59,60 +68,78 @@ class Size:
 
     @property
     def braces(self) -> tuple[Candidate, ...]:
+        """Braces of the plan; empty without a plan."""
         return () if self.planned is None else self.planned.braces
 
     @property
     def dense(self) -> Dense:
-        """References and statics of the plan that there is."""
+        """References and statics of the plan, which must exist."""
         assert self.planned is not None
         return self.planned.dense
 
     @property
     def heat(self) -> float:
-        """[W]; infinite where nothing was found."""
+        """Planned mean heat [W]; infinite without a plan."""
         return math.inf if self.planned is None else self.planned.heat
 
     @property
     def nominal(self) -> Corner | None:
-        """The run as planned; None where nothing was verified."""
+        """Nominal run; None if the plan was not verified."""
         return None if self.verdict is None else self.verdict.nominal
 
     @property
     def expected(self) -> float:
-        """Heat by which numbers of braces rank [W]: of the run as planned, else the planned one."""
+        """Heat for ranking plans [W]: simulated heat of the nominal run if verified, else the planned heat."""
         nominal = self.nominal
         return self.heat if nominal is None or math.isnan(nominal.heat_W) else nominal.heat_W
 
     @property
     def survives(self) -> bool | None:
-        """Whether all corners hold; None where nothing was verified."""
+        """Whether all corners are accepted; None if the plan was not verified."""
         return None if self.verdict is None else self.verdict.survives
 
     @property
     def k_p(self) -> float:
-        """Gain [V/rad] that belongs to the plan."""
+        """Gain k_p of the plan [V/rad]."""
         return K_P if self.verdict is None else self.verdict.k_p
 
     @property
     def label(self) -> str:
-        """Names of points and surfaces."""
+        """Names of the points and surfaces, or "none"."""
         return ", ".join(brace.label for brace in self.braces) or "none"
 
     @property
     def variant(self) -> str:
-        """Its variant of the planned scenario."""
+        """Name of this plan's variant in the planned scenario."""
         return f"braces_{self.count}"
 
 
 @dataclass(frozen=True)
 class BracePlan:
-    """What :func:`plan_braces` has found.
+    """Result of :func:`plan_braces`: one plan per number of braces.
 
     Attributes
     ----------
-    task : the problem; sizes: the answer for each number of braces; tally: what the search has done
-    singles : by candidate, least heat of a single brace at one posture [W], of those that were found
-    ranked : by number of braces, sets with whole paths and their heat [W], the answer first
+    task : Task
+        Planning problem.
+    sizes : tuple of Size
+        Best plan for each number of braces.
+    tally : Tally
+        Statistics of the search.
+    singles : dict of str to float
+        Least heat of a single brace at one posture [W], by candidate.
+    ranked : dict of int to list
+        Brace sets with a whole path and their heat [W], by number of braces, starting with the chosen set.
+
+    Examples
+    --------
+    >>> import dynsim
+    >>> scenario = dynsim.load_scenario("pressing")
+    >>> plan = dynsim.plan_braces(scenario, candidates=["link_6"], count=(0, 1), starts=1, verify=False)
+    >>> plan
+    <BracePlan pressing (plain): 2 sizes, best: link_6 on floor, 19.88 W>
+    >>> [(count, round(heat)) for count, heat in plan.pareto]
+    [(0, 473), (1, 20)]
     """
 
     task: Task
@@ -128,21 +155,39 @@ class BracePlan:
 
     @property
     def answered(self) -> list[Size]:
-        """The sizes for which there is a plan."""
+        """Sizes with a plan."""
         return [size for size in self.sizes if size.planned is not None]
 
     @property
     def best(self) -> Size | None:
-        """The least expected heat of those that survive, else of all; None where nothing was found."""
+        """Plan of least expected heat, preferably one that passed the verification; None without any plan."""
         return min(self.answered, key=lambda size: (size.survives is False, size.expected), default=None)
 
     def size(self, count: int) -> Size:
-        """The answer for a number of braces.
+        """Return the plan for a number of braces.
+
+        Parameters
+        ----------
+        count : int
+            Number of braces.
+
+        Returns
+        -------
+        Size
+            Brace set, references, gains and verification.
 
         Raises
         ------
         ScenarioError
-            That many were not asked for, or nothing was found for them.
+            If this number was not requested, or no plan was found for it.
+
+        Examples
+        --------
+        >>> import dynsim
+        >>> scenario = dynsim.load_scenario("pressing")
+        >>> plan = dynsim.plan_braces(scenario, candidates=["link_6"], count=(1, 1), starts=1, verify=False)
+        >>> plan.size(1).label
+        'link_6 on floor'
         """
         for size in self.sizes:
             if size.count == count:
@@ -150,16 +195,16 @@ class BracePlan:
                     raise ScenarioError(f"no plan with {count} braces: {size.reason}")
                 return size
         asked = ", ".join(str(size.count) for size in self.sizes)
-        raise ScenarioError(f"no plan with {count} braces was asked for; sizes: {asked}")
+        raise ScenarioError(f"no plan with {count} braces was requested (requested: {asked})")
 
     @cached_property
     def table(self) -> list[dict[str, Any]]:
-        """A row for each size: numbers and words, for tables."""
+        """Rows with the main results of each size; the names of the values contain the units."""
         return [_row(self.task, size) for size in self.sizes]
 
     @property
     def pareto(self) -> list[tuple[int, float]]:
-        """Numbers of braces, and expected heat [W], that no smaller number reaches."""
+        """Numbers of braces with their expected heat [W], if it is lower than for all smaller numbers."""
         points: list[tuple[int, float]] = []
         for size in self.answered:
             if not points or size.expected < points[-1][1]:
@@ -167,27 +212,74 @@ class BracePlan:
         return points
 
     def scenario(self, count: int) -> Scenario:
-        """The plan with so many braces as a scenario that runs."""
+        """Return the plan with a number of braces as a runnable scenario.
+
+        Parameters
+        ----------
+        count : int
+            Number of braces.
+
+        Returns
+        -------
+        Scenario
+            Scenario with posture, references, brace forces and gains of the plan.
+
+        Raises
+        ------
+        ScenarioError
+            If this number was not requested, or no plan was found for it.
+
+        Examples
+        --------
+        >>> import dynsim
+        >>> scenario = dynsim.load_scenario("pressing")
+        >>> plan = dynsim.plan_braces(scenario, candidates=["link_6"], count=(1, 1), starts=1, verify=False)
+        >>> plan.scenario(1)
+        <Scenario pressing_plan (braces_1): serial_arm, joint_pd, 10 s, contacts link_6>
+        """
         size = self.size(count)
         return planned_scenario.scenario(self.task, size.braces, size.dense, size.k_p, size.variant)
 
     def record(self, count: int) -> Record:
-        """The run of that scenario."""
+        """Simulate the plan with a number of braces and return its record.
+
+        Parameters
+        ----------
+        count : int
+            Number of braces.
+
+        Returns
+        -------
+        Record
+            Record of the nominal run.
+
+        Raises
+        ------
+        ScenarioError
+            If this number was not requested, or no plan was found for it.
+        SimulationStopped
+            If the run ends early.
+
+        Examples
+        --------
+        >>> record = plan.record(1)  # doctest: +SKIP
+        >>> record.summary["joule_heat_J"]  # doctest: +SKIP
+        """
         return simulate(self.scenario(count))
 
     @property
     def yaml(self) -> dict[str, Any]:
-        """All plans as one scenario with a variant for each size, the best first."""
+        """All plans as one scenario with one variant per size, starting with the best plan."""
         best = self.best
         variants = {
-            size.variant: planned_scenario.particular(self.task, size.braces, size.dense, size.k_p)
+            size.variant: planned_scenario.plan_sections(self.task, size.braces, size.dense, size.k_p)
             for size in sorted(self.answered, key=lambda size: size is not best)
         }
-        return {**planned_scenario.common(self.task), "variants": variants}
+        return {**planned_scenario.shared_sections(self.task), "variants": variants}
 
     @property
     def json(self) -> dict[str, Any]:
-        """The content of ``plan.json``."""
+        """Content of ``plan.json``."""
         tally = self.tally
         return {
             "scenario": self.task.scenario.title,
@@ -211,7 +303,7 @@ class BracePlan:
 
 
 def _row(task: Task, size: Size) -> dict[str, Any]:
-    """Numbers of one size for a table."""
+    """Return the row of one size for a table."""
     row: dict[str, Any] = {"count": size.count, "braces": size.label if size.planned else "not found"}
     if size.planned is None:
         return row | {"reason": size.reason}
@@ -243,7 +335,7 @@ def _row(task: Task, size: Size) -> dict[str, Any]:
 
 
 def _size_json(task: Task, size: Size) -> dict[str, Any]:
-    """One size in ``plan.json``."""
+    """Return the entry of one size in ``plan.json``."""
     braces = [{"body": b.body, "point_m": list(b.point_m), "surface": b.surface, "name": b.name} for b in size.braces]
     entry: dict[str, Any] = {"count": size.count, "braces": braces}
     if size.planned is None:
@@ -293,18 +385,18 @@ def _corner_json(corner: Corner) -> dict[str, Any]:
 
 
 def _number(value: float) -> float | None:
-    """JSON has no NaN and no infinity."""
+    """Return a number for JSON, which has no NaN or infinity: None instead."""
     return float(value) if math.isfinite(value) else None
 
 
 def _torque_share(task: Task, dense: Dense) -> float | None:
-    """Greatest part of a motor's torque at rest that is used; None without limits."""
+    """Return the maximum torque as a fraction of the motor's limit at rest; None without limits."""
     share = np.abs(dense.torques) / task.arm.tables.greatest
     return _number(float(share.max())) if np.isfinite(task.arm.tables.greatest).any() else None
 
 
 def _joint_room(task: Task, dense: Dense) -> float:
-    """Least distance of a joint from its limits [rad or m]."""
+    """Return the minimum distance of a joint from its limits [rad or m]."""
     links = [task.arm.model.robot.links[i] for i in task.arm.links]
     lower, upper = np.array([link.lower for link in links]), np.array([link.upper for link in links])
     return float(min((dense.q - lower).min(), (upper - dense.q).min()))
@@ -330,50 +422,84 @@ def plan_braces(
     tolerances: Tolerances | None = None,
     tell: Tell | None = None,
 ) -> BracePlan:
-    """Which points of an arm to brace, on which surfaces, in what posture along the hand's path, with what forces.
+    """Find the brace points, surfaces, postures and forces of least motor heat along the hand path.
 
-    Minimises the mean heat of the motors, Σ R i², over the path ``controller.hand.path`` of the scenario, see
-    :mod:`dynsim.planner.arm`, for each number of braces; verified with friction and surfaces that are not as planned.
+    For each number of braces, the planner minimises the mean heat of the motors, Σ R i², over the path
+    ``controller.hand.path`` of the scenario (see :mod:`dynsim.planner.arm`). The plans are then simulated with errors
+    in friction and surface height.
 
     Parameters
     ----------
-    candidates : links (their joints), ``first:last``, frames, or contact points of the scenario; default: all links
-        but the first two, and all contact points
-    along : shares of the way along links that are candidates too
-    radius_m : of candidates; default: that of their links
-    count : least and greatest number of braces
-    surfaces : that may be leaned on; default: all
-    peak_W_per_N_m : cost of the greatest torque of revolute joints beside the heat; forces of prismatic ones have none
-    clearance_m : of joints that are not braced
-    min_N : least normal force of a brace
-    verify : run the corners of ``tolerances`` and choose gains that bear them
-    explain : of refused plans find the errors that do hold, by bisection
-    exhaustive : all sets of candidates instead of those that grow from the best
-    starts, seed : rounds of the search, and of its random postures
-    jobs : processes that verify
-    tell : called with what is done and how far it is, 0 to 1
+    scenario : Scenario
+        Scenario with an arm, surfaces and a hand path; its posture and braces are ignored.
+    candidates : sequence of str, optional
+        Points that may become braces: links (at their joint), ranges ``first:last`` of links, frames, or contact
+        points; default: all links except the first two, and all contact points.
+    along : sequence of float, optional
+        Fractions of the link length with additional candidates, above 0 and at most 1.
+    radius_m : float, optional
+        Radius of the candidates [m]; default: the radius of the link.
+    count : tuple of int, optional
+        Minimum and maximum number of braces.
+    surfaces : sequence of str, optional
+        Surfaces that braces may use; default: all.
+    peak_W_per_N_m : float, optional
+        Extra cost of the maximum torque of revolute joints [W/(N m)]; forces of prismatic joints have no extra cost.
+    clearance_m : float, optional
+        Minimum distance of unbraced joints from surfaces [m].
+    min_N : float, optional
+        Minimum normal force of each brace [N].
+    verify : bool, optional
+        Simulate the corners of ``tolerances``, and choose gains that tolerate them.
+    explain : bool, optional
+        For rejected plans, find the largest error they tolerate, by bisection.
+    exhaustive : bool, optional
+        Try every set of candidates instead of growing sets from the best smaller ones (slow).
+    starts : int, optional
+        Number of independent search rounds.
+    seed : int, optional
+        Seed of the random start postures.
+    jobs : int, optional
+        Number of worker processes for the verification.
+    tolerances : Tolerances, optional
+        Errors and limits of the verification, see :class:`dynsim.planner.verify.Tolerances`.
+    tell : callable, optional
+        Called with the current stage (str) and the progress, 0 to 1 (float).
+
+    Returns
+    -------
+    BracePlan
+        One plan per number of braces.
 
     Raises
     ------
     ModelError
-        The scenario has no arm with DC motors, no hand path, no surfaces, or not these candidates.
+        If the scenario has no arm with DC motors, no hand path or no surfaces, or a candidate does not exist.
     ScenarioError
-        Numbers that make no sense.
+        If an argument is out of range, or gravity is zero.
+
+    Examples
+    --------
+    >>> import dynsim
+    >>> scenario = dynsim.load_scenario("pressing")
+    >>> plan = dynsim.plan_braces(scenario, candidates=["link_6"], count=(0, 1), starts=1, verify=False)
+    >>> plan.best.label, round(plan.best.heat, 1)
+    ('link_6 on floor', 19.9)
     """
     require_scenario(scenario)
     least, most = count
     if not 0 <= least <= most:
-        raise ScenarioError(f"count = {least}:{most}: must be numbers of braces, the least first")
+        raise ScenarioError(f"count = {least}:{most}: minimum must not exceed maximum, and both must be ≥ 0")
     for key, number, smallest in (("starts", starts, 1), ("seed", seed, 0), ("jobs", jobs, 1)):
         if number < smallest:
-            raise ScenarioError(f"{key} = {number}: must be {smallest} or more")
+            raise ScenarioError(f"{key} = {number}: must be at least {smallest}")
     tolerances = tolerances or Tolerances()
     positive = {"radius_m": radius_m, "peak_W_per_N_m": peak_W_per_N_m, "clearance_m": clearance_m, "min_N": min_N}
     for key, value in (positive | {"shift_m": max(map(abs, tolerances.shift_m), default=0.0)}).items():
         if value is not None and not 0.0 <= value < math.inf:
-            raise ScenarioError(f"{key} = {value}: must be a finite number, zero or more")
+            raise ScenarioError(f"{key} = {value}: must be finite and not negative")
     if any(not 0.0 < share <= 1.0 for share in along):
-        raise ScenarioError(f"along = {list(along)}: shares of the way along links, above 0 and at most 1")
+        raise ScenarioError(f"along = {list(along)}: must be fractions of the link length, above 0 and at most 1")
     options = Options(
         tuple(candidates), tuple(along), radius_m, (least, most), tuple(surfaces), peak_W_per_N_m, clearance_m, min_N,
         starts, seed, exhaustive,
@@ -381,12 +507,12 @@ def plan_braces(
     tell = tell or (lambda text, share: None)
     with named(scenario):
         problem = task(scenario, options)
-        if problem.bare and most > 0:
-            warnings.warn(_bare(problem.bare), stacklevel=2)
+        if problem.without_radius and most > 0:
+            warnings.warn(_radius_warning(problem.without_radius), stacklevel=2)
         if unplanned := [name for name, load in scenario.config.loads.items() if not isinstance(load, Payload)]:
-            warnings.warn(_unplanned(unplanned), stacklevel=2)
+            warnings.warn(_load_warning(unplanned), stacklevel=2)
         if not np.any(problem.arm.model.robot.gravity):
-            raise ScenarioError("plant.gravity_m_s2 = [0, 0, 0]: without gravity an arm needs no braces")
+            raise ScenarioError("plant.gravity_m_s2 = [0, 0, 0]: must not be zero; without gravity braces are useless")
         search = Search(problem, tell)
         ranked = search.run()
         sizes = [_answered(search, size, ranked[size]) for size in range(least, most + 1)]
@@ -398,63 +524,63 @@ def plan_braces(
     return BracePlan(problem, tuple(sizes), search.tally, singles, heats)
 
 
-def _bare(names: Sequence[str]) -> str:
-    """Warning of candidates without a radius."""
+def _radius_warning(names: Sequence[str]) -> str:
+    """Return the warning about candidates without a radius."""
     return (
-        f"plan: candidates {', '.join(names)} have radius 0 (links of a URDF have none, whatever <visual> shows): "
-        "braces would lay the axis itself onto the surface; give --radius, or name contacts.points with radius_m as "
+        f"plan: candidates {', '.join(names)} have radius 0 (links from URDF have no radius, even with <visual>); "
+        "braces would put the joint axis on the surface; set --radius, or list contacts.points with radius_m in "
         "--candidates"
     )
 
 
-def _unplanned(names: Sequence[str]) -> str:
-    """Warning of loads that are no payloads."""
+def _load_warning(names: Sequence[str]) -> str:
+    """Return the warning about loads other than payloads."""
     return (
-        f"plan: loads.{first_few(names)}: planned without, as only payloads are part of a plan; simulated runs have "
-        "them, and refuse plans that they make dearer: give a steady weight as `type: payload`"
+        f"plan: loads.{first_few(names)}: ignored by the planner, which supports payloads only; simulated runs include "
+        "these loads and reject plans whose heat they raise; define a constant weight as `type: payload`"
     )
 
 
 def _ranked(size: Size, planned: Sequence[Planned]) -> list[tuple[str, float]]:
-    """Sets of a size with their heat, the answer first."""
+    """Return the sets of a size with their heat, starting with the chosen set."""
     names = [(", ".join(b.label for b in plan.braces) or "none", plan.heat) for plan in planned]
     return sorted(names, key=lambda item: (item[0] != size.label, item[1]))
 
 
 def _answered(search: Search, count: int, ranked: Sequence[Planned]) -> Size:
-    """The best of a size, before verification; in words why there is none."""
+    """Return the best plan of a size before verification, or the reason why there is no plan."""
     heats = search.tally.heats.get(count, [])
     if ranked:
-        best = min([*heats, search.least.get(count, math.inf)])
+        best = min([*heats, search.least_heat.get(count, math.inf)])
         return Size(count, ranked[0], None, sum(heat <= best * (1.0 + AGREE) for heat in heats), len(heats))
-    return Size(count, None, reason=_why(search, count), rounds=search.task.options.starts)
+    return Size(count, None, reason=_failure(search, count), rounds=search.task.options.starts)
 
 
-def _why(search: Search, count: int) -> str:
-    """Why no plan of a size was found."""
+def _failure(search: Search, count: int) -> str:
+    """Return why no plan of a size was found."""
     tally, options = search.tally, search.task.options
     if not tally.drawn_on:
         if within := search.never_clear():
             return (
-                f"none of {tally.drawn} random postures could be brought onto the hand's path: {within[0]} is never "
-                "clear of that surface; the base may stand too near to it, or within it"
+                f"none of {tally.drawn} random postures could be projected onto the hand path: {within[0]} is always "
+                "too close to that surface; move the base away from the surface"
             )
         return (
-            f"none of {tally.drawn} random postures could be brought onto the hand's path, within joint limits and "
-            "clear of the surfaces: it may be out of reach, or the orientation that it asks for"
+            f"none of {tally.drawn} random postures could be projected onto the hand path within joint limits and "
+            "clear of the surfaces; the path or its orientation may be out of reach"
         )
     refused = [why for braces, why in tally.refused.items() if len(braces) == count]
     if refused:
         return refused[0]
     if count > len({candidate.location for candidate in search.task.candidates}):
-        return f"there are only {len({candidate.location for candidate in search.task.candidates})} candidates"
+        return f"only {len({candidate.location for candidate in search.task.candidates})} candidates exist"
     missed = sum(len(braces) == count for braces in tally.missed)
     tried = missed + sum(len(braces) == count for braces in tally.reached)
     if tried == 0:
-        return f"no set of {count - 1} braces was found that it could grow from"
+        return f"no set of {count - 1} braces was found to start from"
     return (
-        f"no posture was found for any of the {tried} sets tried: not found, which does not say impossible; more "
-        f"--starts than {options.starts}, other --candidates or a smaller --min-force may help"
+        f"no posture was found for any of the {tried} sets tried, but one may exist; try more --starts than "
+        f"{options.starts}, other --candidates or a smaller --min-force"
     )
 
 
@@ -468,7 +594,7 @@ def _verified(
     explain: bool,
     tell: Tell,
 ) -> list[Size]:
-    """Sizes with their verdicts: where the best set is refused and another one survives, that one."""
+    """Verify the best set of each size; if it is rejected, choose the next set that survives."""
     verifier = Verifier(problem, tolerances, jobs)
     open_ = {size.count: list(ranked[size.count]) for size in sizes if size.planned is not None}
     verdicts: dict[int, list[tuple[Planned, Verdict]]] = {count: [] for count in open_}

@@ -1,4 +1,4 @@
-"""Tables of an arm for the planner's compiled statics: the joints that move, surfaces, points along link axes."""
+"""Tables of an arm for the planner's compiled statics, and the local solver for one set of braces."""
 
 from __future__ import annotations
 
@@ -17,20 +17,26 @@ from dynsim.model.surfaces import Surface, shape_arrays
 from dynsim.planner import compiled
 from dynsim.planner.compiled import Arm, Course, Points, Work
 
-# Distance that plans keep from joint limits [rad or m], at most this share of the range: for errors under soft gains.
+# Distance from joint limits in plans [rad or m], and its maximum as a fraction of the range: a margin for soft gains.
 FROM_STOP, FROM_STOP_SHARE = 0.05, 0.05
 
 
 @dataclass(frozen=True)
 class MovingArm:
-    """The joints of a robot that a plan moves, in their order, on a base that stands.
+    """Joints of a robot that a plan moves, in order, on a fixed base.
 
     Attributes
     ----------
-    tables : for the compiled functions
-    links : index of each joint's link in the robot
-    columns : of each joint in q
-    surfaces : names, in the order of the tables
+    model : Model
+        Model of the robot.
+    tables : Arm
+        Tables for the compiled functions.
+    links : tuple of int
+        Index of each joint's link in the robot.
+    columns : tuple of int
+        Column of each joint in q.
+    surfaces : tuple of str
+        Names of the surfaces, in the order of the tables.
     """
 
     model: Model
@@ -41,39 +47,39 @@ class MovingArm:
 
     @property
     def n(self) -> int:
-        """Number of joints that move."""
+        """Number of moving joints."""
         return len(self.links)
 
     @property
     def joints(self) -> tuple[str, ...]:
-        """Their names."""
+        """Names of the moving joints."""
         return tuple(self.model.robot.links[i].joint for i in self.links)
 
     def attached(self, body: str, point: Array) -> tuple[int, Array]:
-        """Which joint carries a body or frame, and the point in the frame of that joint's link [m]."""
+        """Return the joint that carries a body or frame, and the point in the frame of that joint's link [m]."""
         link, on_link = self.model.robot.attach(body, point)
         if link not in self.links:
-            raise ModelError(f"{body} stands still: only what the arm's joints move can be braced")
+            raise ModelError(f"{body} is not moved by any joint and cannot be braced; remove it from the candidates")
         return self.links.index(link), on_link
 
     def coordinates(self, q: Array) -> Array:
-        """All coordinates of the robot for positions of the joints, (T, n) → (T, nq)."""
+        """Return all coordinates of the robot, shape (T, nq), for joint positions of shape (T, n) [rad or m]."""
         whole = np.tile(self.model.robot.initial, (len(q), 1))
         whole[:, list(self.columns)] = q
         return whole
 
 
 def moving_arm(model: Model, surfaces: Mapping[str, Surface]) -> MovingArm:
-    """Tables of a robot.
+    """Build the tables of a robot.
 
     Raises
     ------
     ModelError
-        A joint with several coordinates, coupled joints, a hand that no joint moves, or a joint without a DC motor.
+        If a joint has several coordinates or no DC motor, joints are coupled, or no joint moves the hand.
     """
     robot = model.robot
     if robot.couplings:
-        raise ModelError("plan: not for robots with coupled joints, which share a motor")
+        raise ModelError("plan: robots with coupled joints are not supported, because these joints share a motor")
     wheels = () if robot.base is None else robot.base.wheels
     links = [i for i, link in enumerate(robot.links) if link.joint not in wheels]
     motors = {motor.joint: motor for motor in robot.motors}
@@ -82,13 +88,11 @@ def moving_arm(model: Model, surfaces: Mapping[str, Surface]) -> MovingArm:
         link = robot.links[i]
         if link.kind not in ("revolute", "prismatic"):
             raise ModelError(
-                f"plan: {link.joint} is a joint of kind {link.kind}; revolute and prismatic ones are planned"
+                f"plan: {link.joint} is of kind {link.kind}; only revolute and prismatic joints are supported"
             )
         motor = motors.get(link.joint)
         if not isinstance(motor, Motor):
-            raise ModelError(
-                f"plan: {link.joint} has no DC motor, whose heat is what is planned for; give it plant…motor"
-            )
+            raise ModelError(f"plan: {link.joint} has no DC motor, whose heat is minimised; set its motor in plant")
         heat.append(motor.resistance / motor.joint_constant**2)
         current = min(motor.greatest_current, motor.voltage_limit / motor.resistance)
         greatest.append(min(motor.joint_constant * current, link.effort_limit))
@@ -137,9 +141,9 @@ def moving_arm(model: Model, surfaces: Mapping[str, Surface]) -> MovingArm:
 
 
 def axis_points(arm: MovingArm, shares: Sequence[float]) -> list[tuple[int, Array, float, float]]:
-    """Points along the axes of all links: joint that carries them, point [m], radius [m], share of the way.
+    """Return points along the axes of all links: index of the joint, point [m], radius [m], fraction of the length.
 
-    From each link's joint to the ends that :func:`dynsim.compile.clearance.axis_ends` gives it.
+    An axis runs from the link's joint to an end from :func:`dynsim.compile.clearance.axis_ends`.
     """
     robot = arm.model.robot
     ends = axis_ends(robot)
@@ -152,53 +156,59 @@ def axis_points(arm: MovingArm, shares: Sequence[float]) -> list[tuple[int, Arra
     ]
 
 
-# The local solver: for one set of braces, the postures along the path and brace forces of least heat.
+# Local solver: postures along the path and brace forces of least heat for one set of braces.
 
 
-# Most constraints that take part in one step.
+# Maximum number of constraints in one step.
 WORKING_SETS = 160
 
 
 @dataclass
 class Problem:
-    """One set of braces at some knots.
+    """Planning problem for one set of braces and a number of knots.
 
     Attributes
     ----------
-    work : results, until another problem with the same room is evaluated
-    peak : cost of the greatest torque of revolute joints [W/(N m)]
+    arm, points, course : Arm, Points, Course
+        Tables for the compiled functions.
+    work : Work
+        Workspace with the results, shared by problems of the same size.
+    min_force : float
+        Minimum normal force of a brace [N].
+    peak : float
+        Cost of the maximum torque of revolute joints [W/(N m)].
     """
 
     arm: Arm
     points: Points
     course: Course
     work: Work
-    least: float
+    min_force: float
     peak: float = 0.0
 
     def evaluate(self, Q: Array, F: Array) -> None:
-        """Torques, geometry and derivatives into the workspace."""
-        compiled.settle(self.arm, self.points, self.course, self.work, Q, F, self.least, False)
+        """Compute torques, geometry and derivatives in the workspace."""
+        compiled.evaluate(self.arm, self.points, self.course, self.work, Q, F, self.min_force, False)
 
     def forces(self, Q: Array) -> Array:
-        """Normal forces of least heat, (E, c) [N]; the workspace holds what goes with them."""
+        """Return the normal forces of least heat, shape (E, c) [N]; the workspace has the corresponding torques."""
         F = np.zeros((len(self.course.knot), len(self.points.friction)))
-        compiled.settle(self.arm, self.points, self.course, self.work, Q, F, self.least, True)
+        compiled.evaluate(self.arm, self.points, self.course, self.work, Q, F, self.min_force, True)
         return F
 
     def heat(self) -> float:
-        """Mean heat of what is in the workspace [W]."""
+        """Return the mean heat of the torques in the workspace [W]."""
         return float(self.course.share @ (self.work.torque**2 @ self.arm.heat))
 
     def retract(self, Q: Array, steps: int = 12, tolerance: float = compiled.ON) -> float:
-        """Put postures onto hand path and braces, in place; what is left [m]."""
+        """Project postures onto hand path and braces, in place; return the residual [m]."""
         reach = 2.0 * compiled.REACH / 3.0
         return float(compiled.retract(self.arm, self.points, self.course, self.work, Q, steps, tolerance, reach))
 
 
 @dataclass(frozen=True)
 class Local:
-    """Postures at the knots, (K, n), forces at the instants, (E, c) [N], heat and cost [W], and steps taken."""
+    """Local optimum: postures at the knots, (K, n), forces at the instants, (E, c) [N], heat and cost [W], steps."""
 
     Q: Array
     F: Array
@@ -236,9 +246,18 @@ def workspace(n: int, points: Points, course: Course) -> Work:
 
 
 def solve(problem: Problem, start: Array, turns: int = 40, tolerance: float = 1e-4) -> Local | None:
-    """Postures and forces of least cost from a start, (K, n); None where that cannot be put onto path and surfaces."""
+    """Minimise the cost from a start, shape (K, n); return None if it cannot be projected onto path and surfaces."""
     Q, F = reals(start), np.zeros((len(problem.course.knot), len(problem.points.friction)))
     cost, heat, steps = compiled.solve(
-        problem.arm, problem.points, problem.course, problem.work, Q, F, problem.least, problem.peak, turns, tolerance
+        problem.arm,
+        problem.points,
+        problem.course,
+        problem.work,
+        Q,
+        F,
+        problem.min_force,
+        problem.peak,
+        turns,
+        tolerance,
     )
     return None if np.isnan(cost) else Local(Q, F, heat, cost, steps)

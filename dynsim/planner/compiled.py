@@ -1,14 +1,14 @@
-"""Statics of a braced arm at many instants with exact derivatives, and the steps of the local solver, compiled.
+"""Compiled statics of a braced arm at many instants with exact derivatives, and the steps of the local solver.
 
-For an arm whose joints each have one coordinate, on a fixed base, with braces c whose forces are
+The arm has a fixed base and joints with one coordinate each. Brace forces and joint torques are
 
     F_c = f_c (n − μ v_t / √(|v_t|² + v_s²)),    τ = g(q) + (D + D_m) v − Σ_c J_cᵀ F_c
 
-n: normal of the surface at the brace, v_t: velocity of the touching point along the surface. Postures q_k belong to
-knots; instants e lie between knots, at q_e = Σ_k blend_ek q_k with velocities v_e = Σ_k chord_ek q_k. So one posture
-has two instants on a path that goes back and forth.
+for braces c with the surface normal n at the brace and the velocity v_t of the contact point along the surface.
+Postures q_k belong to knots. Instants e are between knots, at q_e = Σ_k blend_ek q_k with velocities
+v_e = Σ_k chord_ek q_k. On a path that goes back and forth each posture has two instants.
 
-All is in one file, because for this package the cache of compiled code checks the function's own file only.
+All functions are in one file, because in this package the cache of compiled code only checks the file of the function.
 """
 
 from __future__ import annotations
@@ -39,97 +39,97 @@ from dynsim.dynamics.tree.spatial import (
 )
 from dynsim.jit.kernel import internal_kernel, kernel
 
-# A constraint row of which less than this share is independent of the others is dependent.
+# Independent fraction of a constraint row below which the row counts as dependent.
 DEPENDENT = 1e-9
-# Distance from hand path and surfaces that counts as none [m].
+# Tolerance of the distance from hand path and surfaces [m].
 ON = 1e-9
-# First damping of the steps beside the curvature of the heat, and its bounds, over the largest of that curvature.
+# Initial damping of the steps and its bounds, relative to the cost.
 DAMPING, DAMPING_MIN, DAMPING_MAX = 1e-3, 1e-7, 1e6
-# Longest step of a coordinate in one iteration [rad or m].
+# Maximum step of a coordinate in one iteration [rad or m].
 REACH = 0.6
-# Points that are so much further from a surface than they must be are left out of a step [m].
+# Points whose distance from a surface exceeds their margin by more than this are ignored in a step [m].
 NEARBY = 0.5
-# Steps back onto the manifold within which what is left must be halved, or the search for it ends.
+# Number of projection steps within which the residual must halve, or the projection fails.
 PATIENCE = 12
-# Torques beyond this part of their limits cost extra, so many times what they cost as heat.
-NEAR_LIMIT, DEAR = 0.98, 100.0
-# Exponent of the mean that stands for the peak of the torques.
+# Fraction of the torque limits above which torques have an extra cost, and its factor relative to the heat.
+NEAR_LIMIT, LIMIT_COST = 0.98, 100.0
+# Exponent of the power mean that approximates the peak torque.
 PEAK_POWER = 12
-# Of multipliers and forces, relative to their scale: nothing is gained by letting go of a bound.
+# Threshold, relative to the scale of multipliers and forces, below which releasing a bound brings no gain.
 NO_GAIN = 1e-11
 
 
 class Arm(NamedTuple):
-    """Joints of one coordinate and what they carry; n joints, parents before children."""
+    """Joints with one coordinate each and the bodies they carry; n joints, parents before children."""
 
-    parent: np.ndarray  # (n,) int, −1: the base that stands
+    parent: np.ndarray  # (n,) int, −1: the fixed base
     prismatic: np.ndarray  # (n,) int, 1 or 0
-    rotation: np.ndarray  # (n, 9) of the joint frame at q = 0 in the parent's, in W on the base
-    origin: np.ndarray  # (n, 3) of that frame there [m]
+    rotation: np.ndarray  # (n, 9) joint frame at q = 0 in the parent's frame, or in W on the base
+    origin: np.ndarray  # (n, 3) origin of that frame [m]
     axis: np.ndarray  # (n, 3)
     mass: np.ndarray  # (n,) [kg]
     com: np.ndarray  # (n, 3) centre of mass in the body's frame [m]
-    # Of a prismatic joint forces stand for torques, and metres for radians.
+    # For prismatic joints: forces instead of torques, metres instead of radians.
     losses: np.ndarray  # (n,) D + D_m [N m s/rad]
     heat: np.ndarray  # (n,) R / K_m² [W/(N m)²]
-    greatest: np.ndarray  # (n,) greatest torque at rest [N m], inf for none
-    lower: np.ndarray  # (n,) limits of the joints
+    greatest: np.ndarray  # (n,) maximum torque at rest [N m]; inf: no limit
+    lower: np.ndarray  # (n,) joint limits
     upper: np.ndarray  # (n,)
     gravity: np.ndarray  # (1, 3)
-    hand: np.ndarray  # (1,) int, its body
+    hand: np.ndarray  # (1,) int, body of the hand
     hand_point: np.ndarray  # (1, 3) [m]
     shapes: ShapeArrays  # the surfaces
 
 
 class Points(NamedTuple):
-    """Braces first, c of them, then points that stay clear; P altogether."""
+    """Contact points of c braces, followed by points that must stay clear; P points in total."""
 
     body: np.ndarray  # (P,) int
-    point: np.ndarray  # (P, 3) in its frame [m]
-    radius: np.ndarray  # (P,) of a sphere about it [m]
+    point: np.ndarray  # (P, 3) in the body's frame [m]
+    radius: np.ndarray  # (P,) radius of a sphere around the point [m]
     surface: np.ndarray  # (P,) int
-    margin: np.ndarray  # (P,) least distance [m], of braces zero
+    margin: np.ndarray  # (P,) minimum distance [m]; zero for braces
     friction: np.ndarray  # (c,) μ
 
 
 class Course(NamedTuple):
-    """Knots k with targets of the hand and instants e; instants of one posture follow each other."""
+    """Knots k with targets of the hand, and instants e; the instants of one posture are consecutive."""
 
-    target: np.ndarray  # (K, h) position of the hand [m], with the two directions' components if they are asked for
-    knot: np.ndarray  # (E,) int, the last one before the instant
+    target: np.ndarray  # (K, h) position of the hand [m]; with an orientation also the components of two axes
+    knot: np.ndarray  # (E,) int, last knot before the instant
     blend: np.ndarray  # (E, K)
     chord: np.ndarray  # (E, K) [1/s]
-    share: np.ndarray  # (E,) of the time; their sum is 1
+    share: np.ndarray  # (E,) fraction of the time; the sum is 1
     smooth: np.ndarray  # (K, K) SᵀS of the smoothness S q
-    slip_scale: np.ndarray  # (1,) slip over which friction grows to its value [m/s]
+    slip_scale: np.ndarray  # (1,) v_s: slip at which friction approaches its full value [m/s]
 
 
 class Work(NamedTuple):
-    """Results and scratch."""
+    """Results and workspace."""
 
     torque: np.ndarray  # (E, n)
     by_q: np.ndarray  # (E, n, n) ∂τ/∂q at fixed v and f
     by_v: np.ndarray  # (E, n, n)
     by_f: np.ndarray  # (E, n, c)
-    gap: np.ndarray  # (K + 1, P) distance from the surface less radius; the last row is of an instant
-    gap_rate: np.ndarray  # (K + 1, P, n), of those that are near by
+    gap: np.ndarray  # (K + 1, P) distance from the surface minus radius; the last row is for an instant
+    gap_rate: np.ndarray  # (K + 1, P, n), of nearby points only
     hand: np.ndarray  # (K + 1, h)
     hand_rate: np.ndarray  # (K + 1, h, n)
     R: np.ndarray  # (n, 9)
     p: np.ndarray  # (n, 3)
     a: np.ndarray  # (n, 3) joint axes in W
-    below: np.ndarray  # (n, 4) mass and first moment of what a joint carries
-    moment: np.ndarray  # (n, 3) of the weight that a joint carries, about it, turned by each
-    touch: np.ndarray  # (c, n, 3) velocity of the touching point by each rate
-    turned: np.ndarray  # (c, n, 3) ∂n/∂q: what the normal at the brace turns by
+    below: np.ndarray  # (n, 4) mass and first moment of the bodies that a joint carries
+    moment: np.ndarray  # (n, 3) lever × weight of the bodies that a joint carries
+    touch: np.ndarray  # (c, n, 3) velocity of the contact point per unit rate
+    turned: np.ndarray  # (c, n, 3) ∂n/∂q of the normal at the brace
     normal: np.ndarray  # (c, 3)
-    shift: np.ndarray  # (c, n, 3) what the touching point moves by on the body, by each coordinate
-    slip: np.ndarray  # (c, 7) velocity along the surface over its size, that of the touching point, that size
+    shift: np.ndarray  # (c, n, 3) displacement of the contact point on the body per coordinate
+    slip: np.ndarray  # (c, 7) u = v_t / √(|v_t|² + v_s²), velocity of the contact point, that square root
     force: np.ndarray  # (c, 3)
     turn: np.ndarray  # (n, 3) ∂F/∂q of a brace
     drift: np.ndarray  # (n, 3) ∂F/∂v
-    basis: np.ndarray  # (K, n, n) columns that keep hand and braces come last
-    free: np.ndarray  # (K,) int, how many of those
+    basis: np.ndarray  # (K, n, n) orthonormal basis; the last columns span the null space of hand and braces
+    free: np.ndarray  # (K,) int, number of these columns
     rows: np.ndarray  # (R, n) constraints of one knot
     normal_matrix: np.ndarray  # (R, R)
     right: np.ndarray  # (R,)
@@ -139,12 +139,12 @@ class Work(NamedTuple):
     step: np.ndarray  # (N,)
     B: np.ndarray  # (n, 2 n + c)
     column: np.ndarray  # (2 n + c,) int
-    start: np.ndarray  # (K,) int, where the unknowns of each knot's posture begin; the forces of its instants follow
-    pressed: np.ndarray  # (E,) int, where the forces of each instant begin
-    skyline: np.ndarray  # (N,) int, first column of each row of H that is not zero
-    working: np.ndarray  # (W, 3) int: constraints of the step that have been violated: kind, knot or instant, which
+    start: np.ndarray  # (K,) int, first unknown of each knot's posture; the forces of its instants follow
+    pressed: np.ndarray  # (E,) int, first force of each instant
+    skyline: np.ndarray  # (N,) int, first nonzero column of each row of H
+    working: np.ndarray  # (W, 3) int: violated constraints of the step: kind, knot or instant, index
     bound: np.ndarray  # (W,)
-    normals: np.ndarray  # (N, W) their normals as columns, then L⁻¹ times them
+    normals: np.ndarray  # (N, W) normals of these constraints as columns, later multiplied by L⁻¹
     dual: np.ndarray  # (W, W)
     dual_right: np.ndarray  # (W,)
     multiplier: np.ndarray  # (W,)
@@ -155,16 +155,16 @@ class Work(NamedTuple):
     small_skyline: np.ndarray  # (W,) int
     between: np.ndarray  # (n,) posture of an instant
     rate: np.ndarray  # (n,) velocity of an instant
-    weight: np.ndarray  # (E, n) of the squares of torques in the model of the cost
-    pull: np.ndarray  # (E, n) half the gradient of the cost by torques, over the share of time
-    change: np.ndarray  # (K, n) of postures in a step
+    weight: np.ndarray  # (E, n) weights of the squared torques in the model of the cost
+    pull: np.ndarray  # (E, n) half the gradient of the cost by the torques, divided by the fraction of time
+    change: np.ndarray  # (K, n) change of the postures in a step
     trial: np.ndarray  # (K, n)
     trial_forces: np.ndarray  # (E, c)
 
 
 @internal_kernel
 def poses(arm: Arm, work: Work, q):
-    """Frames of all bodies, joint axes in W, and mass and first moment of what each joint carries."""
+    """Compute the frames of all bodies, the joint axes in W, and mass and first moment carried by each joint."""
     n, below = arm.parent.shape[0], work.below
     for j in range(n):
         i, u = arm.parent[j], vector(arm.axis, j, 0)
@@ -190,13 +190,13 @@ def poses(arm: Arm, work: Work, q):
 
 @internal_kernel
 def body_point(work: Work, body, point, i):
-    """Place of point i of a table, on a body, in W [m]."""
+    """Return the position in W of row i of a table of points on a body [m]."""
     return transform(vector(work.p, body, 0), rotation(work.R, body, 0), vector(point, i, 0))
 
 
 @internal_kernel
 def rates(arm: Arm, work: Work, body, at, out):
-    """Velocity of the material point of a body at a place ``at``, for each unit of rate, (n, 3)."""
+    """Compute the velocity of a body's material point at position ``at`` per unit joint rate, shape (n, 3)."""
     for j in range(arm.parent.shape[0]):
         put_vector(out, j, 0, ZERO_VECTOR)
     j = body
@@ -210,7 +210,7 @@ def rates(arm: Arm, work: Work, body, at, out):
 
 @internal_kernel
 def put_rows(table, out, row):
-    """A table (n, 3) as three rows of another one, from ``row`` on."""
+    """Write a table, shape (n, 3), to three rows of another table, starting at ``row``."""
     for j in range(table.shape[0]):
         for r in range(3):
             out[row + r, j] = table[j, r]
@@ -218,14 +218,14 @@ def put_rows(table, out, row):
 
 @internal_kernel
 def geometry(arm: Arm, points: Points, work: Work, q, k, count):
-    """Into row k: hand, gaps and rates of the first ``count`` points; of the braces what their forces need too."""
+    """Compute row k of hand and gaps, with rates, for the first ``count`` points; for braces also force geometry."""
     n, c, hand, jacobian = arm.parent.shape[0], points.friction.shape[0], arm.hand[0], work.turn
     poses(arm, work, q)
     x = body_point(work, hand, arm.hand_point, 0)
     rates(arm, work, hand, x, jacobian)
     put_vector(work.hand, k, 0, x)
     put_rows(jacobian, work.hand_rate[k], 0)
-    # Where an orientation is asked for: the z axis of the hand's body, then its x axis.
+    # With an orientation: the z axis of the hand's body, then its x axis.
     for row in range(3, work.hand.shape[1], 3):
         R = rotation(work.R, hand, 0)
         axis = third_axis(R) if row == 3 else first_axis(R)
@@ -254,7 +254,7 @@ def geometry(arm: Arm, points: Points, work: Work, q, k, count):
         put_vector(work.normal, i, 0, normal)
         touch, shift, turned = work.touch[i], work.shift[i], work.turned[i]
         rates(arm, work, body, along(x, normal, -radius), touch)
-        # The touching point moves by J_centre − ρ ∂n/∂q, the material there by J_touch.
+        # The contact point moves by J_centre − ρ ∂n/∂q, the material at this point by J_touch.
         for j in range(n):
             centre = vector(jacobian, j, 0)
             dn = times_inertia((xx, xy, xz, yy, yz, zz), centre)
@@ -263,14 +263,25 @@ def geometry(arm: Arm, points: Points, work: Work, q, k, count):
 
 
 @internal_kernel
-def statics(arm: Arm, points: Points, course: Course, work: Work, Q, F, least, forces):
-    """Torques of the instants with their derivatives, and geometry of all knots. Q: (K, n), F: (E, c).
+def statics(arm: Arm, points: Points, course: Course, work: Work, Q, F, min_force, forces):
+    """Compute the torques of the instants with their derivatives, and the geometry of all knots.
 
-    ∂τ/∂q_r = H_jr − Σ_c J_cj · ∂F_c/∂q_r − Σ_c (a_j × s_cr) · F_c,
-    H_ij = −a_i · M_j (joint i carries joint j, both directions alike), M_j = Σ_k J_kj × w_k over weights and forces;
-    zero for a prismatic joint i. s_cr: what the touching point moves by on its body.
+    ∂τ/∂q_r = H_jr − Σ_c J_cj · ∂F_c/∂q_r − Σ_c (a_j × s_cr) · F_c with the symmetric matrix H_ij = −a_i · M_j for
+    joints i that carry joint j, and zero for a prismatic joint i; M_j = Σ_k J_kj × w_k over weights and forces. s_cr is
+    the displacement of the contact point on its body.
 
-    forces : whether those of least heat, at least ``least`` [N], are put into F first
+    Parameters
+    ----------
+    arm, points, course, work
+        Tables and workspace.
+    Q : (K, n) ndarray
+        Postures at the knots [rad or m].
+    F : (E, c) ndarray
+        Normal forces [N].
+    min_force : float
+        Minimum normal force [N].
+    forces : bool
+        Whether to compute the forces of least heat first and write them to ``F``.
     """
     n, c, weight = arm.parent.shape[0], points.friction.shape[0], vector(arm.gravity, 0, 0)
     K, v = Q.shape[0], work.rate
@@ -307,7 +318,7 @@ def statics(arm: Arm, points: Points, course: Course, work: Work, Q, F, least, f
             for j in range(n):
                 work.by_f[e, j, i] = -dot_vector(vector(work.touch[i], j, 0), pull)
         if forces:
-            least_heat(arm, work, least, F[e], e)
+            least_heat(arm, work, min_force, F[e], e)
         for i in range(c):
             put_vector(work.force, i, 0, times_number(vector(work.force, i, 0), F[e, i]))
         for j in range(n):
@@ -332,7 +343,7 @@ def statics(arm: Arm, points: Points, course: Course, work: Work, Q, F, least, f
 
 @internal_kernel
 def force_derivatives(arm: Arm, points: Points, work: Work, v, f, i, e):
-    """What the direction of brace i's force, and the point that it acts at, add to the derivatives of instant e.
+    """Add the derivatives by direction and point of application of brace i's force at instant e.
 
     ∂F = f (∂n − μ G ∂w), w = v_t, G = (1 − u uᵀ)/s, s = √(|w|² + v_s²), u = w/s.
     """
@@ -345,13 +356,13 @@ def force_derivatives(arm: Arm, points: Points, work: Work, v, f, i, e):
         if not arm.prismatic[j]:
             whole = along(whole, vector(work.a, j, 0), v[j])
         j = arm.parent[j]
-    # From the tip inwards: carried = Σ J_i v_i of joint j and those it carries, before = Σ a_i v_i of those before it.
+    # From tip to base: carried = Σ J_i v_i over joint j and the joints it carries, before = Σ a_i v_i over its parents.
     before, carried = whole, ZERO_VECTOR
     j = body
     while j >= 0:
         rate, a, dn = vector(touch, j, 0), vector(work.a, j, 0), vector(turned, j, 0)
         carried = along(carried, rate, v[j])
-        # The material at the touching point changes.
+        # Another material point becomes the contact point.
         dw = cross(whole, vector(shift, j, 0))
         if not arm.prismatic[j]:
             before = along(before, a, -v[j])
@@ -377,10 +388,18 @@ def force_derivatives(arm: Arm, points: Points, work: Work, v, f, i, e):
 
 @internal_kernel
 def factor(A, skyline, done, n):
-    """Cholesky's L of the leading n × n part of A, in its lower half; pivots that are lost stop moving anything.
+    """Factorise the leading n × n part of A = L Lᵀ (Cholesky) in its lower half; lost pivots become very large.
 
-    skyline : (n,) int, out: first column of each row that is not zero; left of it L has zeros too
-    done : so many rows are those of L already
+    Parameters
+    ----------
+    A : ndarray
+        Symmetric matrix; its lower half is overwritten by L.
+    skyline : (n,) ndarray of int
+        Output: first nonzero column of each row; L is also zero to its left.
+    done : int
+        Number of rows that are already rows of L.
+    n : int
+        Size of the leading part.
     """
     for i in range(done, n):
         first = 0
@@ -399,7 +418,7 @@ def factor(A, skyline, done, n):
 
 @internal_kernel
 def forward(L, skyline, b, n):
-    """b ← L⁻¹ b."""
+    """Compute b ← L⁻¹ b."""
     for i in range(n):
         s = b[i]
         for k in range(skyline[i], i):
@@ -409,7 +428,7 @@ def forward(L, skyline, b, n):
 
 @internal_kernel
 def backward(L, skyline, b, n):
-    """b ← L⁻ᵀ b."""
+    """Compute b ← L⁻ᵀ b."""
     for i in range(n - 1, -1, -1):
         b[i] /= L[i, i]
         for k in range(skyline[i], i):
@@ -418,10 +437,21 @@ def backward(L, skyline, b, n):
 
 @internal_kernel
 def nonnegative(work: Work, G, h, x, known, m):
-    """x ≥ 0 that minimises ½ xᵀGx − hᵀx, by Lawson and Hanson's active sets.
+    """Minimise ½ xᵀGx − hᵀx over x ≥ 0 with the active-set method of Lawson and Hanson.
 
-    G: (m, m) positive semidefinite, with room for a little on its diagonal.
-    known : the first so many are the solution without the others, and those above zero are marked in ``work.passive``
+    Parameters
+    ----------
+    work : Work
+        Workspace.
+    G : (m, m) ndarray
+        Positive semidefinite matrix with a small positive diagonal.
+    h, x : (m,) ndarray
+        Linear term, and the solution.
+    known : int
+        Number of leading entries of x that solve the problem without the other entries; ``work.passive`` marks the
+        positive entries.
+    m : int
+        Number of unknowns.
     """
     passive, small, right, index, skyline = work.passive, work.small, work.small_right, work.index, work.small_skyline
     scale, count, done = 1e-300, 0, 0
@@ -478,8 +508,11 @@ def nonnegative(work: Work, G, h, x, known, m):
 
 
 @internal_kernel
-def least_heat(arm: Arm, work: Work, least, f, e):
-    """Normal forces of least heat of instant e, (c,), at least ``least``; its torques are those without forces."""
+def least_heat(arm: Arm, work: Work, min_force, f, e):
+    """Compute the normal forces of least heat at instant e, shape (c,), from its torques without forces.
+
+    The forces are at least ``min_force`` [N].
+    """
     n, c = work.by_f.shape[1], work.by_f.shape[2]
     G, h, x = work.dual, work.dual_right, work.multiplier
     for i in range(c):
@@ -494,25 +527,25 @@ def least_heat(arm: Arm, work: Work, least, f, e):
         for j in range(n):
             s -= arm.heat[j] * work.by_f[e, j, i] * work.torque[e, j]
         for k in range(c):
-            s -= G[i, k] * least
+            s -= G[i, k] * min_force
         h[i] = s
     nonnegative(work, G, h, x, 0, c)
     for i in range(c):
-        f[i] = least + x[i]
+        f[i] = min_force + x[i]
 
 
 @kernel
-def settle(arm: Arm, points: Points, course: Course, work: Work, Q, F, least, forces):
-    """See :func:`statics`."""
-    statics(arm, points, course, work, Q, F, least, forces)
+def evaluate(arm: Arm, points: Points, course: Course, work: Work, Q, F, min_force, forces):
+    """Compiled entry point of :func:`statics`."""
+    statics(arm, points, course, work, Q, F, min_force, forces)
 
 
 @internal_kernel
 def costs(arm: Arm, course: Course, work: Work, Q, peak):
-    """Cost and heat [W] of the torques in the workspace; weights and pull of the cost's quadratic model.
+    """Compute cost and heat [W] of the torques in the workspace, and ``weight`` and ``pull`` of the quadratic model.
 
-    Torques near their limits are dear; ``peak`` : cost of the greatest torque of revolute joints [W/(N m)], by a mean
-    of high power. Forces of prismatic joints are no torques.
+    Torques near their limits have an extra cost. ``peak`` is the cost of the maximum torque of revolute joints
+    [W/(N m)], approximated by a power mean; forces of prismatic joints are excluded.
     """
     E, n = work.torque.shape
     heat, cost, largest, mean, revolute = 0.0, 0.0, 0.0, 0.0, 0
@@ -528,9 +561,9 @@ def costs(arm: Arm, course: Course, work: Work, Q, peak):
             work.weight[e, j], work.pull[e, j] = w, w * torque
             over = abs(torque) - NEAR_LIMIT * arm.greatest[j]
             if over > 0.0:
-                cost += share * DEAR * w * over * over
-                work.weight[e, j] += DEAR * w
-                work.pull[e, j] += DEAR * w * math.copysign(over, torque)
+                cost += share * LIMIT_COST * w * over * over
+                work.weight[e, j] += LIMIT_COST * w
+                work.pull[e, j] += LIMIT_COST * w * math.copysign(over, torque)
             if peak > 0.0 and largest > 0.0 and not arm.prismatic[j]:
                 mean += (abs(torque) / largest) ** PEAK_POWER / (E * revolute)
     if mean > 0.0:
@@ -556,7 +589,7 @@ def costs(arm: Arm, course: Course, work: Work, Q, peak):
 
 @internal_kernel
 def copy(a, out):
-    """Entries of a matrix to another one."""
+    """Copy the entries of a matrix to another matrix."""
     for i in range(a.shape[0]):
         for j in range(a.shape[1]):
             out[i, j] = a[i, j]
@@ -564,7 +597,7 @@ def copy(a, out):
 
 @internal_kernel
 def constraint_rows(course: Course, points: Points, work: Work, k):
-    """Rates of hand and braces of knot k into ``work.rows``; how many."""
+    """Write the rates of hand and braces at knot k to ``work.rows``; return the number of rows."""
     c, n, h = points.friction.shape[0], work.rows.shape[1], work.hand.shape[1]
     for r in range(h):
         for j in range(n):
@@ -576,12 +609,24 @@ def constraint_rows(course: Course, points: Points, work: Work, k):
 
 
 @internal_kernel
-def put_back(arm: Arm, points: Points, course: Course, work: Work, Q, steps, tolerance, reach):
-    """Put the postures of all knots onto hand and braces, clear of the rest and within limits: least change.
+def project(arm: Arm, points: Points, course: Course, work: Work, Q, steps, tolerance, reach):
+    """Project the postures of all knots onto hand path and braces, clear of surfaces and within joint limits.
 
-    Damped Gauss–Newton's steps on what is violated. Returns what is left at the worst knot [m], up to the first
-    that fails.
-    ``reach`` : greatest step of a coordinate
+    Damped Gauss–Newton steps on the violated constraints keep the change small. Returns the residual of the worst knot
+    [m], up to the first knot that fails.
+
+    Parameters
+    ----------
+    arm, points, course, work
+        Tables and workspace.
+    Q : (K, n) ndarray
+        Postures at the knots [rad or m]; changed in place.
+    steps : int
+        Maximum number of steps per knot.
+    tolerance : float
+        Tolerance of the residual [m].
+    reach : float
+        Maximum step of a coordinate [rad or m].
     """
     n, c, P, h = arm.parent.shape[0], points.friction.shape[0], points.body.shape[0], work.hand.shape[1]
     rows, A, right = work.rows, work.normal_matrix, work.right
@@ -604,7 +649,7 @@ def put_back(arm: Arm, points: Points, course: Course, work: Work, Q, steps, tol
                     for j in range(n):
                         rows[m, j] = work.gap_rate[k, i, j]
                     right[m] = short + 0.5 * tolerance
-                    # Slack: what scrapes by a rounding is clear.
+                    # A point that is too close only by rounding counts as clear.
                     left = max(left, short - tolerance)
                     m += 1
             for j in range(n):
@@ -653,15 +698,16 @@ def put_back(arm: Arm, points: Points, course: Course, work: Work, Q, steps, tol
 
 @kernel
 def retract(arm: Arm, points: Points, course: Course, work: Work, Q, steps, tolerance, reach):
-    """See :func:`put_back`."""
-    return put_back(arm, points, course, work, Q, steps, tolerance, reach)
+    """Compiled entry point of :func:`project`."""
+    return project(arm, points, course, work, Q, steps, tolerance, reach)
 
 
 @internal_kernel
-def split(work: Work, k, m):
-    """Orthonormal columns of which the last keep the m rows of ``work.rows``, into ``work.basis``; how many last.
+def null_space(work: Work, k, m):
+    """Write an orthonormal basis to ``work.basis`` whose last columns span the null space of m rows of ``work.rows``.
 
-    Householder's reflections on the rows, those with the most left first; rows that others imply are left out.
+    Householder reflections with pivoting on the rows; dependent rows are skipped. Returns the number of null-space
+    columns.
     """
     rows, Z, u = work.rows, work.basis[k], work.g
     n = rows.shape[1]
@@ -708,13 +754,13 @@ def split(work: Work, k, m):
     return n - rank
 
 
-# Kinds of constraints of a step.
+# Kinds of step constraints.
 CLEAR, LOWER, UPPER, FORCE = 0, 1, 2, 3
 
 
 @internal_kernel
 def unknowns(work: Work):
-    """How many unknowns a step has."""
+    """Return the number of unknowns of a step."""
     last = work.start.shape[0] - 1
     N = work.start[last] + work.free[last]
     for e in range(work.pressed.shape[0]):
@@ -723,8 +769,8 @@ def unknowns(work: Work):
 
 
 @internal_kernel
-def taken_in(arm: Arm, points: Points, work: Work, m, before, kind, at, which, value, bound):
-    """How many constraints the step has with one that it violates: as column m its normal over the unknowns."""
+def add_violated(arm: Arm, points: Points, work: Work, m, before, kind, at, which, value, bound):
+    """Add a violated constraint of the step as column m of ``work.normals``; return the new number of constraints."""
     if value >= bound - 1e-9 or m == work.bound.shape[0]:
         return m
     for i in range(before):
@@ -751,8 +797,8 @@ def taken_in(arm: Arm, points: Points, work: Work, m, before, kind, at, which, v
 
 
 @internal_kernel
-def moved(arm: Arm, work: Work, x, k, j):
-    """Change of coordinate j of knot k by a step x of the unknowns."""
+def coordinate_change(arm: Arm, work: Work, x, k, j):
+    """Return the change of coordinate j at knot k for a step x of the unknowns."""
     first, z = arm.parent.shape[0] - work.free[k], 0.0
     for d in range(work.free[k]):
         z += work.basis[k, j, first + d] * x[work.start[k] + d]
@@ -761,7 +807,7 @@ def moved(arm: Arm, work: Work, x, k, j):
 
 @internal_kernel
 def prepare(arm: Arm, points: Points, course: Course, work: Work, Q, damping):
-    """Matrix and gradient of Gauss and Newton's model, over what hand and braces leave free of each knot, and forces.
+    """Compute matrix and gradient of the Gauss–Newton model in the null space of hand and braces, and in the forces.
 
     Returns the number of unknowns.
     """
@@ -769,10 +815,10 @@ def prepare(arm: Arm, points: Points, course: Course, work: Work, Q, damping):
     n, c = arm.parent.shape[0], points.friction.shape[0]
     K, E = Q.shape[0], course.knot.shape[0]
     H, g, B, column, start = work.H, work.g, work.B, work.column, work.start
-    # Unknowns that meet in the model are near each other, so that its matrix is a band.
+    # Coupled unknowns are close to each other, so that the matrix is banded.
     N, behind = 0, 0
     for k in range(K):
-        work.free[k] = split(work, k, constraint_rows(course, points, work, k))
+        work.free[k] = null_space(work, k, constraint_rows(course, points, work, k))
         start[k] = N
         N += work.free[k]
         while behind < E and course.knot[behind] == k:
@@ -842,10 +888,10 @@ def prepare(arm: Arm, points: Points, course: Course, work: Work, Q, damping):
 
 
 @internal_kernel
-def taken_along(work: Work, N, before, m):
-    """The dual problem's rows of constraints from ``before`` on, of m, whose normals become L⁻¹ times them.
+def add_dual_rows(work: Work, N, before, m):
+    """Add rows ``before`` to m − 1 of the dual problem and multiply the normals of these constraints by L⁻¹.
 
-    By rows of the normals, whose ends the compiler takes several at once of; most of their beginnings are zero.
+    The loop is over rows of the normals, which the compiler can vectorise; most of their leading entries are zero.
     """
     L, normals, dual, right = work.H, work.normals, work.dual, work.dual_right
     for a in range(before, m):
@@ -869,18 +915,18 @@ def taken_along(work: Work, N, before, m):
 
 
 @internal_kernel
-def step(arm: Arm, points: Points, course: Course, work: Work, Q, F, least, N):
-    """The step of least model value after :func:`prepare`, which keeps clearances, limits and least forces.
+def step(arm: Arm, points: Points, course: Course, work: Work, Q, F, min_force, N):
+    """Compute the step that minimises the model of :func:`prepare` within clearances, limits and minimum forces.
 
-    The matrix is factored in place. Constraints are taken in when a step violates them: dual problems
-    min ½ λᵀ A H⁻¹ Aᵀ λ − λ·(b − A x_0) of those so far. Returns twice the fall of the model, −g·x − λ·b; postures
-    change by ``work.change``.
+    The matrix is factorised in place. Violated constraints are added step by step, and the dual problem
+    min ½ λᵀ A H⁻¹ Aᵀ λ − λ·(b − A x_0) of the constraints so far is solved. The change of the postures is in
+    ``work.change``. Returns twice the decrease of the model, −g·x − λ·b.
     """
     n, c, P = arm.parent.shape[0], points.friction.shape[0], points.body.shape[0]
     K, E = Q.shape[0], course.knot.shape[0]
     H, g, x, skyline = work.H, work.g, work.x, work.skyline
     factor(H, skyline, 0, N)
-    # x_0 = −H⁻¹ g, kept as L⁻¹ of it.
+    # x holds −L⁻¹ g; the unconstrained step is x_0 = −H⁻¹ g = L⁻ᵀ x.
     for i in range(N):
         x[i] = -g[i]
     forward(H, skyline, x, N)
@@ -889,7 +935,7 @@ def step(arm: Arm, points: Points, course: Course, work: Work, Q, F, least, N):
     m = 0
     full = work.step
     for _ in range(12):
-        # The step L⁻ᵀ (x + Σ λ L⁻¹ a).
+        # The step is L⁻ᵀ (x + Σ λ L⁻¹ a).
         for i in range(N):
             full[i] = x[i]
             for a in range(m):
@@ -898,12 +944,12 @@ def step(arm: Arm, points: Points, course: Course, work: Work, Q, F, least, N):
         backward(H, skyline, full, N)
         for k in range(K):
             for j in range(n):
-                work.change[k, j] = moved(arm, work, full, k, j)
+                work.change[k, j] = coordinate_change(arm, work, full, k, j)
         before = m
         for e in range(E):
             for i in range(c):
-                value, slack = full[work.pressed[e] + i], least - F[e, i]
-                m = taken_in(arm, points, work, m, before, FORCE, e, i, value, slack)
+                value, slack = full[work.pressed[e] + i], min_force - F[e, i]
+                m = add_violated(arm, points, work, m, before, FORCE, e, i, value, slack)
         for k in range(K):
             for i in range(c, P):
                 slack = min(points.margin[i] - work.gap[k, i], 0.0)
@@ -912,14 +958,14 @@ def step(arm: Arm, points: Points, course: Course, work: Work, Q, F, least, N):
                 z = 0.0
                 for j in range(n):
                     z += work.gap_rate[k, i, j] * work.change[k, j]
-                m = taken_in(arm, points, work, m, before, CLEAR, k, i, z, slack)
+                m = add_violated(arm, points, work, m, before, CLEAR, k, i, z, slack)
             for j in range(n):
                 z, low, high = work.change[k, j], arm.lower[j] - Q[k, j], arm.upper[j] - Q[k, j]
-                m = taken_in(arm, points, work, m, before, LOWER, k, j, z, min(low, 0.0))
-                m = taken_in(arm, points, work, m, before, UPPER, k, j, -z, -max(high, 0.0))
+                m = add_violated(arm, points, work, m, before, LOWER, k, j, z, min(low, 0.0))
+                m = add_violated(arm, points, work, m, before, UPPER, k, j, -z, -max(high, 0.0))
         if m == before:
             break
-        taken_along(work, N, before, m)
+        add_dual_rows(work, N, before, m)
         nonnegative(work, work.dual, work.dual_right, work.multiplier, before, m)
     fall = 0.0
     for i in range(N):
@@ -930,14 +976,14 @@ def step(arm: Arm, points: Points, course: Course, work: Work, Q, F, least, N):
 
 
 @kernel
-def solve(arm: Arm, points: Points, course: Course, work: Work, Q, F, least, peak, turns, tolerance):
-    """Postures Q, (K, n), and forces F, (E, c), of least cost, in place, from postures near by.
+def solve(arm: Arm, points: Points, course: Course, work: Work, Q, F, min_force, peak, turns, tolerance):
+    """Minimise the cost over postures Q, shape (K, n), and forces F, shape (E, c), in place, from a nearby start.
 
-    Returns cost and heat [W] and steps taken; NaN where the start cannot be put onto path and surfaces.
+    Returns cost [W], heat [W] and number of steps; NaN if the start cannot be projected onto path and surfaces.
     """
-    if put_back(arm, points, course, work, Q, 60, ON, 2.0 * REACH / 3.0) > 2.0 * ON:
+    if project(arm, points, course, work, Q, 60, ON, 2.0 * REACH / 3.0) > 2.0 * ON:
         return math.nan, math.nan, 0
-    statics(arm, points, course, work, Q, F, least, True)
+    statics(arm, points, course, work, Q, F, min_force, True)
     cost, heat = costs(arm, course, work, Q, peak)
     damping, quiet, taken, ratio = DAMPING, 0, 0, 0.0
     scale = max(cost, 0.1)
@@ -947,7 +993,7 @@ def solve(arm: Arm, points: Points, course: Course, work: Work, Q, F, least, pea
         before = cost
         while damping < DAMPING_MAX:
             N = prepare(arm, points, course, work, Q, damping * scale + 1e-6)
-            fall = step(arm, points, course, work, Q, F, least, N)
+            fall = step(arm, points, course, work, Q, F, min_force, N)
             if not fall > 0.0 or fall < tolerance * 0.1 * max(cost, 1e-3):
                 break
             longest = 1e-300
@@ -958,8 +1004,8 @@ def solve(arm: Arm, points: Points, course: Course, work: Work, Q, F, least, pea
             for k in range(Q.shape[0]):
                 for j in range(Q.shape[1]):
                     trial[k, j] = Q[k, j] + share * work.change[k, j]
-            if put_back(arm, points, course, work, trial, 12, ON, 2.0 * REACH / 3.0) <= 2.0 * ON:
-                statics(arm, points, course, work, trial, forces, least, True)
+            if project(arm, points, course, work, trial, 12, ON, 2.0 * REACH / 3.0) <= 2.0 * ON:
+                statics(arm, points, course, work, trial, forces, min_force, True)
                 there, warmth = costs(arm, course, work, trial, peak)
                 if there < cost:
                     ratio = (cost - there) / (fall * share * (2.0 - share))
@@ -968,7 +1014,7 @@ def solve(arm: Arm, points: Points, course: Course, work: Work, Q, F, least, pea
                     copy(forces, F)
                     break
             damping *= 8.0
-            statics(arm, points, course, work, Q, F, least, False)
+            statics(arm, points, course, work, Q, F, min_force, False)
             costs(arm, course, work, Q, peak)
         if not cost < before:
             break
@@ -979,5 +1025,5 @@ def solve(arm: Arm, points: Points, course: Course, work: Work, Q, F, least, pea
         quiet = quiet + 1 if before - cost < tolerance * max(cost, 1e-3) else 0
         if quiet >= 2:
             break
-    statics(arm, points, course, work, Q, F, least, False)
+    statics(arm, points, course, work, Q, F, min_force, False)
     return cost, heat, taken

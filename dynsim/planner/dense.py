@@ -1,4 +1,4 @@
-"""Dense references of a plan: postures at many instants, on hand path and surfaces, with their heat."""
+"""Dense references of a plan: postures on hand path and surfaces at many instants, with their heat."""
 
 from __future__ import annotations
 
@@ -19,26 +19,38 @@ from dynsim.planner.compiled import ON
 from dynsim.planner.problem import FINAL_SLIP_SCALE, Candidate, Clear, Task, key
 from dynsim.scenario import build
 
-# Instants of one pass along the path, at least, beside two for each knot; and the most time between two [s].
+# Minimum number of instants per pass along the path (at least two per knot), and maximum time between instants [s].
 INSTANTS, SPACING = 50, 0.1
-# A hand slower than this is at rest [m/s].
-RESTS = 1e-2
-# Instants at which links are checked for contact with each other.
-LOOKS = 11
+# Hand speed below which the hand is at rest [m/s].
+REST_SPEED = 1e-2
+# Number of instants at which links are checked for contact with each other.
+CHECKS = 11
 
 
 @dataclass(frozen=True)
 class Dense:
-    """A plan's references and their statics.
+    """References of a plan with their statics.
 
     Attributes
     ----------
-    times : (T,) of the waypoints, over the whole path [s]; q: (T, n) [rad or m]
-    rests : whether the references begin and end at rest
-    fine : (M,) times at which the statics hold [s]
-    torques : (M, n) of the moved joints [N m; N of prismatic ones]; forces: (M, c) normal ones [N]
-    heat : mean of all motors [W]
-    peak_torque, peak_force : greatest of revolute joints [N m], and of prismatic ones [N]; None without such joints
+    times : (T,) ndarray
+        Times of the waypoints over the whole path [s].
+    q : (T, n) ndarray
+        Joint positions at the waypoints [rad or m].
+    rests : bool
+        Whether the references start and end at rest.
+    fine : (M,) ndarray
+        Times of the statics [s].
+    torques : (M, n) ndarray
+        Torques of the moved joints [N m, or N if prismatic].
+    forces : (M, c) ndarray
+        Normal forces of the braces [N].
+    heat : float
+        Mean heat of all motors [W].
+    peak_torque : float or None
+        Maximum torque of revolute joints [N m]; None without such joints.
+    peak_force : float or None
+        Maximum force of prismatic joints [N]; None without such joints.
     """
 
     times: Array
@@ -53,17 +65,35 @@ class Dense:
 
 
 def references(task: Task, braces: tuple[Candidate, ...], knots: Array, Q: Array, factor: int = 1) -> Dense | str:
-    """Dense references through postures at knots, (K, n); in words why there are none.
+    """Compute dense references through postures at knots.
 
-    A spline through the knots, every instant put back onto path and surfaces. The heat is that of
-    :func:`dynsim.compile.references.inverse_kinematics.pressing` along them, accelerations and losses included, with
-    all of the friction that a creeping brace feels. ``factor`` : so many times as many instants
+    The references are a spline through the knots, projected onto path and surfaces at every instant. Their heat is
+    computed with :func:`dynsim.compile.references.inverse_kinematics.pressing`, including accelerations and losses, and
+    with the full friction of a creeping brace.
+
+    Parameters
+    ----------
+    task : Task
+        Planning problem.
+    braces : tuple of Candidate
+        Braces of the plan.
+    knots : (K,) ndarray
+        Times of the knots [s].
+    Q : (K, n) ndarray
+        Postures at the knots [rad or m].
+    factor : int, optional
+        Factor on the number of instants.
+
+    Returns
+    -------
+    Dense or str
+        References with their statics, or the reason why they do not exist.
     """
     span = task.span
     count = factor * max(INSTANTS, int(np.ceil(span / SPACING)), 2 * (len(knots) - 1))
     half = np.linspace(0.0, span, count + 1)
     start, end = (np.linalg.norm(np.diff(task.targets(np.array(pair)), axis=0)) for pair in _ends(task.duration))
-    rests = bool(max(start, end) / 1e-4 < RESTS)
+    rests = bool(max(start, end) / 1e-4 < REST_SPEED)
     if task.kind == "closed":
         spline = CubicSpline(np.append(knots, span), np.vstack([Q, Q[:1]]), bc_type="periodic")
     elif rests or task.kind == "there_and_back":
@@ -72,11 +102,14 @@ def references(task: Task, braces: tuple[Candidate, ...], knots: Array, Q: Array
         spline = CubicSpline(knots, Q, bc_type="not-a-knot")
     q = reals(spline(half))
     single = task.problem(braces, 1)
-    for k, target in enumerate(task.wanted(half)):
+    for k, target in enumerate(task.hand_targets(half)):
         single.course.target[0] = target
         row = q[k : k + 1]
         if (left := single.retract(row, 20, 0.1 * ON)) > ON:
-            return f"between knots, at t = {half[k]:.3g} s, no posture near by keeps hand and braces ({left:.2g} m off)"
+            return (
+                f"at t = {half[k]:.3g} s, between two knots, hand and braces cannot be kept on path and surfaces "
+                f"(residual {left:.2g} m)"
+            )
     times = half
     if task.kind == "there_and_back":
         times, q = np.append(half, span + half[1:]), np.vstack([q, q[-2::-1]])
@@ -84,12 +117,12 @@ def references(task: Task, braces: tuple[Candidate, ...], knots: Array, Q: Array
 
 
 def _ends(duration: float) -> tuple[tuple[float, float], tuple[float, float]]:
-    """The first and the last tenth of a millisecond of a path."""
+    """Return the first and last 0.1 ms of a path [s]."""
     return (0.0, 1e-4), (duration - 1e-4, duration)
 
 
 def contacts(task: Task, braces: tuple[Candidate, ...]) -> Mapping[str, Contact]:
-    """Braces as contacts, by name."""
+    """Return the braces as named contacts."""
     surfaces = build.surfaces(task.scenario)
     return {
         b.name: Contact(
@@ -100,7 +133,7 @@ def contacts(task: Task, braces: tuple[Candidate, ...]) -> Mapping[str, Contact]
 
 
 def statics(task: Task, braces: tuple[Candidate, ...], times: Array, q: Array, rests: bool) -> Dense | str:
-    """What references cost, see :func:`references`."""
+    """Compute the statics of references; see :func:`references`."""
     arm, model = task.arm, task.arm.model
     spacing = getattr(task.scenario.controller, "knot_spacing_s", 0.02)
     fine = np.linspace(0.0, task.duration, max(int(np.ceil(task.duration / spacing)), 6) + 1)
@@ -118,10 +151,10 @@ def statics(task: Task, braces: tuple[Candidate, ...], times: Array, q: Array, r
     try:
         planner, tables = pressing(model, fine, whole, rates, placed, task.options.min_N, FINAL_SLIP_SCALE)
     except ModelError as error:
-        return f"between knots the postures jump: {error}"
+        return f"the postures jump between knots: {error}"
     torques, forces, solved = planner.least_heat(whole, rates, accelerations, tables)
     if solved < len(fine):
-        return f"at t = {fine[solved]:.3g} s no forces within friction cones and limits of the motors carry the motion"
+        return f"at t = {fine[solved]:.3g} s the motion needs forces beyond the friction cones or the motor limits"
     weights = planner.arrays.motors[:, kb.HEAT]
     heat = float(np.trapezoid(torques**2 @ weights, fine) / task.duration)
     moved = torques[:, list(arm.links)]
@@ -133,9 +166,31 @@ def statics(task: Task, braces: tuple[Candidate, ...], times: Array, q: Array, r
 def nearest(
     task: Task, braces: tuple[Candidate, ...], times: Array, q: Array, shift: Array | None = None
 ) -> tuple[float, str, float]:
-    """Least distance from a surface of what is not braced, over what it may be: (distance [m], what, when [s]).
+    """Find the smallest distance of an unbraced point from a surface.
 
-    Links both of whose ends are braced may lie on the surface. ``shift`` : of all surfaces, (3,) [m]
+    Links with both ends braced may rest on the surface.
+
+    Parameters
+    ----------
+    task : Task
+        Planning problem.
+    braces : tuple of Candidate
+        Braces of the plan.
+    times : (T,) ndarray
+        Times [s].
+    q : (T, n) ndarray
+        Joint positions [rad or m].
+    shift : (3,) ndarray, optional
+        Displacement of all surfaces [m].
+
+    Returns
+    -------
+    distance : float
+        Smallest distance [m].
+    part : str
+        Point and surface; empty if there are no points.
+    time : float
+        Time [s].
     """
     best = (np.inf, "", 0.0)
     robot, arm = task.arm.model.robot, task.arm
@@ -162,11 +217,11 @@ def nearest(
 
 
 def touching_links(task: Task, times: Array, q: Array) -> str:
-    """In words which links that are no neighbours would touch each other, and when; empty: none.
+    """Check at some instants of the first pass whether links touch each other, except neighbours.
 
-    At some instants of the first pass.
+    Returns a text with the links and the time; empty if none touch.
     """
-    chosen = np.unique(np.linspace(0, np.searchsorted(times, task.span), LOOKS).astype(int))
+    chosen = np.unique(np.linspace(0, np.searchsorted(times, task.span), CHECKS).astype(int))
     arm, links = task.arm, task.arm.model.robot.links
     ends = axis_ends(arm.model.robot)
     segments = [(k, end) for k, i in enumerate(arm.links) for end in ends[links[i].name] if np.linalg.norm(end) > 1e-9]
@@ -179,7 +234,7 @@ def touching_links(task: Task, times: Array, q: Array) -> str:
             lines[t, m] = p, p + R @ end
     a, b = np.triu_indices(len(segments), 1)
     first, second = lines[:, a], lines[:, b]
-    # Neighbours share a joint, and those over a link without length do.
+    # Neighbours share a joint, also across a link of zero length.
     apart = np.linalg.norm(first[:, :, :, None] - second[:, :, None], axis=-1).min(axis=(0, 2, 3)) > 1e-9
     joints = np.array([k for k, _ in segments])
     parents = arm.tables.parent[joints]
@@ -191,11 +246,11 @@ def touching_links(task: Task, times: Array, q: Array) -> str:
     t = int(touching.any(axis=1).argmax())
     pair = int(touching[t].argmax())
     names = [links[arm.links[joints[side[pair]]]].name for side in (a, b)]
-    return f"{names[0]} and {names[1]} would touch each other at t = {times[chosen[t]]:.3g} s"
+    return f"{names[0]} and {names[1]} touch each other at t = {times[chosen[t]]:.3g} s"
 
 
 def _segment_distances(first: Array, second: Array) -> Array:
-    """Of pairs of segments, (…, 2, 3), [m], (…) (Ericson, Real-Time Collision Detection, 5.1.9)."""
+    """Return the distances [m] between pairs of segments, (…, 2, 3) (Ericson, Real-Time Collision Detection, 5.1.9)."""
     u, v, w = (
         first[..., 1, :] - first[..., 0, :],
         second[..., 1, :] - second[..., 0, :],

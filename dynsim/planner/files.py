@@ -1,6 +1,6 @@
-"""Files of a brace plan and their writing: plan.json, plan.yaml, plan_table.csv and .json, figures, view.html.
+"""Output files of a brace plan: plan.json, plan.yaml, plan_table.csv and .json, figures and view.html.
 
-plan.yaml is a scenario that runs. Figures and view.html are drawn by :mod:`dynsim.planner.pictures`.
+plan.yaml is a runnable scenario. :mod:`dynsim.planner.pictures` draws the figures and view.html.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ PLAN_FILES = ("plan.json", "plan.yaml", "plan_table.csv", "plan_table.json", "vi
 
 
 def check_plan_folder(folder: Path) -> None:
-    """Raise, before planning starts, if the files of a plan cannot be written to the folder."""
+    """Raise an error before planning starts if the files of a plan cannot be written to the folder."""
     check_writable(folder, PLAN_FILES)
 
 
 def save_plan(plan: BracePlan, folder: Path, figures: bool = True, kind: str = "png") -> None:
-    """Write the files of a plan to a folder, in place of those of an earlier plan there.
+    """Write the files of a plan to a folder and replace the files of an earlier plan.
 
-    A plan without an answer has plan.json and the tables only; without ``figures`` there is no view.html either. What
-    an earlier plan left of the others is removed, as it would not belong to the new numbers.
+    If no plan was found, only plan.json and the tables are written; without ``figures`` view.html is omitted. Other
+    files of an earlier plan are removed, because they would not match the new numbers.
     """
     folder.mkdir(parents=True, exist_ok=True)
     drawn = [folder / "view.html", *(folder / "figures").glob("plan_*")]
@@ -46,7 +46,7 @@ def save_plan(plan: BracePlan, folder: Path, figures: bool = True, kind: str = "
 
 
 def _csv(plan: BracePlan) -> str:
-    """The table with the columns of all its rows."""
+    """Return the table as CSV with the columns of all rows."""
     columns = list(dict.fromkeys(key for row in plan.table for key in row))
     text = io.StringIO()
     writer = csv.DictWriter(text, columns, restval="", lineterminator="\n")

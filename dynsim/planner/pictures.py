@@ -1,4 +1,4 @@
-"""Figures of a plan, and the page of the best plan beside the unbraced arm."""
+"""Figures of a plan, and a 3D page of the best plan next to the unbraced arm."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from dynsim.planner.problem import Task
 from dynsim.record import Record
 from dynsim.scenario import build
 
-# Instants of the first pass that the arm is drawn at.
+# Number of instants of the first pass at which the arm is drawn.
 POSES = 4
-# Grid points along each axis from which surfaces are drawn, and the margin of the grid around the arm [m].
+# Number of grid points per axis for drawing surfaces, and margin of the grid around the arm [m].
 GRID, BEYOND = 160, 0.15
 
 
 def draw_plan(plan: BracePlan, folder: Path, kind: str) -> None:
-    """Figures into ``figures/``, and ``view.html``."""
+    """Draw the figures to ``figures/``, and write ``view.html``."""
     draw_plan_figures(picture(plan), folder / "figures", kind)
     from dynsim.draw.page import content
 
@@ -32,7 +32,7 @@ def draw_plan(plan: BracePlan, folder: Path, kind: str) -> None:
 
 
 def _records(plan: BracePlan) -> dict[str, Record]:
-    """Runs of the best and of the unbraced plan, those that come to their ends."""
+    """Simulate the best and the unbraced plan; return their records, including the records of stopped runs."""
     shown: dict[str, Record] = {}
     best = plan.best
     for size in plan.answered:
@@ -47,12 +47,12 @@ def _records(plan: BracePlan) -> dict[str, Record]:
 
 
 def picture(plan: BracePlan) -> PlanPicture:
-    """What the figures of a plan show."""
+    """Return the data for the figures of a plan."""
     task, best = plan.task, plan.best
     assert best is not None
     heading = _heading(task)
     poses = _poses(task, best, heading)
-    path = _seen(task.targets(np.linspace(0.0, task.duration, 200)), heading)
+    path = _in_view(task.targets(np.linspace(0.0, task.duration, 200)), heading)
     points = np.vstack([path, *(line for pose in poses for line in pose.lines)])[:, [0, 2]]
     low, high = points.min(axis=0) - BEYOND, points.max(axis=0) + BEYOND
     along, up = np.linspace(low[0], high[0], GRID), np.linspace(low[1], high[1], GRID)
@@ -79,21 +79,21 @@ def picture(plan: BracePlan) -> PlanPicture:
 
 
 def _heading(task: Task) -> Array:
-    """Level unit vector from the arm's base to its path."""
+    """Return the horizontal unit vector from the arm's base to its path."""
     middle = task.targets(np.array([0.5 * task.span]))[0] - task.arm.tables.origin[0]
     middle[2] = 0.0
     size = float(np.linalg.norm(middle))
     return middle / size if size > 1e-9 else np.array([1.0, 0.0, 0.0])
 
 
-def _seen(points: Array, heading: Array) -> Array:
-    """Points (T, 3) along the heading, to the left of it, and up."""
+def _in_view(points: Array, heading: Array) -> Array:
+    """Convert points, shape (T, 3), to coordinates along the heading, to its left, and up [m]."""
     left = np.array([-heading[1], heading[0], 0.0])
     return np.stack([points @ heading, points @ left, points[..., 2]], axis=-1)
 
 
 def _poses(task: Task, size: Size, heading: Array) -> list[Pose]:
-    """The arm at some instants of the first pass."""
+    """Return the arm at some instants of the first pass."""
     arm, model, dense = task.arm, task.arm.model, size.dense
     ends, surfaces = axis_ends(model.robot), build.surfaces(task.scenario)
     poses = []
@@ -105,12 +105,12 @@ def _poses(task: Task, size: Size, heading: Array) -> list[Pose]:
             R, p = model.body_pose(link, q)
             for end in ends[model.robot.links[link].name]:
                 if np.linalg.norm(end) > 1e-9:
-                    lines.append(_seen(np.array([p, p + R @ end]), heading))
+                    lines.append(_in_view(np.array([p, p + R @ end]), heading))
         points, forces = np.zeros((len(size.braces), 3)), np.zeros((len(size.braces), 3))
         now = min(round(dense.times[t] / dense.fine[1]), len(dense.fine) - 1)
         for k, brace in enumerate(size.braces):
             centre = model.point_position(brace.body, np.array(brace.point_m), q)
             normal = surfaces[brace.surface].normal(centre)
             points[k], forces[k] = centre - brace.radius * normal, dense.forces[now, k] * normal
-        poses.append(Pose(float(dense.times[t]), lines, _seen(points, heading), _seen(forces, heading)))
+        poses.append(Pose(float(dense.times[t]), lines, _in_view(points, heading), _in_view(forces, heading)))
     return poses

@@ -1,4 +1,4 @@
-"""A plan as a runnable scenario: initial posture, joint references, pressing braces, gains."""
+"""Plan as a runnable scenario: initial posture, joint references, pressing braces and gains."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from dynsim.planner.problem import Candidate, Task
 from dynsim.scenario import Scenario
 from dynsim.scenario.reading import scenario_from_resolved
 
-# Digits that waypoints are written with: a nanometre at the end of any arm.
+# Decimal places of the waypoints: accurate to a nanometre at the hand.
 DIGITS = 10
-# Gain of joints that press no brace [V/rad]: those whose lever is below this share of the greatest.
+# Gain of joints that press no brace [V/rad], and fraction of the largest lever below which a joint presses no brace.
 STIFF, FREE = 500.0, 0.05
-# Instants at which levers are compared.
-LOOKS = 12
+# Number of instants at which levers are compared.
+SAMPLES = 12
 # Keys of the controller that a plan replaces.
 REPLACED = (
     "hand",
@@ -35,38 +35,38 @@ BILATERAL_ONLY = ("slip_smoothing_m_s", "pulling_friction")
 
 
 def method(task: Task) -> str:
-    """How plans are integrated.
+    """Return the integration method for plans.
 
-    Braces that stick at the turning points of a path, several at once, may open and close without end where events are
-    located; heats of both methods agree to 1e-4. A base that tips is an event.
+    If several braces stick at the turning points of a path, an event-driven method may open and close them endlessly.
+    The heats of both methods agree to 1e-4. A mobile base requires events, to detect tipping.
     """
     return "time_stepping" if task.arm.model.robot.base is None else "auto"
 
 
 def damping_gain(k_p: float) -> float:
-    """k_d [V s/rad] that goes with k_p [V/rad]: that of the published arm (500 and 20), over the root of the ratio."""
+    """Return k_d [V s/rad] for k_p [V/rad], scaled from the published arm (500 and 20) with the square root of k_p."""
     return 20.0 * float(np.sqrt(k_p / 500.0))
 
 
 def stiffness_gains(task: Task, braces: tuple[Candidate, ...], dense: Dense, k_p: float) -> Array:
-    """k_p of each moved joint, (n,): ``k_p`` where it presses braces onto their surfaces, else at least STIFF.
+    """Return k_p of each moved joint, shape (n,): ``k_p`` for joints that press braces, otherwise at least STIFF.
 
-    A joint that moves no brace along its normal bears any error of the surface, however stiff: the yaw of an arm on a
-    floor, and joints beyond the last brace. They hold the hand where soft ones would let it go.
+    A joint that moves no brace along the normal tolerates any error of the surface at any stiffness, e.g. the yaw of
+    an arm on a floor, and joints beyond the last brace. With low gains these joints would not hold the hand in place.
     """
     if not braces:
         return np.full(task.arm.n, k_p)
     problem, none = task.problem(braces, 1), np.zeros((1, len(braces)))
     pressing = np.zeros(task.arm.n)
-    for row in dense.q[:: max(len(dense.q) // LOOKS, 1)]:
+    for row in dense.q[:: max(len(dense.q) // SAMPLES, 1)]:
         problem.evaluate(row[None].copy(), none)
         rates = np.abs(problem.work.gap_rate[0, : len(braces)])
         pressing = np.maximum(pressing, (rates / rates.max(axis=1, keepdims=True)).max(axis=0))
     return np.where(pressing > FREE, k_p, max(k_p, STIFF))
 
 
-def common(task: Task) -> dict[str, Any]:
-    """What all plans of a scenario share: the scenario without what they replace."""
+def shared_sections(task: Task) -> dict[str, Any]:
+    """Return the part that all plans of a scenario share: the scenario without the keys that plans replace."""
     data = dict(task.scenario.resolved)
     data["name"] = f"{task.scenario.name}_plan"
     data.pop("variant", None)
@@ -86,8 +86,8 @@ def common(task: Task) -> dict[str, Any]:
     return data
 
 
-def particular(task: Task, braces: tuple[Candidate, ...], dense: Dense, k_p: float) -> dict[str, Any]:
-    """What is of one plan alone."""
+def plan_sections(task: Task, braces: tuple[Candidate, ...], dense: Dense, k_p: float) -> dict[str, Any]:
+    """Return the sections of one plan."""
     arm = task.arm
     joints = {}
     for name, link, column in zip(arm.joints, arm.links, dense.q.T, strict=True):
@@ -126,7 +126,7 @@ def particular(task: Task, braces: tuple[Candidate, ...], dense: Dense, k_p: flo
 
 
 def merged(shared: dict[str, Any], own: dict[str, Any], variant: str = "") -> dict[str, Any]:
-    """A whole scenario from both."""
+    """Combine the shared part and the sections of one plan to a complete scenario."""
     return {
         **shared,
         **({"variant": variant} if variant else {}),
@@ -144,7 +144,7 @@ def scenario(
     variant: str = "",
     more: Mapping[str, Any] | None = None,
 ) -> Scenario:
-    """The plan as a scenario; ``more``: sections on top."""
+    """Return the plan as a scenario; ``more`` has additional sections."""
     return scenario_from_resolved(
-        merged(common(task), particular(task, braces, dense, k_p), variant) | dict(more or {})
+        merged(shared_sections(task), plan_sections(task, braces, dense, k_p), variant) | dict(more or {})
     )

@@ -1,4 +1,4 @@
-"""The planning problem: options, arm, surfaces, clearances, hand path, and points that may be braced."""
+"""Planning problem: options, arm, surfaces, clearances, hand path, and candidate points for braces."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from dynsim.planner.arm import MovingArm, Problem, axis_points, moving_arm, work
 from dynsim.planner.compiled import Course, Points
 from dynsim.scenario import Scenario, build
 
-# Weight of the bend of the postures along the path [W/rad²]: for uniqueness; no part of the cost that is reported.
+# Weight of the curvature of the postures along the path [W/rad²], for uniqueness; excluded from the reported cost.
 SMOOTHNESS = 1e-3
-# Where along links clearance is asked for, beside their ends.
+# Positions along links with a required clearance, in addition to the ends, as fractions of the length.
 ALONG = (0.33, 0.67)
-# Clearance of those points [m].
+# Clearance of these points [m].
 LINK_CLEARANCE = 2e-3
-# Slip [m/s] over which the friction that is charged grows to its value: a brace that creeps feels all of it, whatever
-# planned voltages, which must not ring, make of it. The search begins with smoother ones, for long steps and few local
-# optima.
+# Slip v_s [m/s] at which friction approaches its full value. The final value charges a creeping brace with the full
+# friction; planned voltages use a smoother friction, so that they do not oscillate. The search starts with larger
+# values, which allow long steps and have few local optima.
 FINAL_SLIP_SCALE, FINE_SLIP_SCALE, COARSE_SLIP_SCALE = 1e-3, 3e-3, 1e-2
-# Targets that differ by less are the same [m].
+# Maximum distance between equal targets [m].
 SAME = 1e-6
 
 Kind = Literal["there_and_back", "closed", "open"]
@@ -40,15 +40,24 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Candidate:
-    """A point that may be braced, in the frame of the link that carries it, and a surface that it may lean on.
+    """Candidate point for a brace, with a surface that it may use.
 
     Attributes
     ----------
-    name : of the point
-    body : link, or frame, as the scenario names it; point_m: in its frame [m]
-    joint, on_joint : index of the arm's joint that carries it, and the point in the frame of that link [m]
-    radius : of a sphere about the point, that touches [m]
-    surface : name
+    name : str
+        Name of the point.
+    body : str
+        Link or frame in the scenario.
+    point_m : tuple of float
+        Point in the frame of ``body`` [m].
+    joint : int
+        Index of the arm's joint that carries the point.
+    on_joint : (3,) ndarray
+        Point in the frame of this joint's link [m].
+    radius : float
+        Radius of the sphere around the point that touches [m].
+    surface : str
+        Name of the surface.
     """
 
     name: str
@@ -61,18 +70,33 @@ class Candidate:
 
     @property
     def location(self) -> tuple[str, tuple[float, float, float]]:
-        """The point, whatever it leans on: it can lean on one surface only."""
+        """Body and point, without the surface; a point can use only one surface at a time."""
         return self.body, self.point_m
 
     @property
     def label(self) -> str:
-        """Point and surface."""
+        """Name of point and surface."""
         return f"{self.name} on {self.surface}"
 
 
 class Clear(NamedTuple):
-    """A point that stays clear: index of its joint, point [m] in the frame of that joint's link, radius [m], least
-    distance [m], name, index of the surface."""
+    """Point that must stay clear of a surface.
+
+    Attributes
+    ----------
+    joint : int
+        Index of the joint that carries the point.
+    point : (3,) ndarray
+        Point in the frame of this joint's link [m].
+    radius : float
+        Radius of a sphere around the point [m].
+    margin : float
+        Minimum distance [m].
+    label : str
+        Name of point and surface.
+    surface : int
+        Index of the surface.
+    """
 
     joint: int
     point: Array
@@ -86,26 +110,37 @@ Key = tuple[int, int, tuple[float, ...]]
 
 
 def key(joint: int, surface: int, point: Array) -> Key:
-    """The same for the same point and surface, by indices of its joint and of the surface."""
+    """Return a key that is equal for equal points and surfaces, given the indices of joint and surface."""
     return joint, surface, tuple(point.round(9).tolist())
 
 
 @dataclass(frozen=True)
 class Options:
-    """What a designer may choose.
+    """Options of the planner.
 
     Attributes
     ----------
-    candidates : links, frames or declared contact points, ``first:last`` for all links from one to the other; empty:
-        all links beyond the second, and declared points
-    along : shares of the way along links that are candidates too, beside their joints
-    radius_m : of candidates; None: that of their links, and of declared points what they say
-    count : least and greatest number of braces
-    surfaces : that may be leaned on; empty: all
-    peak : cost of the greatest torque of revolute joints [W/(N m)]
-    clearance_m : of joints that are not braced; links between them must not touch
-    min_N : least normal force of a brace
-    starts : postures that the search begins with
+    candidates : tuple of str
+        Links, ranges of links ``first:last``, frames or declared contact points; empty: all links except the first
+        two, and all declared points.
+    along : tuple of float
+        Fractions of the link length with additional candidates, 0 to 1.
+    radius_m : float or None
+        Radius of the candidates [m]; None: the radius of the link or of the declared point.
+    count : tuple of int
+        Minimum and maximum number of braces.
+    surfaces : tuple of str
+        Surfaces that braces may use; empty: all.
+    peak : float
+        Cost of the maximum torque of revolute joints [W/(N m)].
+    clearance_m : float
+        Minimum distance of unbraced joints from surfaces [m]; links between joints must not touch.
+    min_N : float
+        Minimum normal force of a brace [N].
+    starts, seed : int
+        Number of search rounds, and seed of the random postures.
+    exhaustive : bool
+        Whether to try every set of candidates.
     """
 
     candidates: tuple[str, ...] = ()
@@ -123,7 +158,7 @@ class Options:
 
 @dataclass(frozen=True)
 class Task:
-    """A scenario as a planning problem."""
+    """Planning problem of a scenario."""
 
     scenario: Scenario
     options: Options
@@ -134,8 +169,8 @@ class Task:
     friction: float
 
     @property
-    def bare(self) -> list[str]:
-        """Names of candidates whose radius of zero nobody chose: it is that of their links."""
+    def without_radius(self) -> list[str]:
+        """Names of candidates that have radius zero because their link has no radius."""
         if self.options.radius_m is not None:
             return []
         declared = self.scenario.config.contacts.points
@@ -143,26 +178,26 @@ class Task:
 
     @cached_property
     def _known(self) -> dict[Any, Any]:
-        """Courses by their number of knots, points by their braces, and rooms by these numbers."""
+        """Cache: courses by number of knots, points by braces, and workspaces by problem size."""
         return {}
 
-    def _once(self, key: Any, make: Callable[[], T]) -> T:
-        """What is made when it is asked for first."""
+    def _cached(self, key: Any, make: Callable[[], T]) -> T:
+        """Return the cached value of a key; compute it on first use."""
         if key not in self._known:
             self._known[key] = make()
         return cast("T", self._known[key])
 
     @property
     def duration(self) -> float:
-        """Of the path [s]."""
+        """Duration of the path [s]."""
         return float(self.scenario.duration_s)
 
     def targets(self, times: Array) -> Array:
-        """Of the hand [m], (T, 3)."""
+        """Return the positions of the hand on its path, shape (T, 3) [m]."""
         return np.asarray(self.path.position(np.asarray(times, dtype=np.float64)), dtype=np.float64)
 
-    def wanted(self, times: Array) -> Array:
-        """Of the hand, (T, 3) [m]; with an orientation also the z and the x axis that its link has then, (T, 9)."""
+    def hand_targets(self, times: Array) -> Array:
+        """Return the targets of the hand, shape (T, 3) [m]; with an orientation also its z and x axis, (T, 9)."""
         targets, hand = self.targets(times), self.scenario.controller.hand
         if hand.orientation is None:
             return targets
@@ -172,11 +207,11 @@ class Task:
 
     @property
     def span(self) -> float:
-        """Time that the knots cover [s]: of a path there and back, half of it."""
+        """Time that the knots cover [s]: half of the duration for a path there and back."""
         return 0.5 * self.duration if self.kind == "there_and_back" else self.duration
 
     def times(self, count: int) -> Array:
-        """Of so many knots [s]."""
+        """Return the times of ``count`` knots [s]."""
         if count == 1:
             return np.array([0.5 * self.span])
         if self.kind == "closed":
@@ -185,7 +220,7 @@ class Task:
 
     @cached_property
     def clear(self) -> dict[Key, Clear]:
-        """Points that stay clear where they are not braced; of planes the ends of links are enough."""
+        """Points that must stay clear unless they are braced; for planes the ends of links are sufficient."""
         robot, arm = self.arm.model.robot, self.arm
         points: dict[Key, Clear] = {}
         rng = np.random.default_rng(0)
@@ -213,13 +248,13 @@ class Task:
         return points
 
     def _thickness(self, k: int) -> float:
-        """Radius about the beginning of a link: the larger one of those that meet there [m]."""
+        """Return the radius at the start of a link: the larger radius of the two adjacent links [m]."""
         links, parent = self.arm.model.robot.links, int(self.arm.tables.parent[k])
         own = links[self.arm.links[k]].radius
         return own if parent < 0 else max(own, links[self.arm.links[parent]].radius)
 
     def points(self, braces: Sequence[Candidate]) -> Points:
-        """Tables of braces, then of what stays clear."""
+        """Return the tables of the braces, followed by the points that must stay clear."""
         on = [self.arm.surfaces.index(b.surface) for b in braces]
         braced = {
             key(b.joint, s, b.on_joint): Clear(b.joint, b.on_joint, b.radius, 0.0, b.name, s)
@@ -236,11 +271,11 @@ class Task:
         )
 
     def course(self, count: int) -> Course:
-        """Knots and instants of so many knots: halfway between neighbours, with the chord for a velocity.
+        """Return ``count`` knots, and instants halfway between neighbouring knots with the chord as velocity.
 
-        So both are right to second order in the distance of knots. Slopes of a spline through the knots an optimiser
-        would make vanish there, and slide in between; chords with the posture of a knot let it save much of the
-        friction that there is, by joints that turn against each other.
+        Both are second-order accurate in the knot spacing. With the slopes of a spline the optimiser would make the
+        slip vanish at the knots and slide in between; with chords at the postures of the knots it would avoid much of
+        the real friction by joints that turn against each other.
         """
         times, closed = self.times(count), self.kind == "closed"
         pairs = [(k, (k + 1) % count) for k in range(count if closed else count - 1)] if count > 1 else []
@@ -257,7 +292,7 @@ class Task:
         else:
             bend = np.diff(np.eye(count), 2, axis=0)
         return Course(
-            target=reals(self.wanted(times)),
+            target=reals(self.hand_targets(times)),
             knot=integers(knot),
             blend=reals(blend),
             chord=reals(chord),
@@ -267,48 +302,53 @@ class Task:
         )
 
     def problem(self, braces: Sequence[Candidate], count: int, slip_scale: float = COARSE_SLIP_SCALE) -> Problem:
-        """Of one set of braces at so many knots; its targets are its own, its room that of all with as many braces."""
-        course = self._once(count, lambda: self.course(count))
-        points = self._once(tuple(braces), lambda: self.points(braces))
-        room = self._once((len(braces), len(points.body), count), lambda: workspace(self.arm.n, points, course))
+        """Return the problem for one brace set and ``count`` knots.
+
+        Its targets are private; its workspace is shared by all sets of the same size.
+        """
+        course = self._cached(count, lambda: self.course(count))
+        points = self._cached(tuple(braces), lambda: self.points(braces))
+        work = self._cached((len(braces), len(points.body), count), lambda: workspace(self.arm.n, points, course))
         course = course._replace(target=course.target.copy(), slip_scale=reals([slip_scale]))
-        return Problem(self.arm.tables, points, course, room, self.options.min_N, self.options.peak)
+        return Problem(self.arm.tables, points, course, work, self.options.min_N, self.options.peak)
 
 
 def task(scenario: Scenario, options: Options) -> Task:
-    """The planning problem of a scenario: its plant, surfaces, friction and the hand's path.
+    """Build the planning problem of a scenario from its plant, surfaces, friction and hand path.
 
     Raises
     ------
     ModelError
-        No arm with DC motors, no path of the hand, no surface, or candidates that there are not.
+        If the scenario has no arm with DC motors, no hand path or no surface, or a candidate does not exist.
     """
     robot = build.robot(scenario)
     model = Model(robot)
     surfaces = build.surfaces(scenario)
     if not surfaces and options.count[1] > 0:
-        raise ModelError("plan: the scenario has no surfaces to lean on; give it some, or ask for --count 0:0")
+        raise ModelError("plan: the scenario has no surfaces; add one, or use --count 0:0")
     hand = getattr(scenario.controller, "hand", None)
     if hand is None:
-        raise ModelError("plan: the scenario has no controller.hand.path, along which the arm could be planned")
+        raise ModelError("plan: the scenario has no controller.hand.path; add a path of the hand")
     path = families.build("path", hand.path, BuildContext(scenario.duration_s), HandPath)
     arm = moving_arm(model, surfaces)
     unknown = [name for name in options.surfaces if name not in surfaces]
     if unknown:
-        raise ModelError(f"plan: no surface {unknown[0]!r}; surfaces: {', '.join(surfaces) or 'none'}")
+        raise ModelError(f"plan: unknown surface {unknown[0]!r} (surfaces: {', '.join(surfaces) or 'none'})")
     chosen = options.surfaces or tuple(surfaces)
     candidates = _candidates(scenario, arm, options, chosen)
     if not candidates and options.count[1] > 0:
-        raise ModelError("plan: no candidates for braces; name links or contact points with --candidates")
+        raise ModelError("plan: no candidates for braces; list links or contact points in --candidates")
     points = len({candidate.location for candidate in candidates})
     if options.count[0] > points:
-        raise ModelError(f"plan: {options.count[0]} braces, but there are {points} points to brace; ask for fewer")
+        raise ModelError(
+            f"plan: {options.count[0]} braces requested, but only {points} candidates exist; lower --count"
+        )
     kind = _kind(path, scenario.duration_s)
     return Task(scenario, options, arm, path, kind, tuple(candidates), scenario.config.contacts.friction)
 
 
 def _kind(path: HandPath, duration: float) -> Kind:
-    """Whether a path comes back the way it went, or to where it began."""
+    """Return whether a path returns along itself, returns to its start, or is open."""
     times = np.linspace(0.0, duration, 33)
     there = np.asarray(path.position(times))
     if np.abs(there - there[::-1]).max() <= SAME and np.ptp(there, axis=0).max() > SAME:
@@ -317,7 +357,7 @@ def _kind(path: HandPath, duration: float) -> Kind:
 
 
 def _candidates(scenario: Scenario, arm: MovingArm, options: Options, surfaces: Sequence[str]) -> list[Candidate]:
-    """Points that may be braced, each with each surface that it may lean on."""
+    """Return the candidate points, each combined with each surface that it may use."""
     robot, declared = arm.model.robot, scenario.config.contacts.points
     links = [robot.links[i].name for i in arm.links]
     frames = [frame.name for frame in robot.frames if frame.body in links]
@@ -329,9 +369,9 @@ def _candidates(scenario: Scenario, arm: MovingArm, options: Options, surfaces: 
             continue
         for end in (first, last):
             if end not in links:
-                raise ModelError(f"plan: no link {end!r} in {text!r}; links: {', '.join(links)}")
+                raise ModelError(f"plan: unknown link {end!r} in {text!r} (links: {', '.join(links)})")
         if links.index(first) > links.index(last):
-            raise ModelError(f"plan: {text!r} begins after its end; write {last}:{first}")
+            raise ModelError(f"plan: the range {text!r} is reversed; write {last}:{first}")
         wanted += links[links.index(first) : links.index(last) + 1]
     if not wanted:
         wanted = [*declared, *links[2:]]
@@ -359,7 +399,7 @@ def _candidates(scenario: Scenario, arm: MovingArm, options: Options, surfaces: 
             continue
         if name not in links:
             known_names = ", ".join([*declared, *links, *frames])
-            raise ModelError(f"plan: no candidate {name!r}; contact points, links and frames: {known_names}")
+            raise ModelError(f"plan: unknown candidate {name!r} (contact points, links and frames: {known_names})")
         k = links.index(name)
         radius = robot.links[arm.links[k]].radius
         parent = int(arm.tables.parent[k])

@@ -1,8 +1,8 @@
-"""Search over sets of braces, grown one brace at a time from the best smaller sets.
+"""Search over sets of braces that grow by one brace at a time from the best smaller sets.
 
-For each number of braces, sets are solved at one posture of the path without slip, the best of them at a few knots with
-slip; the best of these get one more brace. A set without a solution is "not found", not "impossible": the solver starts
-from postures of other sets.
+For each number of braces, all sets are solved at one posture of the path without slip, and the best sets at a few knots
+with slip; the best of these get one more brace. A set without a solution is "not found", not "impossible", because the
+solver starts from postures of other sets.
 """
 
 from __future__ import annotations
@@ -21,23 +21,23 @@ from dynsim.planner.arm import Local, solve
 from dynsim.planner.dense import Dense, references, touching_links
 from dynsim.planner.problem import COARSE_SLIP_SCALE, FINAL_SLIP_SCALE, FINE_SLIP_SCALE, Candidate, Task
 
-# Sets of each size that go on from the cheap problem, and from the one with slip.
+# Number of sets per size that continue to the next stage and to the next size.
 BEAM = 3
-# Postures that a round begins with, and random ones that are tried for them.
+# Number of start postures per round, and maximum number of random postures tried to find them.
 POSTURES, DRAWS = 4, 60
-# Standard deviation of their joints, drawn from so much to so much [rad]; of prismatic ones [m].
+# Range of the standard deviation of random joint angles [rad], and standard deviation of prismatic joints [m].
 SPREAD, PRISMATIC_SPREAD = (0.3, 1.5), 0.2
-# Sets of each size and round that whole paths are made for, and those that are made finer in the end.
+# Number of sets per size and round that are solved along the whole path, and per size that are refined at the end.
 PATHS, KEPT = 4, 3
-# Sets of each size whose neighbours are tried along the whole path.
+# Number of sets per size whose neighbours are tried along the whole path.
 NEIGHBOURS = 5
-# Beyond that ratio to the least cost of its size a neighbour is not followed.
+# Maximum ratio of a neighbour's cost to the least cost of its size.
 PROMISING = 1.25
-# Costs of one set that differ by less, as a share, are of one path, and paths beyond that ratio to the least are none
-# that could become the best; so many of a set are made finer.
+# Relative difference below which two costs of a set belong to the same path; maximum ratio of a path's cost to the
+# least cost for further refinement; maximum number of refined paths per set.
 SAME_COST, NEAR, ALTERNATIVES = 1e-3, 1.1, 6
-# Knots of whole paths, of closed ones and others; those of sets that are kept, and of the best, are doubled until there
-# are about so many, or dense references cost as much as the knots but for this factor.
+# Number of knots of closed and of other whole paths. For the sets that are kept, and for the best set, the knots are
+# doubled up to the next two numbers, or until the dense references cost less than the last factor times the knots.
 CLOSED_KNOTS, PATH_KNOTS, FINE_KNOTS, MOST_KNOTS, CONVERGED = 24, 17, 30, 60, 1.01
 
 Set = tuple[Candidate, ...]
@@ -46,7 +46,7 @@ Tell = Callable[[str, float], None]
 
 @dataclass(frozen=True)
 class Planned:
-    """A set of braces with the best postures found for it along the whole path."""
+    """Set of braces with its best postures along the whole path."""
 
     braces: Set
     times: Array
@@ -55,12 +55,12 @@ class Planned:
 
     @property
     def heat(self) -> float:
-        """Along the dense references [W]."""
+        """Mean heat along the dense references [W]."""
         return self.dense.heat
 
 
 class PosturePath(NamedTuple):
-    """Postures of a set at few knots, by their cost [W], and along the whole path: None, they do not reach."""
+    """Cost of a set at few knots [W], and its solution along the whole path; None if the path is out of reach."""
 
     coarse: float
     local: Local | None
@@ -68,15 +68,20 @@ class PosturePath(NamedTuple):
 
 @dataclass
 class Tally:
-    """What a search has done.
+    """Statistics of a search.
 
     Attributes
     ----------
-    solves : local problems solved
-    drawn, drawn_on : random postures tried, and those that could be put onto the path
-    reached, missed : sets for which a posture was found, and those for which none was
-    heats : by size, the best heat of each round along the path [W], by the knots; inf: none
-    refused : sets that have a path, and why they are none of the answer
+    solves : int
+        Number of local problems solved.
+    drawn, drawn_on : int
+        Number of random postures tried, and number that could be projected onto the path.
+    reached, missed : set
+        Sets with and without a posture.
+    heats : dict
+        Best heat of each round along the path at the knots [W], by number of braces; inf without a path.
+    refused : dict
+        Rejected sets, with the reason.
     """
 
     solves: int = 0
@@ -89,14 +94,14 @@ class Tally:
 
 
 class Search:
-    """A search with its problems, which are made once for each set."""
+    """Search over brace sets for one task."""
 
     def __init__(self, task: Task, tell: Tell | None = None) -> None:
         self.task, self.tally, self.kept = task, Tally(), KEPT
         self._tell = tell or (lambda text, share: None)
         self.single_heats: dict[Set, float] = {}
-        # By size, the least heat of a whole path by its knots [W], of rounds and exchanges.
-        self.least: dict[int, float] = {}
+        # Number of braces → least heat of a whole path at its knots [W], over rounds and exchanges.
+        self.least_heat: dict[int, float] = {}
         self._rng = np.random.default_rng(task.options.seed)
         self.coarse = 4 if task.kind == "closed" else 3
         self.path = CLOSED_KNOTS if task.kind == "closed" else PATH_KNOTS
@@ -104,12 +109,12 @@ class Search:
     def solve(
         self, braces: Set, start: Array, count: int, turns: int = 40, slip_scale: float = COARSE_SLIP_SCALE
     ) -> Local | None:
-        """Local optimum from postures at other knots, or from one posture."""
+        """Find the local optimum from postures at other knots, or from one posture."""
         self.tally.solves += 1
         return solve(self.task.problem(braces, count, slip_scale), self.spread(start, count), turns)
 
     def spread(self, start: Array, count: int) -> Array:
-        """Postures at so many knots, on lines between those given at others; (n,) or (K, n)."""
+        """Interpolate postures, shape (n,) or (K, n), linearly at ``count`` knots."""
         known = np.atleast_2d(start)
         if len(known) == 1 or count == 1:
             return reals(np.tile(known[len(known) // 2], (count, 1)))
@@ -119,7 +124,10 @@ class Search:
         return reals(np.stack([np.interp(wanted, times, column) for column in known.T], axis=1))
 
     def _starts(self, first: bool) -> list[Array]:
-        """Random postures with the hand in the middle of the path, clear of all surfaces; the initial one too."""
+        """Return random postures with the hand in the middle of the path, clear of all surfaces.
+
+        The first round also tries the initial posture.
+        """
         problem, postures = self.task.problem((), 1), list[Array]()
         arm = self.task.arm
         initial = arm.model.robot.initial[list(arm.columns)]
@@ -134,14 +142,14 @@ class Search:
         return postures
 
     def draw(self) -> Array:
-        """A random posture about the initial one, sometimes near it and sometimes far."""
+        """Draw a random posture around the initial posture, with a random spread."""
         tables, rng = self.task.arm.tables, self._rng
         initial = self.task.arm.model.robot.initial[list(self.task.arm.columns)]
         spread = np.where(tables.prismatic, PRISMATIC_SPREAD, rng.uniform(*SPREAD))
         return np.clip(initial + spread * rng.normal(size=len(spread)), tables.lower, tables.upper)
 
     def never_clear(self) -> list[str]:
-        """Points that come nearer to a surface than their clearance in each of some random postures."""
+        """Return the points that violate their clearance in all of some random postures."""
         problem, greatest = self.task.problem((), 1), np.full(len(self.task.clear), -np.inf)
         for _ in range(DRAWS):
             problem.evaluate(reals(self.draw())[None], np.zeros((1, 0)))
@@ -150,10 +158,10 @@ class Search:
         return [point.label for point, gap in zip(points, greatest, strict=True) if gap < point.margin]
 
     def run(self) -> dict[int, list[Planned]]:
-        """The best sets of each size with whole paths, by heat along their dense references; sizes may be empty.
+        """Search; return the best sets of each size, sorted by heat along their dense references.
 
-        Rounds are independent searches, each from postures of its own: how often they agree is what can be said of
-        the distance to the optimum.
+        The list of a size may be empty. Rounds are independent searches from different postures; how often they agree
+        is the only measure of the distance to the optimum.
         """
         least, most = self.task.options.count
         paths: dict[Set, list[PosturePath]] = {}
@@ -165,7 +173,7 @@ class Search:
                 self.tally.heats.setdefault(size, []).append(min(heats, default=math.inf))
         self._exchange(paths, most)
         for size in range(most + 1):
-            self.least[size] = min((local.heat for local, _ in self._best(paths, size)), default=math.inf)
+            self.least_heat[size] = min((local.heat for local, _ in self._best(paths, size)), default=math.inf)
         planned: dict[int, list[Planned]] = {}
         for size in range(least, most + 1):
             self._tell("refining", (rounds + size / (most + 1)) / (rounds + 1))
@@ -173,9 +181,9 @@ class Search:
         return planned
 
     def _path(self, known: list[PosturePath], cost: float, braces: Set, Q: Array) -> float:
-        """Heat of a whole path from postures at few knots [W], which is put among those known of its set.
+        """Solve a whole path from postures at few knots, add it to the known paths of its set, and return its heat [W].
 
-        Costs of few knots that are nearly the same belong to one path; those that are far from the least to none.
+        Nearly equal costs at few knots belong to the same path; a cost far above the least cost is ignored (inf).
         """
         if cost > NEAR * min((path.coarse for path in known), default=math.inf):
             return math.inf
@@ -187,9 +195,9 @@ class Search:
         return math.inf if local is None else local.heat
 
     def _exchange(self, paths: dict[Set, list[PosturePath]], most: int) -> None:
-        """Whole paths of the sets that the best ones become by a brace less, or by one more, until these are known.
+        """Solve whole paths of the neighbours of the best sets, with one brace less or more, until none are new.
 
-        Along the path sets rank otherwise than at few knots, and few of them are near a posture that was drawn.
+        Sets rank differently along the path than at few knots, and few sets are close to a random posture.
         """
         changes = [*((size, -1) for size in range(most, 1, -1)), *((size, 1) for size in range(most))]
         changed, going_on = set[tuple[Set, int, float]](), True
@@ -209,7 +217,7 @@ class Search:
                             least = min(least, local.cost)
 
     def _best(self, paths: Mapping[Set, list[PosturePath]], size: int) -> list[tuple[Local, Set]]:
-        """The best path of each set of a size, the best first."""
+        """Return the best path of each set of a size, sorted by cost."""
         best = [
             (min((path.local for path in some if path.local is not None), key=_cost), braces)
             for braces, some in paths.items()
@@ -218,7 +226,7 @@ class Search:
         return sorted(best, key=lambda item: item[0].cost)
 
     def _round(self, number: int, most: int) -> dict[int, list[tuple[float, Set, Array]]]:
-        """Sets of each size with cost and posture, the best first, from new starts."""
+        """Search from new start postures; return the sets of each size with cost and posture, sorted by cost."""
         starts = self._starts(first=number == 0)
         best: dict[int, list[tuple[float, Set, Array]]] = {}
         unbraced = [r for q in starts if (r := self.solve((), q, 1)) is not None]
@@ -236,14 +244,14 @@ class Search:
                 slipping += self._slipping(self._cheap(swaps, True), 2)
                 slipping.sort(key=lambda item: item[0])
             best[size] = slipping[:BEAM]
-            # Sets that a brace more leads along the path may have none there of their own.
+            # If no set of this size has a path, its best single postures still serve as starts of larger sets.
             front = [(braces, [Q[len(Q) // 2]]) for _, braces, Q in best[size]] or [
                 (braces, [cheap[braces].Q]) for braces in sorted(cheap, key=lambda braces: cheap[braces].cost)[:BEAM]
             ]
         return best
 
     def _cheap(self, sets: Mapping[Set, list[Array]], best: bool) -> dict[Set, Local]:
-        """Sets at one posture without slip, from postures: the best that these lead to, or any."""
+        """Solve sets at one posture without slip from start postures; keep the best or a random solution of each."""
         reached: dict[Set, Local] = {}
         for braces, postures in sets.items():
             tried = [r for q in postures if (r := self.solve(braces, q, 1, 25)) is not None]
@@ -259,7 +267,7 @@ class Search:
         return reached
 
     def _slipping(self, cheap: Mapping[Set, Local], count: int) -> list[tuple[float, Set, Array]]:
-        """The best of them at few knots with slip, the best first."""
+        """Solve the best ``count`` sets at few knots with slip; return them sorted by cost."""
         ranked = sorted(cheap.items(), key=lambda item: item[1].cost)[:count]
         solved = [
             (r.cost, braces, r.Q)
@@ -269,7 +277,7 @@ class Search:
         return sorted(solved, key=lambda item: item[0])
 
     def _grown(self, braces: Set) -> list[Set]:
-        """Sets with one brace more."""
+        """Return the sets with one more brace."""
         sets = [
             tuple(brace for brace in self.task.candidates if brace in braces or brace == new)
             for new in self.task.candidates
@@ -278,12 +286,12 @@ class Search:
         return [grown for grown in sets if _fits(grown)]
 
     def _swaps(self, braces: Set) -> list[Set]:
-        """Sets with one brace exchanged for another candidate."""
+        """Return the sets with one brace exchanged for another candidate."""
         left = combinations(braces, len(braces) - 1)
         return list(dict.fromkeys(grown for some in left for grown in self._grown(some) if grown != braces))
 
     def _sets(self, size: int, front: Sequence[tuple[Set, list[Array]]]) -> dict[Set, list[Array]]:
-        """Sets that grow from smaller ones, with postures to start from."""
+        """Return the sets that grow from smaller sets, with start postures."""
         sets: dict[Set, list[Array]] = {}
         if self.task.options.exhaustive:
             for chosen in combinations(self.task.candidates, size):
@@ -296,9 +304,9 @@ class Search:
         return sets
 
     def _whole(self, braces: Set, Q: Array, most: float = math.inf) -> Local | None:
-        """A whole path from postures at few knots, first with blunt friction, past where sharp friction would stop.
+        """Solve a whole path from postures at few knots, first with smooth friction, which has fewer local optima.
 
-        None too where it costs more than ``most`` there [W].
+        Returns None if there is no path, or if its cost with smooth friction exceeds ``most`` [W].
         """
         half = (self.path + 1) // 2
         local = self.solve(braces, Q, half, 30) or self._walked(braces, Q, half)
@@ -307,7 +315,7 @@ class Search:
         return self.solve(braces, local.Q, self.path, 30, FINE_SLIP_SCALE) or local
 
     def _refined(self, paths: Mapping[Set, list[PosturePath]]) -> list[Planned]:
-        """The best sets, their best paths at more knots, by the heat of their dense references."""
+        """Refine the best paths of the best sets with more knots; return them sorted by heat along dense references."""
         whole = {braces: sorted((p.local for p in some if p.local), key=_cost) for braces, some in paths.items()}
         reached = {braces: some for braces, some in whole.items() if some}
         planned = []
@@ -326,12 +334,12 @@ class Search:
                 planned.append(self._finest(min(good, key=lambda plan: plan.heat), FINE_KNOTS))
                 self.tally.refused.pop(braces, None)
         for braces in (braces for braces, some in paths.items() if some and braces not in reached):
-            self.tally.refused[braces] = "postures found, but none along the whole path"
+            self.tally.refused[braces] = "no solution along the whole path, only single postures"
         planned.sort(key=lambda plan: plan.heat)
         return [self._finest(plan, MOST_KNOTS) for plan in planned[:1]] + planned[1:]
 
     def _finer(self, braces: Set, coarse: Local, count: int) -> Planned | str:
-        """A path at more knots with its dense references; in words why hand and surfaces are not kept between them."""
+        """Solve a path with more knots and its dense references; return the reason as text if they are not feasible."""
         local = self.solve(braces, coarse.Q, count, 20, FINAL_SLIP_SCALE) or coarse
         times = self.task.times(len(local.Q))
         dense = references(self.task, braces, times, local.Q)
@@ -340,7 +348,7 @@ class Search:
         return touching_links(self.task, dense.times, dense.q) or Planned(braces, times, local, dense)
 
     def _finest(self, plan: Planned, most: int) -> Planned:
-        """Twice the knots until the dense references cost what the knots do, or there are ``most`` of them."""
+        """Double the knots until the dense references cost the same as the knots, up to ``most`` knots."""
         while plan.heat > CONVERGED * plan.local.heat and len(plan.times) < most:
             finer = self._finer(plan.braces, plan.local, 2 * len(plan.times) - (self.task.kind != "closed"))
             if isinstance(finer, str) or finer.heat >= plan.heat:
@@ -349,7 +357,7 @@ class Search:
         return plan
 
     def _walked(self, braces: Set, Q: Array, count: int) -> Local | None:
-        """A path from a posture in its middle, knot after knot: where all at once does not reach."""
+        """Solve a path knot by knot from a posture in the middle, if solving all knots at once fails."""
         whole = self.task.problem(braces, count)
         targets, middle = whole.course.target, count // 2
         single = self.task.problem(braces, 1)
@@ -370,10 +378,10 @@ def _cost(local: Local) -> float:
 
 
 def _fits(braces: Sequence[Candidate]) -> bool:
-    """Whether each point leans on one surface only."""
+    """Return whether each point uses only one surface."""
     return len({brace.location for brace in braces}) == len(braces)
 
 
 def _same(cost: float, other: float) -> bool:
-    """Whether two paths of one set are the same, by their costs."""
+    """Return whether two paths of a set have the same cost, and so are the same path."""
     return abs(cost - other) <= SAME_COST * other

@@ -1,4 +1,4 @@
-"""Verification of a plan by simulation: with planned and changed friction, and with displaced surfaces."""
+"""Verification of plans by simulation with planned and changed friction, and with displaced surfaces."""
 
 from __future__ import annotations
 
@@ -19,30 +19,40 @@ from dynsim.record.measures import hand_target
 from dynsim.scenario import Scenario
 from dynsim.studies.batch import simulate_batch
 
-# Share of a driver's current limit that counts as reached.
+# Fraction of a driver's current limit at which the limit counts as reached.
 AT_LIMIT = 0.999
-# A joint this close to its limit touches its stop [rad or m].
+# Distance from a joint limit at which the joint touches its stop [rad or m].
 AT_STOP = 1e-6
-# Depth beyond which a body that is no brace touches [m]; allows for sampling and the tolerance of references.
-SUNK = 1e-4
-# Most gains that are tried for each plan.
+# Depth beyond which an unbraced point touches a surface [m]; allows for sampling and the tolerance of references.
+DEPTH_MAX = 1e-4
+# Maximum number of gains tried per plan.
 TRIES = 3
-# Bisections of an error that a plan bears.
+# Number of bisections for the tolerated error.
 STEPS = 5
 
 
 @dataclass(frozen=True)
 class Tolerances:
-    """What corners are run, and what a plan that survives keeps there.
+    """Corners to simulate, and the limits that a plan must meet in all of them.
 
     Attributes
     ----------
-    friction : factors of μ; shift_m: of all surfaces upwards, against gravity [m]
-    heat : times the planned one
-    nominal : share of the planned heat by which the nominal run may exceed it
-    hand_m : root mean square of the hand's error beside the surface's [m]
-    turn_rad : root mean square of the angle between the hand's orientation and the one that is asked for
-    wall_s : longer than so a corner is refused [s]
+    friction : tuple of float
+        Factors on μ.
+    shift_m : tuple of float
+        Displacements of all surfaces upwards, against gravity [m].
+    heat : float
+        Maximum heat as a multiple of the planned heat.
+    nominal : float
+        Maximum excess of the heat in the nominal run, as a fraction of the planned heat.
+    hand_m : float
+        Maximum rms error of the hand, in addition to the displacement of the surface [m].
+    turn_rad : float
+        Maximum rms angle between the hand's orientation and its reference [rad].
+    wall_s : float
+        Maximum wall-clock time of a corner [s].
+    gains : tuple of float
+        Gains k_p to choose from, in decreasing order [V/rad].
     """
 
     friction: tuple[float, ...] = (1.0, 0.8, 1.2)
@@ -56,26 +66,39 @@ class Tolerances:
 
     @property
     def most_shift(self) -> float:
-        """Greatest error of the surfaces' height [m]."""
+        """Maximum error of the surface height [m]."""
         return max(map(abs, self.shift_m), default=0.0)
 
     @property
     def most_friction(self) -> float:
-        """Greatest error of friction, as a share."""
+        """Maximum relative error of friction."""
         return max((abs(factor - 1.0) for factor in self.friction), default=0.0)
 
 
 @dataclass(frozen=True)
 class Corner:
-    """A run away from the plan.
+    """Run with changed friction and surfaces.
 
     Attributes
     ----------
-    heat_W : mean; hand_rms_m: of the hand's error; NaN where the run ended early
-    electrical_J : energy that the motors take in the run; rate_max: greatest of a joint [rad/s, m/s]
-    turn_rms_rad : of the hand's orientation; NaN where any will do
-    closed : share of the time that each brace touches
-    reason : why it is refused, with time and quantity; empty: it survives
+    friction : float
+        Factor on μ.
+    shift_m : float
+        Displacement of all surfaces upwards [m].
+    heat_W : float
+        Mean heat [W]; NaN if the run ended early.
+    hand_rms_m : float
+        Rms error of the hand [m]; NaN if the run ended early.
+    electrical_J : float
+        Electrical energy of the motors [J].
+    rate_max : float
+        Maximum joint rate [rad/s or m/s].
+    turn_rms_rad : float
+        Rms error of the hand's orientation [rad]; NaN without a reference orientation.
+    closed : dict
+        Fraction of the time that each brace touches.
+    reason : str
+        Why the corner is rejected, with time and quantity; empty if it is accepted.
     """
 
     friction: float
@@ -90,54 +113,56 @@ class Corner:
 
     @property
     def label(self) -> str:
-        """Where it lies."""
+        """Friction factor and displacement as text."""
         return f"friction × {self.friction:g}, surfaces {1e3 * self.shift_m:+g} mm"
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """Corners of one plan with its gains; the first is the nominal one."""
+    """Corners of one plan with its gain; the first corner is the nominal run."""
 
     k_p: float
     corners: tuple[Corner, ...]
 
     @property
     def reason(self) -> str:
-        """Of the first corner that is refused."""
+        """Reason of the first rejected corner; empty if all are accepted."""
         return next((f"{c.label}: {c.reason}" for c in self.corners if c.reason), "")
 
     @property
     def survives(self) -> bool:
+        """Whether all corners are accepted."""
         return bool(self.corners) and not self.reason
 
     @property
     def sound(self) -> bool:
-        """Whether the run as planned holds."""
+        """Whether the nominal run is accepted."""
         return bool(self.corners) and not self.corners[0].reason
 
     @property
     def nominal(self) -> Corner | None:
+        """Nominal run; None without corners."""
         return self.corners[0] if self.corners else None
 
 
 class Verifier:
-    """Runs corners of the plans of one task, several at once."""
+    """Simulation of the corners of plans, several at a time."""
 
     def __init__(self, task: Task, tolerances: Tolerances, jobs: int = 1) -> None:
         self.task, self.tolerances, self.jobs = task, tolerances, jobs
 
     def verify(self, plans: Sequence[tuple[tuple[Candidate, ...], Dense]]) -> list[Verdict]:
-        """Of each plan the largest gains with which it survives, or what refuses it with the smallest tried.
+        """Return the verdict of each plan with the largest gain that survives, or with the last gain tried.
 
-        Statics say where to begin: pressed by δ, a brace's force changes by δ/(J K⁻¹ Jᵀ), K = K_m k_p/R. From there on
-        smaller gains are tried. The nominal run comes first; where it fails, no other is made.
+        Statics determine the first gain: a displacement δ changes the force of a brace by δ/(J K⁻¹ Jᵀ), K = K_m k_p/R.
+        Smaller gains follow. The nominal run is simulated first; if it fails, the other corners are skipped.
         """
         gains = self.tolerances.gains
         first, *others = [(mu, shift) for shift in self.tolerances.shift_m for mu in self.tolerances.friction]
         left = {}
         for number, (braces, dense) in enumerate(plans):
-            borne = [k_p for k_p in gains if self._bears(braces, dense, k_p)]
-            left[number] = (borne or [min(gains)])[: TRIES if braces else 1]
+            tolerated = [k_p for k_p in gains if self._tolerates(braces, dense, k_p)]
+            left[number] = (tolerated or [min(gains)])[: TRIES if braces else 1]
         verdicts: dict[int, Verdict] = {}
         while left:
             trial = {number: tried.pop(0) for number, tried in left.items()}
@@ -148,18 +173,18 @@ class Verifier:
             for k, n in enumerate(sound):
                 corners = corners_of_all[k * len(others) : (k + 1) * len(others)]
                 verdicts[n] = Verdict(trial[n], (*verdicts[n].corners, *corners))
-            # Where the nominal run fails, softer gains move it further away.
+            # If the nominal run fails, smaller gains make it worse.
             left = {n: tried for n, tried in left.items() if tried and n in sound and not verdicts[n].survives}
         return [verdicts[number] for number in range(len(plans))]
 
     def corners(
         self, braces: tuple[Candidate, ...], dense: Dense, k_p: float, corners: Sequence[tuple[float, float]]
     ) -> list[Corner]:
-        """Some corners of one plan, (factor of μ, shift [m])."""
+        """Simulate corners (factor on μ, displacement [m]) of one plan."""
         return self._runs([(braces, dense, k_p, corner) for corner in corners])
 
     def _runs(self, runs: Sequence[tuple[tuple[Candidate, ...], Dense, float, tuple[float, float]]]) -> list[Corner]:
-        """Corners of plans, several at once."""
+        """Simulate corners of several plans in parallel."""
         if not runs:
             return []
         scenarios = [self.perturbed(braces, dense, k_p, *corner) for braces, dense, k_p, corner in runs]
@@ -169,13 +194,13 @@ class Verifier:
             if result.record is None or not result.ok:
                 corners.append(Corner(mu, shift, reason=result.reason))
             else:
-                corners.append(self._judged(braces, dense, mu, shift, result.record))
+                corners.append(self._judge(braces, dense, mu, shift, result.record))
         return corners
 
     def perturbed(
         self, braces: tuple[Candidate, ...], dense: Dense, k_p: float, friction: float = 1.0, shift: float = 0.0
     ) -> Scenario:
-        """The plan's scenario with surfaces and friction that are not as planned."""
+        """Return the plan's scenario with changed friction and displaced surfaces."""
         more: dict[str, Any] = {}
         if friction != 1.0 or shift != 0.0:
             more["surface_error"] = {"shift_m": (shift * self._up).tolist(), "friction_factor": friction}
@@ -188,8 +213,8 @@ class Verifier:
         gravity = self.task.arm.model.robot.gravity
         return -gravity / np.linalg.norm(gravity)
 
-    def _bears(self, braces: tuple[Candidate, ...], dense: Dense, k_p: float) -> bool:
-        """Whether statics let the heat stay within what is allowed when surfaces are off by the most."""
+    def _tolerates(self, braces: tuple[Candidate, ...], dense: Dense, k_p: float) -> bool:
+        """Return whether, by statics, the heat stays within its limit at the maximum displacement of the surfaces."""
         worst = self.tolerances.most_shift
         if not braces or worst == 0.0:
             return True
@@ -215,8 +240,8 @@ class Verifier:
             hot += hottest
         return hot / len(rows) <= 1.2 * self.tolerances.heat * dense.heat
 
-    def _judged(self, braces: tuple[Candidate, ...], dense: Dense, mu: float, shift: float, record: Record) -> Corner:
-        """What a run shows, and the first thing that refuses it."""
+    def _judge(self, braces: tuple[Candidate, ...], dense: Dense, mu: float, shift: float, record: Record) -> Corner:
+        """Evaluate a run, and find the first reason to reject it."""
         tolerances, time = self.tolerances, record.time
         heat = float(record.summary["joule_heat_J"]) / float(time[-1])
         target = hand_target(record)
@@ -233,21 +258,22 @@ class Verifier:
             power = record["heat_joule"].ravel() if "heat_joule" in record else np.zeros(len(time))
             late = np.flatnonzero(power > tolerances.heat * dense.heat * np.maximum(time, 0.1 * time[-1]))
             since = float(time[late[0]]) if late.size else float(time[-1])
-            reason = (
-                f"{heat:.3g} W of heat, more than {tolerances.heat:g} × {dense.heat:.3g} W from t = {since:.3g} s on"
-            )
+            reason = f"heat of {heat:.3g} W exceeds {tolerances.heat:g} × {dense.heat:.3g} W from t = {since:.3g} s"
         elif mu == 1.0 and shift == 0.0 and heat > (1.0 + tolerances.nominal) * dense.heat:
-            # Less is no fault: plans charge all of the friction that a brace which creeps or sticks may have.
+            # Less heat is fine: the plan assumes full sliding friction even if a brace sticks.
             reason = (
-                f"{heat:.3g} W of heat, over {100 * tolerances.nominal:g} % more than the planned {dense.heat:.3g} W, "
-                "over the whole run"
+                f"heat of {heat:.3g} W over the whole run exceeds the planned {dense.heat:.3g} W by more than "
+                f"{100 * tolerances.nominal:g} %"
             )
         elif rms > allowed:
             k = int(error.argmax())
-            reason = f"hand off by {1e3 * rms:.3g} mm rms (allowed {1e3 * allowed:.3g} mm), most at t = {time[k]:.3g} s"
+            reason = f"hand error {1e3 * rms:.3g} mm rms (limit {1e3 * allowed:.3g} mm), maximum at t = {time[k]:.3g} s"
         elif turn > tolerances.turn_rad:
             k = int(record["hand_turn_error"].argmax())
-            reason = f"hand turned by {turn:.3g} rad rms (allowed {tolerances.turn_rad:g}), most at t = {time[k]:.3g} s"
+            reason = (
+                f"orientation error of the hand {turn:.3g} rad rms (limit {tolerances.turn_rad:g} rad), maximum at "
+                f"t = {time[k]:.3g} s"
+            )
         else:
             reason = self._touches(braces, record, shift) or self._limits(record)
         joints = self.task.arm.joints
@@ -256,18 +282,18 @@ class Verifier:
         return Corner(mu, shift, heat, rms, energy, rate, turn, closed, reason)
 
     def _touches(self, braces: tuple[Candidate, ...], record: Record, shift: float) -> str:
-        """What is not declared and would touch."""
+        """Return a text about an unbraced point that touches a surface; empty if none does."""
         arm = self.task.arm
         places = np.array([record.labels["q"].index(joint) for joint in arm.joints])
         q = record["q"][:, places]
-        # Surfaces that are up are arms that are down.
+        # The surfaces of the run are displaced by the shift.
         distance, part, when = nearest(self.task, braces, record.time, q, shift * self._up)
-        if distance < -SUNK:
-            return f"{part}: {-1e3 * distance:.3g} mm deep at t = {when:.3g} s, though no brace"
+        if distance < -DEPTH_MAX:
+            return f"{part}: touches without being a brace, {-1e3 * distance:.3g} mm deep at t = {when:.3g} s"
         return ""
 
     def _limits(self, record: Record) -> str:
-        """A limit of motor, joint or base that is reached."""
+        """Return a text about a limit of a motor, joint or base that is reached; empty if none is."""
         robot, time = self.task.arm.model.robot, record.time
         for motor, voltage, current in zip(robot.motors, record["voltage"].T, record["current"].T, strict=True):
             if not isinstance(motor, Motor):
@@ -291,12 +317,12 @@ class Verifier:
         return ""
 
     def tolerance(self, braces: tuple[Candidate, ...], dense: Dense, k_p: float) -> tuple[float | None, float | None]:
-        """Greatest error of the surfaces [m] and of friction (as a share) that do hold, each by bisection alone.
+        """Find the largest tolerated error of the surface height [m] and of friction (relative), each by bisection.
 
-        None: plans were not asked to bear such errors.
+        An entry is None if the tolerances include no such error.
         """
 
-        def bears(corner: tuple[float, float]) -> bool:
+        def tolerates(corner: tuple[float, float]) -> bool:
             other = (2.0 - corner[0], -corner[1])
             return not any(c.reason for c in self.corners(braces, dense, k_p, [corner, other]))
 
@@ -304,11 +330,11 @@ class Verifier:
             low, high = 0.0, most
             if most == 0.0:
                 return None
-            if bears(corner(high)):
+            if tolerates(corner(high)):
                 return high
             for _ in range(STEPS):
                 middle = 0.5 * (low + high)
-                low, high = (middle, high) if bears(corner(middle)) else (low, middle)
+                low, high = (middle, high) if tolerates(corner(middle)) else (low, middle)
             return low
 
         shift = largest(self.tolerances.most_shift, lambda x: (1.0, x))
