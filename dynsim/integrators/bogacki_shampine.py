@@ -11,7 +11,7 @@ from dynsim.dynamics.derivative import System, derivative
 from dynsim.dynamics.tables import Workspace
 from dynsim.integrators import run as ki
 from dynsim.integrators.dopri5 import combine, explicit_error
-from dynsim.integrators.driver import conclude, propose, can_step
+from dynsim.integrators.driver import can_step, conclude, propose
 from dynsim.integrators.events import note_inside
 from dynsim.integrators.run import Run
 from dynsim.integrators.steps import finished, stalled

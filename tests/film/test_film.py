@@ -107,7 +107,7 @@ def test_the_hand_is_where_the_model_has_it(braced: Record, view: str) -> None:
     film = Film({"one": braced}, view=view, plot="", size=(640, 480))
     known = film.painters["one"]
     painter = Painter(known.robot, known.camera, known.size, (np.zeros(3), np.ones(3)), tint=MARK)
-    painter._ways.clear()
+    painter._paths.clear()
     model = build_model(load_scenario("elbow_comparison", "two_elbows"))
     camera, hand = painter.camera, braced.scene.hand
     # The projection in words: along the axes of the view, y down.
@@ -135,7 +135,7 @@ def test_round_surfaces_are_whole(braced: Record, view: str, curved: tuple[int, 
     surface = SceneSurface.of_quadric("round", Q, -Q @ centre, 0.5 * (centre @ Q @ centre - np.sign(size) * radius**2))
     assert surface.radius == pytest.approx(radius)
     painter = Painter(known.robot, known.camera, known.size, (low, high))
-    painter._ways.clear()
+    painter._paths.clear()
     painter.robot = replace(known.robot, scene=replace(known.robot.scene, surfaces=(surface,)))
     shown = np.asarray(painter._background(low, high)).astype(int)
     rng = np.random.default_rng(3)
@@ -180,7 +180,7 @@ def test_a_snake_has_fingers_that_close(robots: dict[str, Record]) -> None:
         record.add("gripper", np.array([closed]), "1")
         record.scene = snake.scene
         painter = Painter(replace(robot, record=record), camera, (640, 480), (np.zeros(3), np.ones(3)), tint=MARK)
-        painter._ways.clear()
+        painter._paths.clear()
         solids = painter._solids
         fingers = solids.body == robot.scene.hand.body
         fingers &= np.abs(solids.aside).max(axis=(0, 2)) > 0.0

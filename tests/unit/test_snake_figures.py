@@ -129,12 +129,12 @@ def test_modes_are_numbers_above_the_chart_or_steps_below_it(every, numbered):
 
 
 def test_modes_that_would_fill_the_chart_are_shares_of_time(monkeypatch):
-    monkeypatch.setattr(snake_view, "TURNS", 20)
+    monkeypatch.setattr(snake_view, "INTERVALS", 20)
     record = switching_all_the_time(0.06)
     figure = figures.redundancy(record)
     chart, steps = figure.axes[:2]
     assert mentions(chart.get_title(loc="left"), "0.15 s")
-    starts = snake_view.turns(len(record))
+    starts = snake_view.interval_starts(len(record))
     assert len(starts) == 20
     parts = np.split(np.arange(len(record)), starts[1:])
     pairs = np.array([mesh.get_array().ravel() for mesh in chart.collections])

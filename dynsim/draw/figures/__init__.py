@@ -1,4 +1,4 @@
-"""Figures of one record, or comparisons of several, written to a folder; single figures by name.
+"""Figures of one record, or comparisons of several, written to a folder; or single figures.
 
 Matplotlib is loaded on the first drawing.
 """
@@ -19,8 +19,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MEASURED, SIMULATED = "dynsim.draw.figures.measured", "dynsim.draw.figures.arm"
-# Module with ``draw`` and ``draw_comparison``, and with ``figures`` and ``comparisons``, the makers by name → sets of
-# signals. A module draws the records that have one of its sets; the first module that matches is used.
+# Modules that draw figures, with the sets of signals that they need. A module has ``draw`` and ``draw_comparison``, and
+# ``figures`` and ``comparisons``, which return a mapping of drawing functions. It draws records that have one of its
+# sets; the first module that matches is used.
 MODULES: dict[str, tuple[set[str], ...]] = {
     "dynsim.draw.figures.snake": ({"posture"}, {"base_pose", "mode"}, {"w", "w_target"}),
     MEASURED: ({"q_goal"}, {"record_time"}, {"torque_estimate"}),
@@ -29,17 +30,26 @@ MODULES: dict[str, tuple[set[str], ...]] = {
 
 
 def draw(record: Record, folder: Path, kind: str = "png") -> list[Path]:
-    """Draw every figure that the record has data for, as files of a kind: "png", "pdf" or "svg".
+    """Draw every figure for which the record has data.
+
+    Parameters
+    ----------
+    record : Record
+        Record to draw.
+    folder : Path
+        Output folder.
+    kind : {"png", "pdf", "svg"}, optional
+        File format.
 
     Returns
     -------
     list of Path
-        The files written; empty for a record without samples.
+        The written files; empty for a record without samples.
 
     Raises
     ------
     RecordError
-        Nobody draws records of such signals, the record lacks what the figures need, or a file cannot be written.
+        If no module draws records with these signals, the record lacks data, or a file cannot be written.
     """
     if not len(record):
         return []
@@ -48,40 +58,68 @@ def draw(record: Record, folder: Path, kind: str = "png") -> list[Path]:
 
 
 def draw_comparison(records: Mapping[str, Record], folder: Path, kind: str = "png") -> list[Path]:
-    """Draw variants over each other, in the order of ``records``; those without samples are left out.
+    """Overlay variants in the order of ``records``; records without samples are skipped.
+
+    Parameters
+    ----------
+    records : mapping of str to Record
+        Names and records.
+    folder : Path
+        Output folder.
+    kind : {"png", "pdf", "svg"}, optional
+        File format.
+
+    Returns
+    -------
+    list of Path
+        The written files.
 
     Raises
     ------
     RecordError
-        See :func:`draw`; or the records are of different kinds.
+        See :func:`draw`; also if the records are of different kinds.
     """
     drawn = {name: record for name, record in records.items() if len(record)}
-    # Measured runs too are drawn as simulated ones: what both have.
+    # In a comparison, measured runs are drawn like simulated runs, which have the same signals.
     arm = importlib.import_module(SIMULATED)
     modules = {arm if module.__name__ == MEASURED else module for module in map(_module, drawn.values())}
     if not modules:
         return []
     if len(modules) > 1:
-        raise RecordError("records of different kinds cannot be drawn over each other")
+        raise RecordError("cannot overlay records of different kinds")
     with _drawable():
         return list(modules.pop().draw_comparison(drawn, Path(folder), kind))
 
 
 def figure(records: Record | Mapping[str, Record], name: str, *, title: bool = True) -> Figure:
-    """Draw one figure of a record, or of variants over each other, as a matplotlib figure in dynsim's look.
-
-    >>> dynsim.figure(record, "contact_forces", title=False).savefig("forces.pdf")
+    """Draw one figure of a record, or overlay several, and return the matplotlib Figure.
 
     Parameters
     ----------
-    records : a record, or several by name
-    name : of the file that ``dynsim plot`` writes, without its ending: "energy", "compare_energy", …
-    title : with the heading above all panels; papers have a caption instead
+    records : Record or mapping of str to Record
+        A record, or several records and their names.
+    name : str
+        File name without suffix of a figure that ``dynsim plot`` writes: "energy", "compare_energy", …
+    title : bool, optional
+        Whether the figure has a title; use False for figures with a caption.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        The figure; its ``savefig`` writes a file.
 
     Raises
     ------
     RecordError
-        No such figure, or the record has no data for it.
+        If there is no figure of this name, or the record has no data for it.
+
+    Examples
+    --------
+    >>> import dynsim
+    >>> scenario = dynsim.load_scenario("elbow_comparison", variant="two_elbows", overrides={"duration_s": 0.1})
+    >>> record = dynsim.simulate(scenario)
+    >>> drawing = dynsim.figure(record, "contact_forces", title=False)
+    >>> drawing.savefig("forces.pdf")  # doctest: +SKIP
     """
     several = not isinstance(records, Record)
     if not several and not len(records):
@@ -89,14 +127,14 @@ def figure(records: Record | Mapping[str, Record], name: str, *, title: bool = T
     if several and not records:
         raise RecordError("no records to draw")
     module = _module(next(iter(records.values()))) if isinstance(records, Mapping) else _module(records)
-    # Measured runs are compared by the figures of simulated ones.
+    # Measured runs are compared with the figures of simulated runs.
     home = importlib.import_module(SIMULATED) if several and module.__name__ == MEASURED else module
     style = importlib.import_module("dynsim.draw.figures.style")
     with _drawable(), style.look():
         makers = home.comparisons(records) if several else home.figures(records)
         if name not in makers:
             kind = "several records" if several else "such a record"
-            raise RecordError(f"no figure {brief(name)} of {kind}; figures: {', '.join(makers)}")
+            raise RecordError(f"unknown figure {brief(name)} for {kind}; choices: {', '.join(makers)}")
         drawn: Figure | None = makers[name](records)
     if drawn is None:
         raise RecordError(f"the record has no data for the figure {name!r}")
@@ -107,7 +145,7 @@ def figure(records: Record | Mapping[str, Record], name: str, *, title: bool = T
 
 @contextmanager
 def _drawable() -> Iterator[None]:
-    """A record may come from anywhere: what it lacks is its fault, and said in a line."""
+    """Report errors in the block as errors of the record: records may come from any source and may lack data."""
     try:
         yield
     except DynsimError:
@@ -121,4 +159,4 @@ def _module(record: Record) -> ModuleType:
     for name, needed in MODULES.items():
         if any(signals <= set(record) for signals in needed):
             return importlib.import_module(name)
-    raise RecordError(f"no figures for a record of these signals: {', '.join(record) or 'none'}")
+    raise RecordError(f"no figures for a record with these signals: {', '.join(record) or 'none'}")

@@ -1,4 +1,4 @@
-"""The set of figures of an arm, fixed or on a mobile base: of one run, or of variants over each other."""
+"""Figures of an arm, fixed or on a mobile base: one run, or overlays of variants."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from dynsim.draw.figures import base, contacts, energy, posture, style
 from dynsim.record import Record
 
-# File name → figure, None where the record has no data for it.
+# Drawing functions by file name; they return None if the record has no data.
 FIGURES: dict[str, Callable[[Record], Figure | None]] = {
     "hand_path": energy.path,
     "tracking_error": energy.error,
@@ -34,20 +34,20 @@ COMPARISONS: dict[str, Callable[[Mapping[str, Record]], Figure | None]] = {
 
 
 def figures(record: Record) -> Mapping[str, Callable[[Record], Figure | None]]:
-    """Makers of the figures of one run by file name; a maker gives None where the record has no data for it."""
+    """Return the drawing functions of one run by file name; they return None if the record has no data."""
     return FIGURES
 
 
 def comparisons(records: Mapping[str, Record]) -> Mapping[str, Callable[[Mapping[str, Record]], Figure | None]]:
-    """Makers of the figures of several runs by file name."""
+    """Return the drawing functions of several runs by file name."""
     return COMPARISONS
 
 
 def draw(record: Record, folder: Path, kind: str = "png") -> list[Path]:
-    """See :func:`dynsim.draw.figures.draw`."""
+    """Draw all figures, see :func:`dynsim.draw.figures.draw`."""
     return style.save_all(FIGURES, record, folder, kind)
 
 
 def draw_comparison(records: Mapping[str, Record], folder: Path, kind: str = "png") -> list[Path]:
-    """See :func:`dynsim.draw.figures.draw_comparison`."""
+    """Draw all comparisons, see :func:`dynsim.draw.figures.draw_comparison`."""
     return style.save_all(COMPARISONS, records, folder, kind)

@@ -1,4 +1,4 @@
-"""Figures of a mobile base over time: wheel and caster loads, tip margin, traction, reference and motion."""
+"""Figures of a mobile base: loads, tip margin, traction and tracking over time, and the view from above."""
 
 from __future__ import annotations
 
@@ -23,38 +23,39 @@ from dynsim.record.poses import point_positions
 from dynsim.record.scene import Point
 
 LOADS, MARGIN, TRACTION = "wheel_load", "tip_margin", "traction_demand"
-# Ends of the axes: the traction demand is unbounded without load, the tip margin where the ground carries almost none.
+# Axis limits: the traction demand is unbounded without load, the tip margin if the ground carries almost no load.
 TRACTION_TOP, MARGIN_LOW = 2.5, -2.0
-# Colours and widths of left wheel, right wheel and caster; the left is wider, so that it is visible at equal loads.
+# Colours and widths of left wheel, right wheel and caster; the left line is wider, so that it is visible at equal
+# loads.
 LOOKS = ((style.BLUE, 2.0), (style.GREEN, 1.0), (style.ORANGE, 1.2))
-# Tracking: least range of the axes of positions and headings [m, °], so that rounding at rest is not enlarged.
-LEAST_POSITION, LEAST_HEADING = 1e-3, 0.1
+# Tracking: minimum range of the axes of positions and headings [m, °], so that rounding errors are not magnified.
+MIN_POSITION_RANGE, MIN_HEADING_RANGE = 1e-3, 0.1
 MILLI = 1e3
 
 
 def overturning(record: Record) -> Figure | None:
-    """Loads of wheels and caster, tip margin and traction demand over time; None without a mobile base."""
+    """Draw loads of wheels and caster, tip margin and traction demand over time; None without a mobile base."""
     if not {LOADS, MARGIN, TRACTION} <= set(record):
         return None
-    figure = style.new_figure(6.2, style.title(record, "what the base stands on"))
+    figure = style.new_figure(6.2, style.title(record, "loads and stability of the base"))
     loads, margin = record[LOADS], record[MARGIN]
-    # Nothing is demanded of a wheel that carries nothing, and of one that carries next to nothing no number.
+    # The traction demand is undefined for a wheel without load.
     traction = np.where(np.isfinite(record[TRACTION]), record[TRACTION], np.nan)
     bare = np.asarray(np.isnan(traction).any(axis=1))
     demanded = np.minimum(traction, TRACTION_TOP)
     series = [loads, np.maximum(margin, MARGIN_LOW), demanded]
     rows = style.time_rows(figure, [[(record.time, values)] for values in series], style.settle_time(record))
     for axes in rows[0]:
-        _lines(axes, record, LOADS, "least {} N", np.nanmin)
-        style.shade_below_zero(axes, "pulls: held down")
+        _lines(axes, record, LOADS, "min {} N", np.nanmin)
+        style.shade_below_zero(axes, "wheel pulls on the ground")
         _mark_tipping(axes, [record], [style.PULLING])
     for axes in rows[1]:
         style.line(axes, record.time, margin, color=style.BLACK, label=_margin_label("margin", record))
         _frame_margin(axes)
         _mark_tipping(axes, [record], [style.PULLING])
     for axes in rows[2]:
-        _lines(axes, record, TRACTION, "at most {}", np.nanmax)
-        _shade(axes, record.time, bare, "a wheel carries nothing")
+        _lines(axes, record, TRACTION, "max {}", np.nanmax)
+        _shade(axes, record.time, bare, "a wheel carries no load")
         axes.axhline(1.0, color=style.PULLING, linewidth=0.8, label="slips above 1")
         axes.set_ylim(0.0, min(max(axes.get_ylim()[1], 1.15), TRACTION_TOP))
         _mark_tipping(axes, [record], [style.PULLING])
@@ -63,9 +64,9 @@ def overturning(record: Record) -> Figure | None:
         style.legend_above(panels[-1], columns=4)
     note = []
     if np.nanmax(traction, initial=0.0) > TRACTION_TOP:
-        note.append(f"traction demand cut off at {TRACTION_TOP:g}: hardly any load")
+        note.append(f"traction demand cut off at {TRACTION_TOP:g}: almost no load")
     if bare.any():
-        note.append(f"none without load on a wheel: {percent(float(bare.mean()))} of the samples")
+        note.append(f"undefined without load on a wheel: {percent(float(bare.mean()))} of the samples")
     last = rows[2][-1]
     last.set_xlabel("\n".join([last.get_xlabel(), *note]))
     contacts.mark_all(rows, record)
@@ -73,14 +74,14 @@ def overturning(record: Record) -> Figure | None:
 
 
 def margin_comparison(records: Mapping[str, Record]) -> Figure | None:
-    """Tip margins of all variants over each other; None without mobile bases."""
+    """Overlay the tip margins of all variants; None without mobile bases."""
     shown = {name: record for name, record in records.items() if MARGIN in record}
     if not shown:
         return None
     some = list(shown.values())
     figure = style.new_figure(
         3.4 + len(shown) * style.LEGEND_ROW / 72.0 + contacts.height_of_variants(shown),
-        style.comparison_title(some, "tip margin (1: safest place, 0: tips over)"),
+        style.comparison_title(some, "tip margin (1: safest, 0: tips over)"),
     )
     series = [(record.time, np.maximum(record[MARGIN], MARGIN_LOW)) for record in some]
     (panels,) = style.time_rows(figure, [series], max(map(style.settle_time, some)))
@@ -98,34 +99,36 @@ def margin_comparison(records: Mapping[str, Record]) -> Figure | None:
 
 
 def tracking(record: Record) -> Figure | None:
-    """Reference and place of a mobile base over time, and what lies between; None without a reference.
+    """Draw reference and actual pose of a mobile base over time, and their difference; None without a reference.
 
-    Of a base that is to stand, and does, only what lies between is drawn.
+    For a stationary base only the difference is drawn.
     """
     if not {"base_pose", "base_target"} <= set(record):
         return None
     pose, target = record["base_pose"], record["base_target"]
     error = base_error(record)
     heading = np.degrees(np.stack([target[:, 2], pose[:, 2]], axis=1))
-    stands = _spread(np.hstack([target[:, :2], pose[:, :2]])) < LEAST_POSITION and _spread(heading) < LEAST_HEADING
-    # To a nanometre: beyond it a base that stands shows its rounding.
+    is_stationary = (
+        _spread(np.hstack([target[:, :2], pose[:, :2]])) < MIN_POSITION_RANGE and _spread(heading) < MIN_HEADING_RANGE
+    )
+    # Rounded to a nanometre, below which a stationary base shows rounding errors.
     away, turned = np.round(MILLI * error[:, :2], 6), np.round(180.0 / np.pi * error[:, 2:], 6)
     parts = {"error [mm]": away, "heading error [°]": turned}
-    if not stands:
+    if not is_stationary:
         parts = {"position [m]": np.hstack([target[:, :2], pose[:, :2]]), "heading [°]": heading, **parts}
-    subject = "base, which stands: actual − reference" if stands else "base, reference and actual"
+    subject = "stationary base: actual − reference" if is_stationary else "base, reference and actual"
     figure = style.new_figure(0.6 + 1.5 * len(parts), style.title(record, subject))
     grid = style.time_rows(figure, [[(record.time, values)] for values in parts.values()], style.settle_time(record))
     rows = dict(zip(parts, grid, strict=True))
     for name, panels in rows.items():
         for axes in panels:
             values = parts[name]
-            least = {"position [m]": LEAST_POSITION, "heading [°]": LEAST_HEADING}.get(name, 0.0)
+            least = {"position [m]": MIN_POSITION_RANGE, "heading [°]": MIN_HEADING_RANGE}.get(name, 0.0)
             if _spread(values) < least:
                 middle = float(np.nanmean(values))
                 axes.set_ylim(middle - least, middle + least)
             axes.ticklabel_format(axis="y", useOffset=False)
-    # Dashes: x and y may be the same.
+    # One is dashed, because x and y may coincide.
     for k, (name, dashes) in enumerate((("x", "-"), ("y", (0, (5, 4))))):
         for axes in rows.get("position [m]", ()):
             _pair(axes, record.time, target[:, k], pose[:, k], name, style.AXIS_COLOURS[name], dashes)
@@ -150,13 +153,13 @@ def tracking(record: Record) -> Figure | None:
 
 
 def _spread(values: Array) -> float:
-    """How far the values of any column spread."""
+    """Return the largest range of any column."""
     known = values[np.isfinite(values).all(axis=1)]
     return float(np.ptp(known, axis=0).max()) if len(known) else 0.0
 
 
 def base_error(record: Record) -> Array:
-    """Actual minus reference of a mobile base: ahead and to the left of the reference [m], heading [rad], (T, 3)."""
+    """Return actual minus reference pose of a base, (T, 3): ahead and left of the reference [m], heading [rad]."""
     target = record["base_target"]
     error = record["base_pose"] - target
     c, s = np.cos(target[:, 2]), np.sin(target[:, 2])
@@ -164,40 +167,40 @@ def base_error(record: Record) -> Array:
 
 
 def tipping_times(record: Record) -> list[float]:
-    """When the base tips over [s], in the order of time."""
+    """Return the times at which the base tips over [s], in order."""
     return [event.time for event in record.events if event.kind == TIP_OVER]
 
 
 def _verdict(record: Record) -> str:
     times = tipping_times(record)
     if not times:
-        return "it never tips over"
+        return "never tips over"
     more = f"{len(times)} times, first " if len(times) > 1 else ""
     settle = style.settle_time(record)
     if record.time[-1] > settle and overturns_settled(record, settle) is None:
-        return f"a jolt of the start takes it below zero {more}at {style.number(times[0], 3)} s"
+        return f"only the initial transient is below zero, {more}at {style.number(times[0], 3)} s"
     return f"tips over {more}at {style.number(times[0], 3)} s"
 
 
 def _margin_label(name: str, record: Record) -> str:
-    """With the least margin after the start, and whether it tips."""
+    """Return a label with the minimum margin after the start, and whether the base tips."""
     settle = style.settle_time(record)
     late = record[MARGIN][record.time >= settle]
-    least = f" least {style.number(float(np.nanmin(late)), 3)} from {settle:g} s on;" if np.isfinite(late).any() else ""
+    least = f" min {style.number(float(np.nanmin(late)), 3)} from {settle:g} s on;" if np.isfinite(late).any() else ""
     return f"{name}:{least} {_verdict(record)}"
 
 
 def _lines(axes: Axes, record: Record, signal: str, note: str, extreme: Callable[[Array], Any]) -> None:
-    """A line for each column, its extreme in the legend."""
+    """Draw a line for each column, with its extreme value in the legend."""
     for values, name, (colour, width) in zip(record[signal].T, record.labels[signal], LOOKS, strict=False):
         known = np.isfinite(values).any()
         values = np.where(np.isfinite(values), values, np.nan)
-        label = f"{name}: {note.format(style.number(float(extreme(values)), 3))}" if known else f"{name}: none"
+        label = f"{name}: {note.format(style.number(float(extreme(values)), 3))}" if known else f"{name}: no values"
         style.line(axes, record.time, values, color=colour, linewidth=width, label=label)
 
 
 def _shade(axes: Axes, time: Array, where: NDArray[np.bool_], label: str) -> None:
-    """Bands over the samples at which something is so, named once; each as wide as to the samples beside it."""
+    """Shade the samples at which ``where`` is True, up to their neighbours, with one legend entry."""
     edges = np.flatnonzero(np.diff(where, prepend=False, append=False)).reshape(-1, 2)
     limits = axes.get_xlim()
     for k, (first, end) in enumerate(edges.tolist()):
@@ -207,7 +210,7 @@ def _shade(axes: Axes, time: Array, where: NDArray[np.bool_], label: str) -> Non
 
 
 def _pair(axes: Axes, time: Array, target: Array, actual: Array, name: str, colour: str, dashes: Any) -> None:
-    """Actual over its reference, which is wide and pale so that both are seen where they agree."""
+    """Draw the actual values over their reference, which is wide and pale so that both are visible if they agree."""
     style.line(axes, time, target, color=colour, linewidth=4.0, alpha=0.3, label=f"{name}, reference")
     style.line(axes, time, actual, color=colour, linestyle=dashes, label=f"{name}, actual")
 
@@ -215,18 +218,18 @@ def _pair(axes: Axes, time: Array, target: Array, actual: Array, name: str, colo
 def _frame_margin(axes: Axes) -> None:
     low, high = axes.get_ylim()
     axes.set_ylim(max(min(low, -0.05), MARGIN_LOW), max(high, 0.1))
-    style.shade_below_zero(axes, "beyond the triangle")
+    style.shade_below_zero(axes, "outside the support triangle")
 
 
 def _mark_tipping(axes: Axes, records: Sequence[Record], colours: Sequence[str]) -> None:
-    """Lines and triangles at the times that the axes show; others would stand, and take room, beside the axes."""
+    """Draw lines and triangles at the tipping times within the axes; others would be drawn outside."""
     low, high = axes.get_xlim()
     for record, colour in zip(records, colours, strict=True):
         for time in tipping_times(record):
             if not low <= time <= high:
                 continue
             axes.axvline(time, color=colour, linestyle=(0, (4, 2)), linewidth=0.9)
-            # Above the axes, where a line at their edge is seen too.
+            # Above the axes, where it is visible even at their edge.
             top = axes.get_xaxis_transform()
             axes.plot(time, 1.0, "v", color=colour, markersize=4, transform=top, clip_on=False, zorder=5)
 
@@ -235,15 +238,13 @@ def _rms(values: Array) -> float:
     return float(np.sqrt(np.nanmean(values**2)))
 
 
-# Figure of a mobile base from above: path, arm, elbows and hand, supports, and centre of pressure in its frame.
-
-
+# View from above: path, arm, elbows and hand, supports, and centre of pressure in the frame of the base.
 Rows = NDArray[np.intp]
 
-# Height of the panel in the base's frame where it is placed below that in the world [inch].
+# Height of the base-frame panel if it is placed below the world panel [inch].
 BELOW = 2.9
 
-# Most support triangles, at even distances along the path, and their least distance in parts of their size.
+# Maximum number of support triangles, evenly spaced along the path, and their minimum distance relative to their size.
 TRIANGLES, APART = 6, 0.25
 ELBOW_COLOURS = (style.ORANGE, style.GREEN, "#8C6D31")
 ARM_ABOVE = "#A8A8A8"
@@ -251,7 +252,7 @@ TRIANGLE, INSIDE, OUTSIDE = style.SKY, style.PURPLE, style.PULLING
 
 
 def top_view(record: Record) -> Figure | None:
-    """The run from above in the world, and the pressure centre in the base's frame; None without a mobile base."""
+    """Draw the run from above in the world, and the centre of pressure in the base frame; None without a base."""
     body, _ = skeleton(record)
     if body is None or len(body.scene.supports) != 3 or not {"base_pose", "center_of_pressure"} <= set(record):
         return None
@@ -261,7 +262,7 @@ def top_view(record: Record) -> Figure | None:
     low, high = _extent(body, rows)
     size = high - low
     wide = size[0] > 1.8 * size[1]
-    # In a row of its own the world is as high as its width makes it, with 0.6 inch for its labels.
+    # In a separate row, the height of the world panel follows from its width, with 0.6 inch for labels.
     above = 0.6 + 6.3 * float(size[1] / size[0])
     height = 0.8 + above + BELOW if wide else 0.9 + float(np.clip(3.9 * size[1] / size[0], 3.3, 6.0))
     figure = style.new_figure(height, style.title(record, "base from above"))
@@ -271,7 +272,7 @@ def top_view(record: Record) -> Figure | None:
         world, own = figure.subplots(1, 2, width_ratios=[1.25, 1.0])
     _draw_world(world, body, rows)
     world.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-    _draw_own(own, body, rows)
+    _draw_base_frame(own, body, rows)
     for axes in (world, own):
         axes.set_aspect("equal", adjustable="box", anchor="N")
     style.legend_below(figure, [world, own], 4)
@@ -279,19 +280,19 @@ def top_view(record: Record) -> Figure | None:
 
 
 def support_corners(body: Skeleton, row: int) -> Array:
-    """Where the base stands on the ground: left wheel, right wheel, caster, (3, 2) [m]."""
+    """Return the ground contacts of the base: left wheel, right wheel, caster, (3, 2) [m]."""
     return np.array([point_positions(body.record, point, row)[:2] for point in body.scene.supports])
 
 
 def pressure_in_base(record: Record) -> Array:
-    """Centre of pressure in the base's frame, (T, 2) [m]."""
+    """Return the centre of pressure in the base frame, (T, 2) [m]."""
     away = record["center_of_pressure"] - record["base_pose"][:, :2]
     c, s = np.cos(record["base_pose"][:, 2]), np.sin(record["base_pose"][:, 2])
     return np.stack([c * away[:, 0] + s * away[:, 1], c * away[:, 1] - s * away[:, 0]], axis=1)
 
 
 def _extent(body: Skeleton, rows: Rows) -> tuple[Array, Array]:
-    """Corners of what is drawn of the world [m]; a centre of pressure far away is not in it."""
+    """Return the corners of the world panel [m]; a distant centre of pressure may be outside."""
     record = body.record
     points = [record["hand_position"][:, :2]] if "hand_position" in record else []
     if (target := hand_target(record)) is not None:
@@ -302,7 +303,7 @@ def _extent(body: Skeleton, rows: Rows) -> tuple[Array, Array]:
 
 
 def _track(body: Skeleton, point: Point, rows: Rows) -> Array:
-    """Way of a point over the ground, (rows, 2) [m]."""
+    """Return the path of a point over the ground, (rows, 2) [m]."""
     return point_positions(body.record, point)[rows, :2]
 
 
@@ -315,7 +316,7 @@ def _draw_world(axes: Axes, body: Skeleton, rows: Rows) -> None:
     for segment in arm:
         axes.plot(*segment.T, color=ARM_ABOVE, lw=1.6, zorder=3)
     axes.plot([], [], color=ARM_ABOVE, lw=1.6, label="arm at the end")
-    for row in _spread_out(
+    for row in _rows_along_path(
         record["base_pose"], rows, APART * float(np.ptp(support_corners(body, first), axis=0).max())
     ):
         axes.add_patch(Polygon(support_corners(body, row), facecolor="none", edgecolor=TRIANGLE, lw=0.7, zorder=4))
@@ -344,8 +345,8 @@ def _draw_world(axes: Axes, body: Skeleton, rows: Rows) -> None:
     axes.set_ylabel("y [m]")
 
 
-def _draw_own(axes: Axes, body: Skeleton, rows: Rows) -> None:
-    """The base from above, in its own frame: ahead is to the right."""
+def _draw_base_frame(axes: Axes, body: Skeleton, rows: Rows) -> None:
+    """Draw the base from above in its own frame, with its heading to the right."""
     record = body.record
     x, y, heading = record["base_pose"][rows[-1]]
     turn = np.array([[np.cos(heading), -np.sin(heading)], [np.sin(heading), np.cos(heading)]])
@@ -358,7 +359,7 @@ def _draw_own(axes: Axes, body: Skeleton, rows: Rows) -> None:
     middle = corners.mean(axis=0)
     for point, corner in zip(body.scene.supports, corners, strict=True):
         axes.plot(*corner, "o", color=ARM_COLOUR, markersize=3, zorder=6)
-        # Towards the middle, where there is room.
+        # Towards the middle, where there is space.
         away = 16.0 * (middle - corner) / np.linalg.norm(middle - corner)
         axes.annotate(
             point.name,
@@ -373,7 +374,7 @@ def _draw_own(axes: Axes, body: Skeleton, rows: Rows) -> None:
         )
     path = pressure_in_base(record)
     _draw_pressure(axes, body, path)
-    # The path may go far; what it does within a base's length of the base is in the picture.
+    # The path may be long; only the part within about one length of the base is shown.
     drawn = np.concatenate([corners, *parts])
     low, high = drawn.min(axis=0), drawn.max(axis=0)
     reach = 0.75 * float((high - low).max())
@@ -382,7 +383,7 @@ def _draw_own(axes: Axes, body: Skeleton, rows: Rows) -> None:
     low, high = box_about([drawn, near], 0.06)
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     lost = 1.0 - len(near) / max(len(path), 1)
-    axes.set_title("in the base's frame" + (f"; {100 * lost:.2g} % of the path is farther off" if lost > 0.0 else ""))
+    axes.set_title("in the base frame" + (f"; {100 * lost:.2g} % of the path is outside" if lost > 0.0 else ""))
     axes.set_xlabel("ahead [m]")
     axes.set_ylabel("to the left [m]")
 
@@ -395,7 +396,7 @@ def _draw_outline(axes: Axes, body: Skeleton, row: int, *, label: str, **look: A
 
 
 def _draw_pressure(axes: Axes, body: Skeleton, path: Array) -> None:
-    """The centre of pressure, (T, 2) in the axes drawn: inside the support triangle, and outside."""
+    """Draw the centre of pressure, (T, 2) in the axes; colours differ inside and outside the support triangle."""
     corners = np.array([point.position[:2] for point in body.scene.supports])
     at, outside = pressure_pieces(pressure_in_base(body.record), corners)
     points = np.stack([np.interp(at, np.arange(len(path)), column) for column in path.T], axis=1)
@@ -416,14 +417,16 @@ def pressure_pieces(path: Array, corners: Array) -> tuple[Array, NDArray[np.bool
 
     Returns
     -------
-    at : (m,) samples, and fractions of samples at which it is cut
-    outside : (m - 1,) whether the piece that follows lies outside the triangle
+    at : (m,) ndarray
+        Sample indices, with fractions at the cuts.
+    outside : (m - 1,) ndarray of bool
+        Whether the following piece is outside the triangle.
     """
     kept = np.linspace(0, len(path) - 1, min(len(path), style.LINE_POINTS)).astype(int)
     path, side = path[kept], np.roll(corners, -1, axis=0) - corners
     normal = np.stack([-side[:, 1], side[:, 0]], axis=1)
     normal *= np.sign((normal * (corners.mean(axis=0) - corners)).sum(axis=1))[:, None]
-    # Distances from the sides, positive inside, by the sides' lengths: linear along each piece.
+    # Distances from the sides times their lengths, positive inside; linear along each piece.
     distance = ((path[:, None] - corners) * normal).sum(axis=2)
     a, b = distance[:-1], distance[1:]
     row, crossed = np.nonzero(a * b < 0.0)
@@ -434,8 +437,8 @@ def pressure_pieces(path: Array, corners: Array) -> tuple[Array, NDArray[np.bool
     return np.interp(at, np.arange(len(kept)), kept), between.min(axis=1) < 0.0
 
 
-def _spread_out(pose: Array, rows: Rows, apart: float) -> list[int]:
-    """Rows at which the base has gone on by at least ``apart`` [m], the first and the last among them."""
+def _rows_along_path(pose: Array, rows: Rows, apart: float) -> list[int]:
+    """Return rows between which the base travels at least ``apart`` [m], including the first and the last."""
     distance = np.append(0.0, np.cumsum(np.hypot(*np.diff(pose[rows, :2], axis=0).T)))
     count = int(np.clip(distance[-1] / max(apart, 1e-9), 1, TRIANGLES - 1)) + 1
     return [

@@ -1,4 +1,4 @@
-"""Figure of the normal contact forces over time, with pulling forces or contact modes marked.
+"""Figure of the normal contact forces over time, and marks of contact events on time axes.
 
 Under the bilateral law a force may have either sign; the region below zero is shaded. Under the unilateral law bands
 show the mode of each contact: open, sliding or sticking.
@@ -21,10 +21,8 @@ from dynsim.record import Record
 from dynsim.record.content import Event
 from dynsim.record.measures import percent
 
-# Marks of events over time axes: landings, lift-offs, begin and end of slip, joint stops.
-
-
-# Kind of event → mark of matplotlib, the same as a character, and words for it. Other kinds have figures of their own.
+# Kinds of events that are marked: marker in matplotlib, the same marker as a character, and its meaning. Other kinds
+# have separate figures.
 MARKS: dict[str, tuple[str, str, str]] = {
     "landing": ("v", "▼", "landing"),
     "lift_off": ("^", "▲", "lift-off"),
@@ -36,24 +34,24 @@ MARKS: dict[str, tuple[str, str, str]] = {
     "chatter": ("*", "★", "chatter"),
 }
 COLOUR = "#555555"
-# Most events that get vertical lines; more would hide the curves, and get marks only.
+# Maximum number of events with vertical lines; more lines would hide the curves.
 LINES = 40
-# Distance of the marks from the upper edge, and between their rows [point].
+# Distance of the marks from the upper edge, and between rows of marks [point].
 BELOW, MARK_ROW = 4.0, 6.0
-# Most characters in a line of the legend of marks, which fits under the narrowest panel.
+# Maximum line length of the legend of marks, which fits below the narrowest panel.
 WIDEST = 50
 
 
 def marked(record: Record, names: Iterable[str] | None = None) -> list[Event]:
-    """Events that are marked, of the contacts and joints named or of all."""
+    """Return the marked events, of all or of the named contacts and joints."""
     chosen = None if names is None else set(names)
     return [event for event in record.events if event.kind in MARKS and (chosen is None or event.name in chosen)]
 
 
 def mark(axes: Axes, events: Sequence[Event], colour: str = COLOUR, *, row: int = 0, lines: bool = True) -> None:
-    """Draw events that lie within the axes: a faint line each and its mark, in a row from the upper edge down.
+    """Mark the events within the axes by a faint line and a marker, in rows counted down from the upper edge.
 
-    Negative rows lie above the edge.
+    Negative rows are above the edge.
     """
     low, high = axes.get_xlim()
     inside = [event for event in events if low <= event.time <= high]
@@ -72,7 +70,7 @@ def mark(axes: Axes, events: Sequence[Event], colour: str = COLOUR, *, row: int 
 
 
 def mark_all(rows: Iterable[Sequence[Axes]], record: Record) -> None:
-    """Mark all events of a run in every panel, and name the marks under the last one."""
+    """Mark all events of a run in every panel, with a legend below the last one."""
     events = marked(record)
     if not events:
         return
@@ -83,16 +81,16 @@ def mark_all(rows: Iterable[Sequence[Axes]], record: Record) -> None:
 
 
 def height_of_variants(records: Mapping[str, Record]) -> float:
-    """Room over a panel for the rows of :func:`mark_variants` [inch]."""
+    """Return the height above a panel that :func:`mark_variants` needs [inch]."""
     return MARK_ROW * sum(bool(marked(record)) for record in records.values()) / 72.0
 
 
 def mark_variants(
     rows: Iterable[Sequence[Axes]], records: Mapping[str, Record], colours: Mapping[str, str]
 ) -> list[Event]:
-    """Mark the events of several runs over every panel, a row in its colour for each that has some; returns them.
+    """Mark the events of several runs above every panel, one coloured row per run; returns the events.
 
-    Inside they would lie on the curves of the other variants.
+    Inside the panel the marks would cover the curves of other variants.
     """
     having = {name: events for name, record in records.items() if (events := marked(record))}
     everything = [event for events in having.values() for event in events]
@@ -102,13 +100,13 @@ def mark_variants(
         for axes in panels:
             for row, (name, events) in enumerate(having.items()):
                 mark(axes, events, colours[name], row=-1 - row, lines=len(everything) <= LINES)
-            # The empty title keeps the room.
+            # An empty title reserves the space.
             axes.set_title(" ", fontsize=1.0, y=1.0, pad=MARK_ROW * len(having))
     return everything
 
 
 def explain(axes: Axes, events: Sequence[Event]) -> None:
-    """Lines under the label of the time axis: each mark that is drawn, what it means, and how often."""
+    """Add a legend of the marks below the label of the time axis, with the number of events."""
     count = Counter(event.kind for event in events)
     lines = [axes.get_xlabel()]
     for part in (f"{sign} {text} ({count[kind]})" for kind, (_, sign, text) in MARKS.items() if count[kind]):
@@ -121,11 +119,11 @@ def explain(axes: Axes, events: Sequence[Event]) -> None:
         axes.set_xlabel("\n".join(lines))
 
 
-# Most rows on a page; height of a row [inch].
+# Maximum number of rows on a page; height of a row [inch].
 ROWS, ROW = 8, 1.75
-# Most samples that are drawn as dots.
+# Maximum number of samples that are drawn as dots.
 DOTS = 150
-# Modes by their number: name, colour of the bands, and key of the summary with the share of time.
+# Modes by number: name, colour of the bands, and summary key of the fraction of time.
 MODE = "contact_mode"
 MODES = (
     ("open", "#EFEFEF", "closed_fraction"),
@@ -135,33 +133,33 @@ MODES = (
 
 
 def forces(record: Record) -> Figure | None:
-    """Normal force of each contact; None without contacts, or if none ever touched."""
+    """Draw the normal force of each contact; None without contacts, or if none ever touched."""
     return _forces({"": record}, style.title(record, "normal contact forces"))
 
 
 def forces_comparison(records: Mapping[str, Record]) -> Figure | None:
-    """Normal force of each contact, all variants that have it over each other."""
+    """Draw the normal force of each contact, with all variants that have the contact overlaid."""
     return _forces(records, style.comparison_title(list(records.values()), "normal contact forces"))
 
 
 def _forces(records: Mapping[str, Record], title: str) -> Figure | None:
-    """Rows of forces; of one run, which has no name, with the modes of its contacts or the time in which they pull."""
+    """Draw rows of forces; for a single run (named ""), with contact modes or the time in which the surface pulls."""
     runs, alone = list(records.values()), "" in records
     names = touching_names(runs)
     if not names:
         return None
     chosen = _most_interesting(names, runs)
-    kind = "highest" if any(map(is_real, runs)) else "lowest"
+    kind = "highest" if any(map(is_unilateral, runs)) else "lowest"
     note = "" if len(chosen) == len(names) else f", {len(chosen)} of {len(names)} contacts ({kind} forces)"
     having = {name: {v: r for v, r in records.items() if _touched(r, name)} for name in chosen}
-    # A legend has an entry for each variant and one for the shading.
+    # A legend has one entry per variant and one for the shading.
     more = sum(-(-(len(having[name]) + 1) // 2) - 1 for name in chosen) * style.LEGEND_ROW / 72.0
     figure = style.new_figure(1.0 + ROW * len(chosen) + more, title + note)
     series = [[values for r in having[name].values() for values in _series(r, name)] for name in chosen]
     styles = style.variant_styles(list(records))
     rows = style.time_rows(figure, series, max(map(style.settle_time, runs)))
     for name, panels in zip(chosen, rows, strict=True):
-        # What the panel of the beginning shows would be a heap of marks in the other one.
+        # Events of the transient panel would overlap each other in the panel of the whole run.
         begun = panels[0].get_xlim()[1] if len(panels) > 1 else -np.inf
         for axes in panels:
             for row, (variant, record) in enumerate(having[name].items()):
@@ -172,14 +170,14 @@ def _forces(records: Mapping[str, Record], title: str) -> Figure | None:
                     axes.axhline(value, color=colour, linestyle=(0, (5, 3)), linewidth=0.7)
                 changes = marked(record, [name])
                 mark(axes, [e for e in changes if axes is panels[0] or e.time > begun], colour, row=row)
-                if alone and is_real(record):
+                if alone and is_unilateral(record):
                     _draw_modes(axes, record, name)
                 elif alone:
                     fill: dict[str, Any] = {"color": style.PULLING, "alpha": 0.3, "linewidth": 0, "interpolate": True}
                     axes.fill_between(record.time, force, 0.0, where=force < 0.0, label="_pulling", **fill)
                 if len(panels) > 1 and axes is panels[0]:
                     _draw_samples(axes, record, name, colour)
-            if not all(map(is_real, having[name].values())):
+            if not all(map(is_unilateral, having[name].values())):
                 style.shade_below_zero(axes, "surface pulls")
         panels[0].set_ylabel(f"{name}\nfₙ [N]")
         style.legend_above(panels[-1], columns=4 if alone else 2)
@@ -189,7 +187,7 @@ def _forces(records: Mapping[str, Record], title: str) -> Figure | None:
 
 
 def contact_names(records: Sequence[Record]) -> list[str]:
-    """Names of all contacts, in the order in which they first appear."""
+    """Return the names of all contacts, in order of first occurrence."""
     names: dict[str, None] = {}
     for record in records:
         names.update(dict.fromkeys(record.labels.get("contact_normal_force", ())))
@@ -197,7 +195,7 @@ def contact_names(records: Sequence[Record]) -> list[str]:
 
 
 def touching_names(records: Sequence[Record]) -> list[str]:
-    """Those that touched: under the unilateral law many may, and most never do."""
+    """Return the names of contacts that touched; under the unilateral law most candidates never do."""
     return [name for name in contact_names(records) if any(_touched(record, name) for record in records)]
 
 
@@ -205,15 +203,15 @@ def _touched(record: Record, name: str) -> bool:
     return name in contact_names([record]) and _summary(record, name).get("closed_fraction", 1.0) > 0.0
 
 
-def is_real(record: Record) -> bool:
-    """Whether its contacts follow the unilateral law."""
+def is_unilateral(record: Record) -> bool:
+    """Return whether the contacts of a record follow the unilateral law."""
     return MODE in record
 
 
 def _share(record: Record, name: str) -> str:
-    state, key = ("closed", "closed_fraction") if is_real(record) else ("pulling", "pulling_fraction")
+    state, key = ("closed", "closed_fraction") if is_unilateral(record) else ("pulling", "pulling_fraction")
     contact = _summary(record, name)
-    return f"{state} {percent(contact[key])} of the run" if contact else f"{state} unknown part"
+    return f"{state} {percent(contact[key])} of the run" if contact else f"{state} for an unknown time"
 
 
 def _within(record: Record, name: str) -> str:
@@ -222,7 +220,10 @@ def _within(record: Record, name: str) -> str:
 
 
 def _extremes(record: Record, name: str) -> Array:
-    """Lowest and highest force of all integration steps [N], which see peaks between the samples; empty if unknown."""
+    """Return the minimum and maximum force over all integration steps [N], or an empty array if unknown.
+
+    They include peaks between samples.
+    """
     contact = _summary(record, name)
     if not contact:
         return np.empty(0)
@@ -231,25 +232,25 @@ def _extremes(record: Record, name: str) -> Array:
 
 
 def _summary(record: Record, name: str) -> dict[str, Any]:
-    """The contact's part of the summary: over all integration steps, not over the samples. Empty if there is none."""
+    """Return the summary of a contact, which covers all integration steps; empty if it is missing."""
     return next((contact for contact in record.summary.get("contacts", ()) if contact["name"] == name), {})
 
 
 def _series(record: Record, name: str) -> list[style.Series]:
-    """What must find room: the samples, and the extremes, which most often fall into the first milliseconds."""
+    """Return the series that determine the axis range: samples and extremes, which mostly occur at the start."""
     extremes = _extremes(record, name)
     return [(record.time, _force(record, name)), *([(record.time[[0, 0]], extremes)] if extremes.size else [])]
 
 
 def _draw_samples(axes: Axes, record: Record, name: str, colour: str) -> None:
-    """A dot at each sample of the transient, while they are few enough to be told apart."""
+    """Draw a dot at each sample of the transient if the samples are few enough to be distinguished."""
     inside = record.time <= axes.get_xlim()[1]
     if inside.sum() <= DOTS:
         axes.plot(record.time[inside], _force(record, name)[inside], ".", color=colour, markersize=2.5)
 
 
 def _note_sampling(rows: Sequence[Sequence[Axes]], records: Sequence[Record]) -> None:
-    """Under the last panel: how often the curves are sampled, and what the dashed lines are."""
+    """Add a note below the last panel about the sampling interval and the dashed lines."""
     steps = [float(np.median(np.diff(record.time))) for record in records if len(record) > 1]
     if not steps:
         return
@@ -267,21 +268,23 @@ def _force(record: Record, name: str) -> Array:
 
 
 def _most_interesting(names: list[str], records: Sequence[Record]) -> list[str]:
-    """All contacts, or ``ROWS`` of them, in their order: those that pull hardest, or if real press hardest."""
+    """Return all contacts, or the ``ROWS`` with the lowest (unilateral law: highest) forces, in their order."""
     if len(names) <= ROWS:
         return names
-    real = any(map(is_real, records))
+    unilateral = any(map(is_unilateral, records))
 
     def rank(name: str) -> float:
         values = [_force(r, name) for r in records if name in contact_names([r])]
-        return -max(float(force.max()) for force in values) if real else min(float(force.min()) for force in values)
+        return (
+            -max(float(force.max()) for force in values) if unilateral else min(float(force.min()) for force in values)
+        )
 
     chosen = sorted(names, key=rank)[:ROWS]
     return [name for name in names if name in chosen]
 
 
 def mode_bands(record: Record, name: str) -> list[tuple[float, float, int]]:
-    """Begin, end [s] and mode of each stretch of samples in one mode, cut at the contact's events if there are some."""
+    """Return begin, end [s] and mode of each interval in one mode, bounded by events of the contact, if any."""
     mode = np.rint(record[MODE][:, record.labels[MODE].index(name)]).astype(int)
     changes = [event.time for event in marked(record, [name])]
     time, bands, since = record.time, [], float(record.time[0])
@@ -294,7 +297,7 @@ def mode_bands(record: Record, name: str) -> list[tuple[float, float, int]]:
 
 
 def _draw_modes(axes: Axes, record: Record, name: str) -> None:
-    """Bands behind the curve: when the contact is open, slides and sticks, with the share of the run in the legend."""
+    """Draw bands behind the curve for open, sliding and sticking, with the fraction of the run in the legend."""
     bands, contact = mode_bands(record, name), _summary(record, name)
     limits = axes.get_xlim()
     for mode, (text, colour, key) in enumerate(MODES):

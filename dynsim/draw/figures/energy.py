@@ -1,4 +1,4 @@
-"""Figures of electrical energy and work over time ([WM] Figs 7, 8), and of the energy ledger."""
+"""Figures of an arm over time: energy and work ([WM] Figs 7, 8), energy ledger, motors, hand path, tracking error."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from dynsim.draw.geometry.shapes import box_about
 from dynsim.record import Record
 from dynsim.record.measures import RESIDUAL_LIMIT, energy_turnover, hand_error, hand_target
 
-# Terms of the ledger in the order in which they are stacked.
+# Terms of the ledger, in stacking order.
 TERMS = {
     "heat_joule": ("Joule heat in the windings", "#E69F00"),
     "loss_gear": ("gear losses", "#56B4E9"),
@@ -26,30 +26,30 @@ TERMS = {
     "loss_stop": ("impacts at joint stops", "#F0E442"),
     "loss_damper": ("dampers of contacts and ties", "#44AA99"),
     "energy_elastic": ("Δ elastic energy", "#AA4499"),
-    "loss_scheme": ("taken by time steps", "#999933"),
+    "loss_scheme": ("loss of time stepping", "#999933"),
     "energy_kinetic": ("Δ kinetic energy", "#009E73"),
     "energy_potential": ("Δ potential energy", "#CC79A7"),
     "energy_magnetic": ("Δ magnetic energy", "#7F7F7F"),
 }
-# Largest ratio of final values that is drawn on a linear axis.
+# Largest ratio of final values that is drawn with a linear axis.
 LOG_RATIO = 8.0
-# Share of the turnover above which one term hides the others, which then get a panel of their own.
+# Fraction of the turnover above which one term hides the others, which then get a separate panel.
 DOMINANT = 0.8
-# Less than this share of the largest term is rounding.
+# Smaller fractions of the largest term are rounding errors.
 NOTHING = 1e-9
-# Net and drawn energy that are nowhere further apart than this share of the largest are one curve.
+# Net and drawn energy are one curve if they differ by no more than this fraction of the maximum.
 DIFFER = 0.01
-# A residual below this share of its limit is a number, not a picture.
+# A residual below this fraction of its limit is only printed, not drawn.
 SMALL_RESIDUAL = 0.1
 
 
 def has_motors(record: Record) -> bool:
-    """Whether the record has electrical energy to draw."""
+    """Return whether the record has electrical energy to draw."""
     return "energy_electrical" in record and "current" in record and record["current"].shape[1] > 0
 
 
 def energy(record: Record) -> Figure | None:
-    """Electrical energy, net and, where it differs, drawn; mechanical work. None without motors."""
+    """Draw net electrical energy, drawn energy if it differs, and mechanical work; None without motors."""
     if not has_motors(record):
         return None
     figure = style.new_figure(4.2, style.title(record, "electrical energy and mechanical work"))
@@ -74,7 +74,7 @@ def energy(record: Record) -> Figure | None:
 
 
 def energy_comparison(records: Mapping[str, Record]) -> Figure | None:
-    """Electrical energy over time and in total, and mechanical work, of all variants."""
+    """Draw electrical energy over time and in total, and mechanical work, of all variants."""
     shown = {name: record for name, record in records.items() if has_motors(record)}
     if not shown:
         return None
@@ -94,7 +94,7 @@ def energy_comparison(records: Mapping[str, Record]) -> Figure | None:
         style.line(work, record.time, record["work_mechanical"], **styles[name])
     if logarithmic:
         style.log_axis(over_time)
-        # The first milliseconds would spread the axis over many decades in which nothing is to be seen.
+        # The first milliseconds would extend the axis by many almost empty decades.
         over_time.set_ylim(least, 1.6 * finals.max())
     over_time.set_ylabel("electrical energy [J]")
     over_time.tick_params(labelbottom=False)
@@ -109,9 +109,9 @@ def energy_comparison(records: Mapping[str, Record]) -> Figure | None:
 
 
 def ledger(record: Record) -> Figure | None:
-    """Where the energy went, stacked, and what the ledger does not explain; None without a ledger.
+    """Draw the stacked terms of the energy ledger and its residual; None without a ledger.
 
-    Where Joule heat would hide the rest, the rest has the panel, and a small one aside has all of it.
+    If Joule heat would hide the other terms, the main panel omits it, and a small panel shows all terms.
     """
     if "energy_residual" not in record:
         return None
@@ -159,7 +159,7 @@ def _residual_note(record: Record, turnover: float) -> str:
 
 
 def _stack(axes: Axes, time: Array, terms: Mapping[str, Array], supplied: Array, source: str) -> None:
-    """Positive terms upward and negative ones downward from zero: both together make up what was supplied."""
+    """Stack positive terms upward and negative terms downward from zero; their sum is the supplied energy."""
     kept = np.unique(np.linspace(0, len(time) - 1, min(len(time), style.LINE_POINTS // 4)).astype(int))
     largest = max(float(np.abs(values[-1])) for values in (*terms.values(), supplied))
     for clip in (np.maximum, np.minimum):
@@ -205,14 +205,14 @@ def _residual(axes: Axes, record: Record, turnover: float) -> None:
 
 
 def _totals(axes: Axes, names: Sequence[str], values: Array, colours: Sequence[str], logarithmic: bool) -> None:
-    """Totals as bars; on the logarithmic axis of the curves, where these would have no foot, as dots.
+    """Draw totals as bars, or as dots on a logarithmic axis, which has no zero.
 
-    Those have what they are as parts of the largest beside them.
+    Dots are labelled with their ratio to the largest total.
     """
     places, largest = np.arange(len(names)), float(values.max())
     if logarithmic:
         axes.scatter(places, values, s=60, c=colours, zorder=3)
-        # Room for the numbers, on an axis of decades.
+        # Space for the numbers on a logarithmic axis.
         axes.set_ylim(0.6 * float(values.min()), 2.0 * largest)
         style.log_axis(axes)
         axes.margins(x=0.2)
@@ -226,29 +226,27 @@ def _totals(axes: Axes, names: Sequence[str], values: Array, colours: Sequence[s
         axes.annotate(text, (x, max(value, 0.0)), xytext=(0, 6 if logarithmic else 2), **look)
     axes.set_xticks(places, names, rotation=30 if len(names) <= 4 else 60, ha="right")
     axes.grid(axis="x", visible=False)
-    axes.set_title("electrical energy of the run, net [J]" + (",\nand as a part of the largest" if logarithmic else ""))
+    axes.set_title("electrical energy of the run, net [J]" + (",\nand relative to the largest" if logarithmic else ""))
 
 
 def _joules(values: Array, largest: float = 0.0) -> str:
-    """The last value; 0 if it is rounding beside the largest of its ledger."""
+    """Format the last value; 0 if it is only rounding error of the largest value of the ledger."""
     last = float(values[-1])
     return f"{style.number(0.0 if abs(last) < NOTHING * largest else last)} J"
 
 
-# Figures of motor currents and voltages over time.
-
-
-# Most motors with lines of their own: those with the largest currents; of more motors the envelope is drawn too.
+# Motor currents and voltages. Only the motors with the largest currents have separate lines, at most this number; if
+# there are more motors, the envelope of all is drawn too.
 LARGEST = 6
 
 
 def motors(record: Record) -> Figure | None:
-    """Motor currents and terminal voltages; None without motors."""
+    """Draw motor currents and terminal voltages; None without motors."""
     if "current" not in record or record["current"].shape[1] == 0:
         return None
     signals = (("current", "current [A]"), ("voltage", "voltage [V]"))
     count = record["current"].shape[1]
-    # By the current after the start, where all motors are busy; the same motors in both panels.
+    # Selected by the current after the start, when all motors are active; the same motors in both panels.
     settled = record.time >= style.settle_time(record)
     late = settled if settled.any() else slice(None)
     effort = np.sqrt((record["current"][late] ** 2).mean(axis=0))
@@ -279,16 +277,14 @@ def _draw(axes: Axes, record: Record, name: str, shown: np.ndarray, looks: Mappi
     axes.axhline(0.0, color=style.GREY, linewidth=0.6)
 
 
-# Figures of the hand and its target: paths in three planes, and tracking error over time ([WM] Figs 4–6).
-
-
+# Hand and target: paths in three planes, and tracking error over time ([WM] Figs 4–6).
 PLANES = ((0, 1), (0, 2), (1, 2))
 MILLI = 1e3
-# A target whose motion stays within this is fixed [m].
+# A target that moves less than this is fixed [m].
 HELD = 1e-6
-# Legends: position of the hand by its path, and by the goals of the joints.
+# Legend entries: target from the path of the hand, and from the goals of the joints.
 TARGET, GOALS = "target", "goals"
-# Mark of the start of a hand, the same for all variants.
+# Mark of the start position of the hand, the same for all variants.
 START: dict[str, Any] = {
     "linestyle": "none",
     "marker": "o",
@@ -300,12 +296,12 @@ START: dict[str, Any] = {
 
 
 def path(record: Record) -> Figure | None:
-    """Hand path and target in xy, xz and yz at one scale; None without a hand."""
+    """Draw hand path and target in xy, xz and yz at one scale; None without a hand."""
     return _paths({"hand": record}, style.title(record, "hand path"))
 
 
 def path_comparison(records: Mapping[str, Record]) -> Figure | None:
-    """Hand paths of all variants in xy, xz and yz."""
+    """Draw the hand paths of all variants in xy, xz and yz."""
     return _paths(records, style.comparison_title(list(records.values()), "hand paths"))
 
 
@@ -313,7 +309,7 @@ def _paths(records: Mapping[str, Record], title: str) -> Figure | None:
     shown = {name: record for name, record in records.items() if "hand_position" in record}
     if not shown:
         return None
-    # Three square panels and the legend, without room above and below.
+    # Three square panels and the legend, without extra space.
     figure = style.new_figure(2.62 + style.LEGEND_ROW * -(-(3 + len(shown)) // 4) / 72.0, title)
     panels = _planes(figure, list(shown.values()))
     styles = style.variant_styles(list(records))
@@ -328,7 +324,7 @@ def _paths(records: Mapping[str, Record], title: str) -> Figure | None:
 
 
 def error(record: Record) -> Figure | None:
-    """Tracking error over time, components and norm; None without a target."""
+    """Draw the tracking error over time, components and norm; None without a target."""
     target = hand_target(record)
     if target is None:
         return None
@@ -355,7 +351,7 @@ def error(record: Record) -> Figure | None:
 
 
 def error_comparison(records: Mapping[str, Record]) -> Figure | None:
-    """Tracking errors of all variants: distance from the target, logarithmic, and the vertical part."""
+    """Draw the tracking errors of all variants: distance from the target (logarithmic) and vertical error."""
     shown = {name: record for name, record in records.items() if hand_target(record) is not None}
     if not shown:
         return None
@@ -385,7 +381,7 @@ def error_comparison(records: Mapping[str, Record]) -> Figure | None:
 
 
 def _log_rows(panels: Sequence[Axes], settled: Array) -> None:
-    """Logarithmic axes; that of the whole run, where the beginning has a panel of its own, for what has settled."""
+    """Make the axes logarithmic; those of the whole run show the settled range if there is a transient panel."""
     for axes in panels:
         axes.autoscale(axis="y")
         style.log_axis(axes)
@@ -395,7 +391,7 @@ def _log_rows(panels: Sequence[Axes], settled: Array) -> None:
 
 
 def _planes(figure: Figure, records: list[Record]) -> list[Axes]:
-    """Three square panels of one scale, large enough for hands and targets."""
+    """Create three square panels of one scale that contain all hands and targets."""
     points = [record["hand_position"] for record in records]
     points += [target for record in records if (target := hand_target(record)) is not None]
     low, high = box_about(points)
@@ -404,12 +400,12 @@ def _planes(figure: Figure, records: list[Record]) -> list[Axes]:
     middle = 0.5 * (low + high)
     panels = list(figure.subplots(1, 3))
     for axes, (i, j) in zip(panels, PLANES, strict=True):
-        axes.set_aspect("equal", anchor="N")  # room that is left is above the legend
+        axes.set_aspect("equal", anchor="N")  # unused space is above the legend
         axes.set_xlim(middle[i] - half, middle[i] + half)
         axes.set_ylim(middle[j] - half, middle[j] + half)
         axes.set_xlabel(f"{'xyz'[i]} [m]")
         axes.set_ylabel(f"{'xyz'[j]} [m]")
-        # Fewer beside each other, where "−0.050" is wide, than above each other.
+        # Fewer ticks along x, where labels such as "−0.050" are wide.
         axes.locator_params(axis="x", nbins=4)
         axes.locator_params(axis="y", nbins=5)
     return panels
@@ -422,7 +418,7 @@ def _draw_target(axes: Axes, record: Record, plane: tuple[int, int]) -> None:
     target = wanted[:, plane]
     known = wanted[np.isfinite(wanted).all(axis=1)]
     if len(known) and float(np.ptp(known, axis=0).max()) <= HELD:
-        # Larger than the start of the hand, which may lie on it.
+        # Larger than the mark of the hand start, which may coincide with it.
         axes.plot(*target[0], "x", label=target_name(record), color=style.BLACK, markersize=8, zorder=3)
         return
     axes.plot(*edge_on(target).T, label=target_name(record), color=style.BLACK, linestyle=(0, (4, 2)), zorder=3, lw=0.9)
@@ -430,14 +426,14 @@ def _draw_target(axes: Axes, record: Record, plane: tuple[int, int]) -> None:
 
 
 def target_name(record: Record) -> str:
-    """What a legend calls :func:`dynsim.record.measures.hand_target`."""
+    """Return the legend entry of :func:`dynsim.record.measures.hand_target`."""
     return TARGET if "target_position" in record else GOALS
 
 
 def edge_on(points: Array) -> Array:
-    """A curve in the plane of the drawing, (T, 2); one seen edge-on as the segment that it covers.
+    """Return a plane curve, (T, 2), or, if it is straight, only its end points.
 
-    Running to and fro over itself it would fill the gaps of its own dashes.
+    A line drawn back and forth would fill the gaps between its dashes.
     """
     points = style.sparse(points)
     if len(points) < 3 or not np.isfinite(points).all():
@@ -454,7 +450,7 @@ def _legend_below(figure: Figure, axes: Axes) -> None:
     followed = {line.get_label() for line in axes.get_lines() if line.get_linestyle() != "None"}
     axes.plot([], [], label="start of the hand", **START)
     for target in (TARGET, GOALS):
-        # One that is held is a mark itself.
+        # A fixed target is a mark itself.
         if target in followed:
             axes.plot([], [], "x", color=style.BLACK, markersize=5, label=f"start of the {target}")
     style.legend_below(figure, [axes], 4)
@@ -467,7 +463,7 @@ def _error_label(name: str, record: Record) -> str:
 
 
 def _mark_settle(panels: Sequence[Axes], record: Record) -> None:
-    """A line in every panel; the legend of the first names it, as a label beside it would lie on the curves."""
+    """Draw a line at the settling time in every panel; only the first has a legend entry, away from the curves."""
     settle = style.settle_time(record)
     if max(0.0, record.time[0]) < settle < min(float(record.time[-1]), panels[0].get_xlim()[1]):
         for axes in panels:

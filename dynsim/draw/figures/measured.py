@@ -1,4 +1,4 @@
-"""Figures of a measured run: joints beside their goals, servos, and hand path and posture by the measured angles."""
+"""Figures of a measured run: joints and goals, servos, hand path and posture; and errors against a simulated run."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from dynsim.draw.figures import energy, posture, style
 from dynsim.draw.figures.style import Array
 from dynsim.record import TIME, Record
 
-# Most joints on a page; of more joints, those with the largest errors are drawn.
+# Maximum number of joints on a page; the joints with the largest errors are drawn.
 JOINTS = 24
-# Most lines in one panel.
+# Maximum number of lines in a panel.
 LINES = 12
 MILLI = 1e3
 
 
 def draw(record: Record, folder: Path, kind: str = "png") -> list[Path]:
-    """See :func:`dynsim.draw.figures.draw`."""
+    """Draw all figures, see :func:`dynsim.draw.figures.draw`."""
     return style.save_all(FIGURES, record, folder, kind)
 
 
 def joints(record: Record) -> Figure | None:
-    """Every joint with its goal over time; None where no goal was recorded."""
+    """Draw every joint with its goal over time; None without recorded goals."""
     followed = _followed(record)
     if not followed:
         return None
@@ -52,7 +52,7 @@ def joints(record: Record) -> Figure | None:
 
 
 def following_error(record: Record) -> Figure | None:
-    """Measured minus goal of every joint over time, and how large it is; None where no goal was recorded."""
+    """Draw the following error (measured minus goal) of every joint over time and its size; None without goals."""
     followed = _followed(record)
     if not followed:
         return None
@@ -72,7 +72,7 @@ def following_error(record: Record) -> Figure | None:
     during = record.time >= 0.0 if (record.time >= 0.0).any() else slice(None)
     errors = [MILLI * np.abs(measured - goal)[during] for _, _, measured, goal in shown]
     places = np.arange(len(shown))
-    largest.bar(places, [_finite(np.nanmax, error) for error in errors], color="#CFCFCF", width=0.7, label="largest")
+    largest.bar(places, [_finite(np.nanmax, error) for error in errors], color="#CFCFCF", width=0.7, label="max")
     rms = [_finite(lambda e: np.sqrt(np.nanmean(e**2)), error) for error in errors]
     largest.bar(places, rms, color=style.BLUE, width=0.4, label="rms")
     largest.set_xticks(places, [label for label, *_ in shown], rotation=30 if len(shown) > 6 else 0, ha="center")
@@ -85,7 +85,7 @@ def following_error(record: Record) -> Figure | None:
 
 
 def servos(record: Record) -> Figure | None:
-    """What the servos say of themselves, and how the cycles kept their time; None where they said nothing."""
+    """Draw measurements of the servos and the timing of the cycles; None without measurements."""
     rows = [
         (name, label)
         for name, label in (
@@ -98,7 +98,7 @@ def servos(record: Record) -> Figure | None:
     ]
     if not rows:
         return None
-    # The same joints in every row: those of which the first row has most to say.
+    # The same joints in every row, selected by the largest values in the first row.
     first, names = record[rows[0][0]], record.labels[rows[0][0]]
     size = [_finite(np.nanmax, np.abs(column)) for column in first.T]
     shown = [names[k] for k in np.sort(np.argsort(size)[::-1][:LINES])]
@@ -123,7 +123,7 @@ def servos(record: Record) -> Figure | None:
 
 
 def _cycles(axes: Axes, record: Record) -> None:
-    """Lateness of the cycles, and those in which a servo did not answer."""
+    """Draw the lateness of the cycles, and mark cycles in which a servo did not answer."""
     style.line(axes, record.time, MILLI * record["lateness"], color=style.BLACK, lw=0.9)
     if "exchange" in record:
         style.line(axes, record.time, MILLI * record["exchange"], color=style.SKY, lw=0.9)
@@ -147,7 +147,7 @@ Followed = tuple[str, str, Array, Array]
 
 
 def _followed(record: Record) -> list[Followed]:
-    """Label, unit, measured and goal of everything that had goals: positions, and rates of what has no position."""
+    """Return label, unit, measurement and goal of all quantities with goals: positions, or rates without a position."""
     followed: dict[str, Followed] = {}
     own = [name for name, signal in record.signals.items() if signal.axis == TIME and signal.data.ndim == 2]
     names = [name for name in own if f"{name}_goal" in own and name != "hand_position"]
@@ -160,19 +160,19 @@ def _followed(record: Record) -> list[Followed]:
 
 
 def _largest(followed: Sequence[Followed], count: int) -> list[Followed]:
-    """All, or those with the largest error, in their order."""
+    """Return all entries, or the ``count`` entries with the largest error, in their order."""
     errors = [_finite(np.nanmax, np.abs(measured - goal)) for _, _, measured, goal in followed]
     kept = np.sort(np.argsort(errors)[::-1][:count])
     return [followed[k] for k in kept]
 
 
 def _finite(measure: Callable[[Array], float], values: Array) -> float:
-    """A measure of the values that are there; 0 where there are none."""
+    """Apply a measure to values, or return 0 if no value is finite."""
     return float(measure(values)) if np.isfinite(values).any() else 0.0
 
 
 def _mark_replay(axes: Axes, record: Record, *, named: bool = False) -> None:
-    """Where the replay changed its state, as dotted lines; faults in red."""
+    """Draw dotted lines at changes of the replay state; faults in red."""
     start, end = float(record.time[0]), float(record.time[-1])
     for event in record.events:
         if event.kind not in ("state", "fault") or not start < event.time <= end:
@@ -198,11 +198,11 @@ def _label_time(grid: np.ndarray) -> None:
 
 
 def figures(record: Record) -> dict[str, Callable[[Record], Figure | None]]:
-    """Makers of the figures of one run by file name; a maker gives None where the record has no data for it."""
+    """Return the drawing functions of one run by file name; they return None if the record has no data."""
     return FIGURES
 
 
-# File name → figure, None where the record has no data for it.
+# Drawing functions by file name; they return None if the record has no data.
 FIGURES: dict[str, Callable[[Record], Figure | None]] = {
     "joints": joints,
     "following_error": following_error,
@@ -213,29 +213,35 @@ FIGURES: dict[str, Callable[[Record], Figure | None]] = {
 }
 
 
-# Figure of the errors between measured and simulated runs, for `dynsim hw compare`.
+# Errors between measured and simulated runs, for `dynsim hw compare`.
 
-
-# Number of joints drawn in colour where none are named: those with the largest rms errors.
-STRONG = 4
+# Number of joints drawn in colour by default, selected by the largest rms errors.
+HIGHLIGHTED = 4
 FAINT: dict[str, Any] = {"color": "#CFCFCF", "linewidth": 0.7}
-# On top and dashed, so that both are visible where they agree.
+# On top and dashed, so that both are visible if they agree.
 SIMULATED: dict[str, Any] = {"color": style.BLACK, "linewidth": 0.9, "linestyle": (0, (4, 3))}
 
 
 @dataclass(frozen=True)
 class Compared:
-    """One quantity of several joints, simulated and measured, and its errors.
+    """One quantity of several joints, simulated and measured, with its errors.
 
     Attributes
     ----------
-    kind : plural noun, such as "joints"
-    quantity, error : labels of the axes, with units
-    scale : of the error's unit to that of the values
-    names : of the joints
-    rms : of their errors
-    texts : about their errors
-    values : (2, T, N), simulated and measured
+    kind : str
+        Plural noun, such as "joints".
+    quantity, error : str
+        Axis labels, with units.
+    scale : float
+        Factor from the unit of the values to the unit of the error.
+    names : list of str
+        Names of the joints.
+    rms : list of float
+        Rms errors.
+    texts : list of str
+        Legend entries of the errors.
+    values : (2, T, N) ndarray
+        Simulated and measured values.
     """
 
     kind: str
@@ -249,14 +255,29 @@ class Compared:
 
 
 def draw_errors(title: str, time: Array, quantities: Sequence[Compared], named: Sequence[str], path: Path) -> Path:
-    """Two panels for each quantity: values of some joints, measured over simulated, and the errors of all.
+    """Draw two panels per quantity: measured over simulated values of some joints, and the errors of all joints.
 
     Parameters
     ----------
-    named : joints in colour, of any quantity; the ``STRONG`` worst of one of which none is named
+    title : str
+        Title of the figure.
+    time : (T,) ndarray
+        Times [s].
+    quantities : sequence of Compared
+        Quantities to draw.
+    named : sequence of str
+        Joints to draw in colour; for a quantity without a named joint, the ``HIGHLIGHTED`` joints with the largest
+        error.
+    path : Path
+        File to write.
+
+    Returns
+    -------
+    Path
+        The written file.
     """
     with style.look():
-        rows = [style.LEGEND_ROW / 72.0 * (3 + min(len(quantity.names), STRONG)) / 2 for quantity in quantities]
+        rows = [style.LEGEND_ROW / 72.0 * (3 + min(len(quantity.names), HIGHLIGHTED)) / 2 for quantity in quantities]
         figure = style.new_figure(sum(4.2 + row for row in rows), title)
         panels = figure.subplots(2 * len(quantities), 1, sharex=True)
         for quantity, (values, errors) in zip(quantities, panels.reshape(-1, 2), strict=True):
@@ -267,7 +288,9 @@ def draw_errors(title: str, time: Array, quantities: Sequence[Compared], named: 
 
 def _draw(values: Axes, errors: Axes, time: Array, quantity: Compared, named: Sequence[str]) -> None:
     ranking = sorted(range(len(quantity.names)), key=lambda k: -quantity.rms[k])
-    chosen = [quantity.names.index(name) for name in dict.fromkeys(named) if name in quantity.names] or ranking[:STRONG]
+    chosen = [quantity.names.index(name) for name in dict.fromkeys(named) if name in quantity.names] or ranking[
+        :HIGHLIGHTED
+    ]
     looks = style.variant_styles([quantity.names[k] for k in chosen])
     simulated, measured = quantity.values
     coloured = {

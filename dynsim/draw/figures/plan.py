@@ -1,4 +1,4 @@
-"""Figures of a plan of braces: posture with forces along the path, heat by set, map of single braces, robustness."""
+"""Figures of a brace plan: posture with forces along the path, heat by brace set, map of single braces, robustness."""
 
 from __future__ import annotations
 
@@ -26,25 +26,28 @@ from dynsim.draw.figures.style import (
     save_all,
 )
 
-# Largest length of the arrow of the greatest force, in parts of the height of the view.
+# Maximum length of the arrow of the largest force, relative to the height of the view.
 ARROW = 0.35
-# An arm that leaves its plane by less than this part of its length is not drawn from above.
+# An arm that leaves its plane by less than this fraction of its length is not drawn from above.
 FLAT = 0.02
-# Values whose ratio is larger are drawn on a logarithmic axis.
+# Values with a larger ratio are drawn on a logarithmic axis.
 WIDE = 20.0
-# Margin to either side of an arm in the view from above [m].
+# Margin on each side of the arm in the view from above [m].
 MARGIN = 0.1
 
 
 @dataclass(frozen=True)
 class Pose:
-    """The arm at one instant: along its heading, to the left of it, and up [m].
+    """Arm at one time; coordinates are along its heading, to its left, and up [m].
 
     Attributes
     ----------
-    time : [s]
-    lines : of each link both ends, (2, 3)
-    points, forces : of the braces, (c, 3) [m] and [N]
+    time : float
+        Time [s].
+    lines : sequence of (2, 3) ndarray
+        Both ends of each link.
+    points, forces : (c, 3) ndarray
+        Points [m] and forces [N] of the braces.
     """
 
     time: float
@@ -55,18 +58,28 @@ class Pose:
 
 @dataclass(frozen=True)
 class PlanPicture:
-    """What the figures of a plan show.
+    """Content of the figures of a plan.
 
     Attributes
     ----------
-    title : of the scenario
-    poses : of the best plan; path: of the hand, (T, 3) [m], as those of the poses
-    braces : names of the best plan's, in the order of their points
-    ground : distance from the nearest surface on a grid: along, up, and (up, along) [m]
-    sets : label and heat [W] by number of braces; the first of each is the answer
-    survives : of the answers
-    singles : heat of single braces by candidate [W]
-    corners : of the answers, by number of braces: labels, heat [W] and hand's error [mm]; planned heat
+    title : str
+        Title of the scenario.
+    poses : sequence of Pose
+        Poses of the best plan.
+    path : (T, 3) ndarray
+        Hand path [m], in the coordinates of the poses.
+    braces : sequence of str
+        Names of the braces of the best plan, in the order of their points.
+    ground : tuple of ndarray
+        Distance from the nearest surface on a grid: along, up, and (up, along) [m].
+    sets : mapping of int to sequence
+        Label and heat [W] of brace sets, by number of braces; the first set of each number is the answer.
+    survives : mapping of int to bool or None
+        Whether each answer survives verification.
+    singles : mapping of str to float
+        Heat of single braces by candidate [W].
+    corners : mapping of int to tuple
+        For each answer, by number of braces: planned heat [W]; labels, heat [W] and hand error [mm] of the corners.
     """
 
     title: str
@@ -81,7 +94,7 @@ class PlanPicture:
 
 
 def posture(picture: PlanPicture) -> Figure | None:
-    """The best plan at some instants with the forces of its braces, from above too where it leaves its plane."""
+    """Draw the best plan at several times with brace forces, also from above if it leaves its plane."""
     if not picture.poses:
         return None
     along, up, gap = picture.ground
@@ -95,7 +108,7 @@ def posture(picture: PlanPicture) -> Figure | None:
     side = views[0]
     side.contourf(along, up, gap, levels=[-1e9, 0.0], colors=["#D9D9D9"])
     side.contour(along, up, gap, levels=[0.0], colors=[GREY], linewidths=0.8)
-    # Arrows come from below most braces, and stay within.
+    # Most arrows come from below the braces, and must stay within the view.
     lowest = min(pose.points[:, 2].min(initial=up[-1]) for pose in picture.poses)
     length = min(ARROW * float(np.ptp(up)), float(lowest - up[0]))
     largest = max(float(np.linalg.norm(pose.forces, axis=1).max(initial=0.0)) for pose in picture.poses)
@@ -105,7 +118,7 @@ def posture(picture: PlanPicture) -> Figure | None:
         axes.plot(*picture.path[:, seen].T, color=GREEN, linewidth=2.0, label="path of the hand")
         axes.set(ylabel=name, aspect="equal")
     if largest > 0.0:
-        side.plot([], [], color=PULLING, label=f"forces on braces, at most {number(largest, 3)} N")
+        side.plot([], [], color=PULLING, label=f"forces on braces, max {number(largest, 3)} N")
     if not flat:
         views[1].set_ylim(aside.min() - MARGIN, aside.max() + MARGIN)
     views[-1].set_xlabel("along the heading [m]")
@@ -114,7 +127,7 @@ def posture(picture: PlanPicture) -> Figure | None:
 
 
 def _draw_poses(axes: Axes, picture: PlanPicture, seen: list[int], largest: float, length: float) -> None:
-    """Links, forces, and numbers of braces beside their points in the last pose: the legend has their names."""
+    """Draw links, forces, and the numbers of braces at their points in the last pose; names are in the legend."""
     for k, pose in enumerate(picture.poses):
         shade = 0.25 + 0.75 * (k + 1) / len(picture.poses)
         for line in pose.lines:
@@ -144,7 +157,7 @@ def _draw_poses(axes: Axes, picture: PlanPicture, seen: list[int], largest: floa
 
 
 def heat_by_set(picture: PlanPicture) -> Figure | None:
-    """Planned heat of the best sets of each size, and the simulated one of the answers, which are filled."""
+    """Draw the planned heat of the best sets of each size, and the simulated heat of the answers (filled)."""
     rows = [(count, label, heat, k) for count, sets in picture.sets.items() for k, (label, heat) in enumerate(sets)]
     if not rows:
         return None
@@ -156,20 +169,20 @@ def heat_by_set(picture: PlanPicture) -> Figure | None:
         texts.append(f"{number(heat, 3)} W{run}{', does not survive' if lost else ''}")
         marks.append({"marker": "X" if lost else "o", "markerfacecolor": BLUE if k == 0 else "white"})
     labels = [f"{count}: {label}" for count, label, _, _ in rows]
-    title = f"{picture.title}: heat of the motors by set of braces, the answers filled"
+    title = f"{picture.title}: motor heat by brace set, answers filled"
     return _dots(title, labels, [heat for _, _, heat, _ in rows], texts, marks, "mean heat, planned [W]")
 
 
 def single_braces(picture: PlanPicture) -> Figure | None:
-    """Least heat of an arm with one brace, by the point that is braced, in the middle of the path without slip."""
+    """Draw the minimum heat of an arm with one brace, by braced point, in the middle of the path without slip."""
     if not picture.singles:
         return None
     heats = list(picture.singles.values())
     best = min(heats)
-    texts = [f"{number(heat, 3)} W{', least' if heat == best else ''}" for heat in heats]
+    texts = [f"{number(heat, 3)} W{', minimum' if heat == best else ''}" for heat in heats]
     marks = [{"marker": "o", "markerfacecolor": BLUE if heat == best else "white"} for heat in heats]
-    title = f"{picture.title}: one brace, by where it is"
-    return _dots(title, list(picture.singles), heats, texts, marks, "least heat at one posture, no slip [W]")
+    title = f"{picture.title}: one brace, by braced point"
+    return _dots(title, list(picture.singles), heats, texts, marks, "minimum heat at one posture, no slip [W]")
 
 
 def _dots(
@@ -180,8 +193,10 @@ def _dots(
     marks: Sequence[Mapping[str, Any]],
     axis: str,
 ) -> Figure:
-    """A row with a dot and its text for each value: on a logarithmic axis, which values of many sizes need, bars would
-    begin anywhere."""
+    """Draw a row with a dot and its text for each value.
+
+    Bars would have no natural start on the logarithmic axis that a wide range needs.
+    """
     figure = new_figure(1.1 + 0.26 * len(values), title)
     axes = figure.subplots()
     low, high = min(values), max(values)
@@ -189,7 +204,7 @@ def _dots(
     middle = np.sqrt(low * high) if wide else 0.5 * high
     for y, (value, text, mark) in enumerate(zip(values, texts, marks, strict=True)):
         axes.plot(value, y, color=BLUE, markersize=6.0, linestyle="none", clip_on=False, zorder=3, **mark)
-        # Towards the middle, where there is room.
+        # Towards the middle, where there is space.
         offset, side = (7.0, "left") if value <= middle else (-7.0, "right")
         axes.annotate(
             text, (value, y), xytext=(offset, 0.0), textcoords="offset points", ha=side, va="center", fontsize=7.0
@@ -206,11 +221,11 @@ def _dots(
 
 
 def robustness(picture: PlanPicture) -> Figure | None:
-    """Heat, over the planned one, and the hand's error of the answers where the scene is not as planned."""
+    """Draw heat relative to the plan, and hand error, of the answers in scenes that differ from the plan."""
     shown = {count: corners for count, corners in picture.corners.items() if len(corners[1]) > 1}
     if not shown:
         return None
-    figure = new_figure(4.2, f"{picture.title}: the plans where the scene is not as planned")
+    figure = new_figure(4.2, f"{picture.title}: plans with errors of the scene")
     upper, lower = figure.subplots(2, 1, sharex=True)
     labels = [label for label, _, _ in next(iter(shown.values()))[1]]
     width = 0.8 / len(shown)
@@ -221,7 +236,7 @@ def robustness(picture: PlanPicture) -> Figure | None:
         lower.bar(at, [error for _, _, error in corners], width, color=colour)
     upper.axhline(1.0, color="black", linewidth=0.6)
     upper.set_ylabel("heat over planned")
-    lower.set_ylabel("hand's error, rms [mm]")
+    lower.set_ylabel("hand error, rms [mm]")
     lower.set_xticks(range(len(labels)), labels, rotation=25.0, ha="right", fontsize=6.5)
     legend_above(upper, columns=len(shown))
     return figure
@@ -240,5 +255,5 @@ FIGURES = {
 
 
 def draw_plan_figures(picture: PlanPicture, folder: Path, kind: str) -> list[Path]:
-    """All figures of a plan to a folder; returns the files."""
+    """Draw all figures of a plan to a folder; return the files."""
     return save_all(FIGURES, picture, folder, kind)

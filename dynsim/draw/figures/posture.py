@@ -1,4 +1,4 @@
-"""Figures of an arm's posture: 3D view and side view with elbows, surfaces, target and hand path; comparison."""
+"""Figures of the posture of an arm: 3D view and side view with elbows, surfaces, target and hand path; comparison."""
 
 from __future__ import annotations
 
@@ -25,38 +25,35 @@ from dynsim.record.measures import hand_target
 from dynsim.record.poses import POSITION, contact_positions, point_positions
 from dynsim.record.scene import WORLD, Joint, Point, Scene, SceneSurface
 
-# Lines and points of an arm from the scene and body poses of its record, and their extent.
-
-
-# Number of postures drawn faintly, at even intervals of the run, besides the last one.
+# Number of postures that are drawn faintly, evenly spaced in time, in addition to the last one.
 FAINT = 6
-# Text at the contacts: font size, and height of its two lines [point].
+# Labels of contacts: font size, and height of two lines [point].
 LABEL_SIZE, LABEL_HEIGHT = 7.0, 19.0
-# From the middle of a contact's mark to its text [point].
+# Distance from the centre of a contact mark to its label [point].
 NEAR_CONTACT = 7.0
-# Extents up to this count as zero, as body poses are in single precision [m].
+# Smaller extents count as zero, because body poses are in single precision [m].
 NOTHING = 1e-6
 
 
 @dataclass(frozen=True)
 class Skeleton:
-    """A robot with the poses of its bodies over time."""
+    """Robot with the poses of its bodies over time."""
 
     record: Record
     scene: Scene
 
     def segments(self, row: int) -> Array:
-        """From each body's parent to the body, and from the hand's body to the hand, (m, 2, 3) [m].
+        """Return lines from each parent to its body, and from the body of the hand to the hand, (m, 2, 3) [m].
 
-        Nothing leads from the world or a body to what moves freely beside it.
+        There is no line to a body that moves freely relative to its parent or the world.
         """
         points, base = self.record[POSITION][row].astype(np.float64), self.scene.base
         lines = []
         for k, body in enumerate(self.scene.bodies):
-            # A mobile base is drawn as what it is, see :meth:`solids`.
-            if k in base or body.parent in base or _moves_beside(body.joint):
+            # A mobile base is drawn as a solid, see :meth:`solids`.
+            if k in base or body.parent in base or _is_translation_row(body.joint):
                 continue
-            # A sliding joint at the root moves its body away from where it is mounted.
+            # A prismatic joint at the root moves its body away from its mount.
             start = np.array(body.joint.position) if body.parent == WORLD else points[body.parent]
             lines.append((start, points[k]))
         hand = self.scene.hand
@@ -65,30 +62,29 @@ class Skeleton:
         return np.array(lines)
 
     def solids(self, row: int) -> list[tuple[Array, Faces]]:
-        """Corners, (n, 3) [m], and faces of the shapes of a mobile base and its wheels at a sample."""
+        """Return corners, (n, 3) [m], and faces of the shapes of a mobile base and its wheels at a sample."""
         return [solid for body in self.scene.base for solid in corners_of(self.record, self.scene, body, row)]
 
     def bases(self) -> list[list[Array]]:
-        """Corners of a mobile base's solids for each of the postures."""
+        """Return the corners of the solids of a mobile base for each posture."""
         return [[corners for corners, _ in self.solids(k)] for k in self.rows_shown()]
 
     def postures(self) -> list[Array]:
-        """Segments at some samples, those of the last one last; a run that diverged may end in some without poses."""
+        """Return the segments at the shown samples, the last sample last."""
         return [self.segments(k) for k in self.rows_shown()]
 
     def rows_shown(self) -> list[int]:
-        """Samples at which the robot is drawn, the last one last; none where it never had a pose."""
+        """Return the samples at which the robot is drawn, the last one last; empty if it never had a finite pose."""
         rows = np.flatnonzero(np.isfinite(self.record[POSITION]).all(axis=(1, 2)))
         if not len(rows):
             return []
         return list(dict.fromkeys(rows[np.linspace(0, len(rows) - 1, FAINT + 1).astype(int)].tolist()))
 
     def contacts(self) -> list[tuple[Point, SceneSurface, Array, float]]:
-        """Contact, its surface, position and normal force at the end; NaN for a force that is not known.
+        """Return point, surface, position and normal force (NaN if unknown) of each contact at the end.
 
-        A point with a radius is where its sphere touches, if a force says that it does.
-
-        Of those that could touch, under the unilateral law, the ones that did in some sample.
+        If there is a force, the position is on the surface. Under the unilateral law only contacts that touched are
+        returned.
         """
         record = self.record
         if not np.isfinite(record[POSITION][-1]).all():
@@ -114,52 +110,52 @@ class Skeleton:
         return contacts
 
 
-def _moves_beside(joint: Joint) -> bool:
-    """Whether it is a row of a floating, planar or rolling joint that takes the body away from what it hangs on."""
+def _is_translation_row(joint: Joint) -> bool:
+    """Return whether a joint is a translation of a floating, planar or rolling joint, which separates two bodies."""
     return bool(joint.part_of) and joint.kind in ("prismatic", "planar")
 
 
 def skeleton(record: Record) -> tuple[Skeleton | None, str]:
-    """The robot of a record, or why it cannot be drawn."""
+    """Return the robot of a record, or None and the reason why it cannot be drawn."""
     scene, lacking = placed(record)
     return (None, f"posture not drawn: {lacking}") if scene is None else (Skeleton(record, scene), "")
 
 
 @dataclass(frozen=True)
 class SidePlane:
-    """A vertical plane through ``origin``, where ``where`` is, along the horizontal unit vector ``direction``."""
+    """Vertical plane through ``origin`` (described by ``where``) along the horizontal unit vector ``direction``."""
 
     origin: Array
     direction: Array
     where: str = "the base"
 
     def project(self, points: Array) -> Array:
-        """(…, 3) world → (…, 2): along the plane and z [m]."""
+        """Project world points, (…, 3), to coordinates along the plane and z, (…, 2) [m]."""
         return np.stack([(points - self.origin) @ self.direction, points[..., 2]], axis=-1)
 
     def world(self, along: Array, z: Array) -> Array:
-        """Points in the plane, (…, 3) [m]."""
+        """Return points in the plane, (…, 3) [m]."""
         points = self.origin * np.array([1.0, 1.0, 0.0]) + along[..., None] * self.direction
         points[..., 2] = z
         return points
 
     @property
     def label(self) -> str:
-        """Label of the plane's horizontal axis."""
-        # Rounded first, and without the sign of a zero.
+        """Label of the horizontal axis of the plane."""
+        # Rounded first; adding 0 removes the sign of a negative zero.
         azimuth = round(float(np.degrees(np.arctan2(self.direction[1], self.direction[0])))) + 0
         return f"distance from {self.where}, azimuth {azimuth}° [m]"
 
 
 def side_plane(record: Record, drawn: Sequence[Array]) -> SidePlane:
-    """The vertical plane that the arm spans: from the base in the horizontal direction of its greatest extent."""
+    """Return the vertical plane of the arm: through the base, along the horizontal direction of its largest extent."""
     points = drawn[0].reshape(-1, 3) if drawn else record["hand_position"]
     origin = points[0]
-    where = "the arm's first place" if record.scene is not None and record.scene.base else "the base"
+    where = "the start of the arm" if record.scene is not None and record.scene.base else "the base"
     spread = (points - origin)[:, :2]
     spread = spread[np.isfinite(spread).all(axis=1)]
     if not len(spread) or np.abs(spread).max() < NOTHING:
-        # It stands upright at first; where does it go from there?
+        # The arm starts upright: use its later postures.
         spread = np.concatenate([segments.reshape(-1, 3) for segments in drawn] or [points])[:, :2] - origin[:2]
     if np.abs(spread).max(initial=0.0) < NOTHING:
         return SidePlane(origin, np.array([1.0, 0.0, 0.0]), where)
@@ -171,7 +167,7 @@ def side_plane(record: Record, drawn: Sequence[Array]) -> SidePlane:
 
 @dataclass(frozen=True)
 class Label:
-    """Text at a contact at ``place`` (x, z) [m] of the side plane, on a ``side`` of it, ``level`` labels away."""
+    """Label of a contact at ``place`` (x, z) [m] in the side plane, on one ``side`` of it, ``level`` labels away."""
 
     text: str
     place: Array
@@ -185,24 +181,24 @@ class Label:
 
     @property
     def offset(self) -> Array:
-        """From the contact to its middle [point]."""
+        """Offset from the contact to the centre of the label [point]."""
         half = float(self.half @ np.abs(self.side))
         return np.array(self.side) * (NEAR_CONTACT + (2 * self.level + 1) * half)
 
     def middle(self, scale: float) -> Array:
-        """Where it is in the side plane at a scale [point/m]."""
+        """Return the centre of the label in the side plane at a scale [point/m]."""
         return scale * self.place + self.offset
 
     def overprints(self, other: Label, scale: float) -> bool:
-        """Whether both would be written over each other."""
+        """Return whether two labels would overlap."""
         apart = np.abs(self.middle(scale) - other.middle(scale))
         return bool((apart < self.half + other.half + [2.0, 0.0]).all())
 
 
 def contact_labels(body: Skeleton | None, plane: SidePlane, scale: float) -> list[Label]:
-    """Names and forces of the contacts, on the far side of the surface, where there is no arm.
+    """Return labels with names and forces of the contacts, inside the surface and away from the arm.
 
-    Labels that would overprint each other at ``scale`` [point/m] are moved away from the surface.
+    Labels that would overlap at ``scale`` [point/m] are moved away from the surface.
     """
     labels: list[Label] = []
     points = [(*contact, plane.project(contact[2])) for contact in ([] if body is None else body.contacts())]
@@ -219,7 +215,7 @@ def contact_labels(body: Skeleton | None, plane: SidePlane, scale: float) -> lis
 
 
 def with_labels(extent: tuple[Array, Array], labels: Sequence[Label], scale: float) -> tuple[Array, Array]:
-    """The extent with room for the labels."""
+    """Return the extent with space for the labels."""
     low, high = extent
     for label in labels:
         middle, room = label.middle(scale) / scale, (label.half + 3.0) / scale
@@ -228,42 +224,42 @@ def with_labels(extent: tuple[Array, Array], labels: Sequence[Label], scale: flo
 
 
 def bounds(records: Sequence[Record], drawn: Sequence[Array]) -> tuple[Array, Array]:
-    """Corners of the box that a 3D view shows [m]."""
+    """Return the corners of the box of a 3D view [m]."""
     low, high = box_about(_clouds(records, drawn))
-    # A flat picture still needs some depth to stand in.
+    # A flat scene still needs some depth.
     extra = np.maximum(0.15 * float((high - low).max() or 1.0) - 0.5 * (high - low), 0.0)
     return low - extra, high + extra
 
 
 def extent_of(plane: SidePlane, drawn: Sequence[Array], records: Sequence[Record]) -> tuple[Array, Array]:
-    """Corners of what a side view shows [m]."""
+    """Return the corners of a side view [m]."""
     low, high = box_about([plane.project(points) for points in _clouds(records, drawn)])
     span = float((high - low).max() or 1.0)
-    # An upright arm would leave no width for the axis.
+    # An upright arm alone would leave no width for the axis.
     extra = np.maximum(np.array([0.3, 0.05]) * span - 0.5 * (high - low), 0.0) + 0.05 * span
     return low - extra, high + extra
 
 
 def _clouds(records: Sequence[Record], drawn: Sequence[Array]) -> list[Array]:
-    """Everything that must be in the picture, (…, 3) each."""
+    """Return all points that must be in the view, (…, 3) each."""
     targets = [target for record in records if (target := hand_target(record)) is not None]
     return [*(record["hand_position"] for record in records), *targets, *drawn]
 
 
-# An axis of the 3D view shorter than this share of the longest gets two ticks.
+# An axis of the 3D view that is shorter than this fraction of the longest axis gets two ticks.
 SHORT_AXIS = 0.45
-# Most joints that are drawn as dots.
+# Maximum number of joints that are drawn as dots.
 DOTS = 40
 ARM_COLOUR = "#444444"
 BASE_COLOUR = "#D5D5D5"
-# Width of a side view in a figure of one column, and of two [point].
+# Width of a side view in figures with one and with two columns [point].
 FULL, HALF = 440.0, 205.0
 
 
 def posture(record: Record) -> Figure | None:
-    """The arm at the end of the run and, faintly, before; None for a record without a hand.
+    """Draw the arm at the end of the run and, faintly, before; None for a record without a hand.
 
-    Where the record does not say what the arm looked like, only paths are drawn, with a note.
+    If the record does not describe the arm, only paths are drawn, with a note.
     """
     if "hand_position" not in record:
         return None
@@ -275,14 +271,14 @@ def posture(record: Record) -> Figure | None:
     wide = np.hypot(high[0] - low[0], high[1] - low[1]) > 2.2 * (high[2] - low[2])
     extent = extent_of(plane, everything, [record])
     size = extent[1] - extent[0]
-    # What the side view needs at the width that it has, and the labels of its axis, title and legend.
+    # Height of the side view at its width, plus the labels of its axis, title and legend.
     height = 5.6 if wide else 1.15 + float(np.clip(HALF / 72.0 * size[1] / size[0], 1.5, 3.4))
     room = np.array([FULL, np.inf]) if wide else np.array([HALF, 72.0 * (height - 1.15)])
     extent, scale = _with_labels(extent, [body], plane, room)
     before = ", ".join(style.number(float(record.time[row]), 2) for row in body.rows_shown()[:-1]) if body else ""
     faint = f"; faint, at {before} s" if before else ""
     figure = style.new_figure(height, style.title(record, f"posture at {record.time[-1]:.4g} s{faint}"))
-    # Side by side, the labels of the 3D view need some room to their right.
+    # Side by side, the labels of the 3D view need some space to their right.
     grid = figure.add_gridspec(2, 1, height_ratios=[1.25, 1.0]) if wide else figure.add_gridspec(1, 2, wspace=0.15)
     space: Any = figure.add_subplot(grid[0], projection="3d")
     side = figure.add_subplot(grid[1])
@@ -296,7 +292,7 @@ def posture(record: Record) -> Figure | None:
 
 
 def posture_comparison(records: Mapping[str, Record]) -> Figure | None:
-    """Side views of all variants at one scale; None where no arm can be drawn."""
+    """Draw side views of all variants at one scale; None if no arm can be drawn."""
     bodies = {name: skeleton(record)[0] for name, record in records.items() if "hand_position" in record}
     shown = {name: body for name, body in bodies.items() if body is not None}
     if not shown:
@@ -308,7 +304,7 @@ def posture_comparison(records: Mapping[str, Record]) -> Figure | None:
     everything += [solid for body in shown.values() for base in body.bases() for solid in base]
     low, high = extent_of(plane, everything, some)
     size = high - low
-    # Upright arms stand beside each other.
+    # Upright arms are drawn next to each other.
     columns = min(len(shown), 4 if size[1] > size[0] else 2)
     lines = -(-len(shown) // columns)
     room = np.array([FULL if columns == 1 else 2.0 * HALF / columns, 72.0 * 3.2])
@@ -328,7 +324,7 @@ def posture_comparison(records: Mapping[str, Record]) -> Figure | None:
         axes.label_outer()
     for axes in grid.ravel()[len(shown) :]:
         axes.set_axis_off()
-    # Labels of narrow panels would overlap: one stands for all.
+    # Labels of narrow panels would overlap, so only one panel has a label.
     for axes in grid[:, [k for k in range(columns) if columns > 2 and k != columns // 2]].ravel():
         axes.set_xlabel("")
     style.legend_below(figure, list(grid.ravel()), 5)
@@ -338,7 +334,7 @@ def posture_comparison(records: Mapping[str, Record]) -> Figure | None:
 def _with_labels(
     extent: tuple[Array, Array], bodies: Sequence[Skeleton | None], plane: SidePlane, room: Array
 ) -> tuple[tuple[Array, Array], float]:
-    """The extent with room for the labels of contacts, and the scale [point/m] at which it fits ``room`` [point]."""
+    """Return the extent with space for contact labels, and the scale [point/m] at which it fits ``room`` [point]."""
     wide, scale = extent, float((room / (extent[1] - extent[0])).min())
     for _ in range(3):  # smaller pictures need more room for labels
         labels = [label for body in bodies for label in contact_labels(body, plane, scale)]
@@ -348,7 +344,7 @@ def _with_labels(
 
 
 def _frame_side(axes: Axes, plane: SidePlane, extent: tuple[Array, Array], surfaces: Sequence[SceneSurface]) -> None:
-    """Limits, labels, and where surfaces are: grey inside (C < 0), a line where the plane cuts them."""
+    """Set limits and labels, and draw surfaces: grey inside (C < 0), and a line where the plane cuts them."""
     low, high = extent
     axes.set_aspect("equal", adjustable="box")
     axes.set_xlim(low[0], high[0])
@@ -376,7 +372,7 @@ def _side_view(
     path: str = style.BLUE,
     named: bool = True,
 ) -> None:
-    """``named``: the legend says how far below which surface."""
+    """Draw the side view; if ``named``, the legend states depth and surface of penetrations."""
     for k, base in enumerate([] if body is None else body.bases()):
         last = k == len(drawn) - 1
         for solid in base:
@@ -393,7 +389,7 @@ def _side_view(
             colors=colour,
             linewidths=2.4 if last else 1.2,
             alpha=_opacity(k, len(drawn)),
-            # Round ends of faint segments would overlap to dark dots.
+            # Round ends of faint segments would overlap and form dark dots.
             capstyle="round" if last else "butt",
             zorder=3 if last else 2,
         )
@@ -427,13 +423,13 @@ def _side_view(
             va="center",
             fontsize=LABEL_SIZE,
             linespacing=1.1,
-            # A label further away says with a line where it belongs.
+            # A line connects a distant label with its contact.
             arrowprops={"arrowstyle": "-", "color": style.GREY, "lw": 0.5, "shrinkB": 4} if label.level else None,
         )
 
 
 def _opacity(k: int, count: int) -> float:
-    """Of the k-th posture: the later the darker, the last one in full."""
+    """Return the opacity of the k-th posture, which increases with time up to 1."""
     return 1.0 if k == count - 1 else 0.12 + 0.2 * k / count
 
 
@@ -446,13 +442,13 @@ def _space_view(
     zoom: float,
 ) -> None:
     low, high = bounds
-    # The order of drawing is given: by depth, the floor would hide the contacts that lie on it.
+    # Fixed drawing order: sorted by depth, the floor would hide the contacts on it.
     axes.computed_zorder = False
     for surface in () if body is None else body.scene.surfaces:
         _draw_surface(axes, surface, low, high)
     base = [] if body is None or not drawn else body.solids(body.rows_shown()[-1])
     if base:
-        # One collection: it sorts its faces by depth.
+        # One collection, because a collection sorts its faces by depth.
         shown = np.concatenate([corners[faces] for corners, faces in base])
         solid = Poly3DCollection(shown, facecolors=BASE_COLOUR, linewidths=0, shade=True, antialiased=False, zorder=2.5)
         axes.add_collection3d(solid, autolim=False)
@@ -477,7 +473,7 @@ def _space_view(
     axes.set_xlim(low[0], high[0])
     axes.set_ylim(low[1], high[1])
     axes.set_zlim(low[2], high[2])
-    # The square of the axes is smaller than the room that a long arm has: fill it, and do not clip at the square.
+    # The square of the axes is smaller than the space available to a long arm: fill the space without clipping.
     axes.set_box_aspect(tuple(high - low), zoom=zoom)
     for artist in axes.get_children():
         artist.set_clip_on(False)
@@ -491,7 +487,8 @@ def _space_view(
     ):
         ticks = MaxNLocator(2 + int(3 * share), steps=[1, 2, 5, 10]).tick_values(a, b)
         ticks = ticks[(ticks >= a) & (ticks <= b)]
-        # On a short axis only the outer ones have room; of y, which begins where x ends, the far one.
+        # A short axis has space only for the outer ticks; the y axis, which begins at the end of the x axis, for the
+        # far one.
         short = share < SHORT_AXIS and len(ticks) > (1 if axis is axes.yaxis else 2)
         axis.set_ticks((ticks[-1:] if axis is axes.yaxis else ticks[[0, -1]]) if short else ticks)
     axes.view_init(elev=22, azim=-70)
@@ -500,7 +497,7 @@ def _space_view(
 
 
 def _draw_surface(axes: Axes3D, surface: SceneSurface, low: Array, high: Array) -> None:
-    """The part of a surface next to the arm."""
+    """Draw the part of a surface near the arm."""
     if surface.kind in ("sphere", "cylinder"):
         grids = [round_patch(surface, low, high)]
     else:
@@ -516,14 +513,14 @@ def _draw_surface(axes: Axes3D, surface: SceneSurface, low: Array, high: Array) 
 
 
 def _within(grid: Array, low: Array, high: Array) -> Array:
-    """Points as they are near the arm, NaN elsewhere."""
+    """Return the points near the arm, with NaN for all others."""
     room = 0.1 * float((high - low).max())
     near = ((grid >= low - room) & (grid <= high + room)).all(axis=-1, keepdims=True)
     return np.where(near, grid, np.nan)
 
 
 def _contact_mark(force: float) -> dict[str, Any]:
-    """A blue triangle up where the surface pushes, a red one down where it pulls, a grey dot if open or not known."""
+    """Return the mark of a contact: blue triangle up if pushed, red triangle down if pulled, grey dot otherwise."""
     if force < 0.0:
         marker, colour, label = "v", style.PULLING, "contact, surface pulls"
     elif force > 0.0:

@@ -1,7 +1,7 @@
 """Figures and animation of a snake run, and comparisons of runs, from their records alone.
 
-Postures in top and side view with grounded and lifted wheels and the support polygon; controlled variable against its
-target; joint angles with their limits; cost, smallest singular value, support margin, modes.
+Postures in top and side view with grounded and lifted wheels and the support polygon; controlled variable and target;
+joint angles and limits; cost, smallest singular value, support margin, modes.
 """
 
 from __future__ import annotations
@@ -23,13 +23,14 @@ from dynsim.draw.figures.snake_view import (
     BODY,
     GROUND,
     HEAD,
-    LEAST_HEIGHT,
+    MIN_HEIGHT,
     NUMBERED,
     SYMBOLS,
     TARGET,
     View,
     error_axis,
     greek,
+    interval_starts,
     limits,
     mode_chart,
     mode_starts,
@@ -37,32 +38,31 @@ from dynsim.draw.figures.snake_view import (
     moments,
     posture_grid,
     posture_strip,
-    turns,
 )
 from dynsim.record import Record
 from dynsim.snake.lifting import snake_geometry
 from dynsim.snake.published import used_limit
 
-# Numbers of postures: of an animation, in a row, and over each other in one picture.
+# Numbers of postures: in an animation, in a row, and overlaid in one picture.
 FRAMES, IN_A_ROW, IN_A_PICTURE = 50, 6, 7
-# Greys of postures over time, as the lines beside them have colours.
+# Greys of postures over time, because the lines next to them are coloured.
 SHADES = LinearSegmentedColormap.from_list("shades", ["#CFCFCF", "#000000"])
 
 
 def draw(record: Record, folder: Path, kind: str = "png") -> list[Path]:
-    """Write all figures of one run and the animation into ``folder``; returns the files."""
+    """Draw all figures of one run and the animation; return the files."""
     return [*style.save_all(figures(record), record, folder, kind), animate(record, folder / "animation.gif")]
 
 
 def draw_comparison(records: Mapping[str, Record], folder: Path, kind: str = "png") -> list[Path]:
-    """Variants over each other, and figures and tables beside [T] where its experiments were run; returns the files."""
+    """Draw overlays of variants, and figures and tables next to [T] for its experiments; return the files."""
     scenarios = {record.summary["scenario"] for record in records.values()}
     written = tanaka2019.write_tables(scenarios.pop(), records, folder) if len(scenarios) == 1 else []
     return written + style.save_all(comparisons(records), records, folder, kind)
 
 
 def figures(record: Record) -> dict[str, Callable[[Record], Figure]]:
-    """Makers of the figures of one run by file name."""
+    """Return the drawing functions of one run by file name."""
     return {
         "postures": postures,
         "overview": overview,
@@ -75,14 +75,14 @@ def figures(record: Record) -> dict[str, Callable[[Record], Figure]]:
 
 
 def comparisons(records: Mapping[str, Record]) -> dict[str, Callable[[Mapping[str, Record]], Figure]]:
-    """Makers of the figures of several runs by file name; those beside [T] where all are of one scenario."""
+    """Return the drawing functions of several runs by file name; comparisons with [T] only if all have one scenario."""
     scenarios = {record.summary["scenario"] for record in records.values()}
     published = tanaka2019.figures(scenarios.pop(), records) if len(scenarios) == 1 else {}
     return {"comparison": comparison, "postures": strips, **published}
 
 
 def comparison(records: Mapping[str, Record]) -> Figure:
-    """Cost, largest yaw angle in parts of its limit, support margin and head error of all variants."""
+    """Draw cost, largest yaw angle relative to its limit, support margin and head error of all variants."""
     title = style.comparison_title(list(records.values()), "cost, angles, margin and error")
     figure = style.new_figure(7.0, title)
     axes = figure.subplots(4, 1, sharex=True)
@@ -105,7 +105,7 @@ def comparison(records: Mapping[str, Record]) -> Figure:
 
 
 def strips(records: Mapping[str, Record]) -> Figure:
-    """Postures of every variant over time, a line each."""
+    """Draw the postures of every variant over time, one row per variant."""
     lines = {}
     for name, record in records.items():
         views = [View(record, row) for row in moments(record, IN_A_ROW)]
@@ -117,20 +117,20 @@ def strips(records: Mapping[str, Record]) -> Figure:
 
 
 def postures(record: Record) -> Figure:
-    """Postures over time: top view above, side view along the base's heading below."""
+    """Draw postures over time: top view above, side view along the heading of the base part below."""
     views = [View(record, row) for row in moments(record, IN_A_ROW)]
     texts = [f"{view.time:.1f} s, mode {view.mode}" for view in views]
     return posture_strip(style.title(record, "postures over time"), list(zip(views, texts, strict=True)))
 
 
 def overview(record: Record) -> Figure:
-    """Top view of the whole run in one picture: postures over time, path of the controlled point and its target.
+    """Draw the whole run from above: postures over time, path of the controlled point and its target.
 
-    A robot that stays where it is, and works with its head, is a thin strip in it: below it then is the side view.
+    A robot that stays in place and works with its head is only a thin strip, so a side view is added below.
     """
     rows = moments(record, IN_A_PICTURE)
     x0, x1, y0, y1 = limits([*record["posture"][rows][:, :, :2], record["w"][:, :2]], 0.06)
-    flat = y1 - y0 < LEAST_HEIGHT * (x1 - x0)
+    flat = y1 - y0 < MIN_HEIGHT * (x1 - x0)
     views = [View(record, row) for row in rows] if flat else []
     width = 6.4 if flat else 5.0
     high = width * (y1 - y0) / (x1 - x0)
@@ -168,7 +168,7 @@ def overview(record: Record) -> Figure:
 
 
 def tracking(record: Record) -> Figure:
-    """Six coordinates of the controlled point with their targets, and the errors."""
+    """Draw the six coordinates of the controlled point with their targets, and the errors."""
     figure = style.new_figure(6.2, style.title(record, "controlled point and its target"))
     axes = figure.subplots(4, 2, sharex=True)
     labels = record.labels["w"]
@@ -183,9 +183,9 @@ def tracking(record: Record) -> Figure:
                 record.time, 0, 1, where=record["gripper"] > 0, transform=closed, color="#EEEEEE", lw=0, zorder=0,
                 label="gripper closed",
             )  # fmt: skip
-    # In a white box: what is grey shows on panels that are grey all over.
+    # White background, so that grey entries are visible on an entirely grey panel.
     axes[0, 0].legend(facecolor="white", edgecolor="none")
-    tiny = 1e-16  # an error of exactly zero has no place on a logarithmic axis
+    tiny = 1e-16  # a logarithmic axis cannot show an error of exactly zero
     axes[3, 0].semilogy(record.time, np.maximum(record["position_error"], tiny), color=BODY)
     axes[3, 0].set_ylabel("position error [m]")
     axes[3, 1].semilogy(record.time, np.maximum(record["attitude_error"], tiny), color=BODY)
@@ -197,7 +197,7 @@ def tracking(record: Record) -> Figure:
 
 
 def joints(record: Record) -> Figure:
-    """Joint angles of head and base part with their limits; marks show where a joint left the allocation."""
+    """Draw the joint angles of head and base part with their limits; dots mark joints out of the allocation."""
     geometry = snake_geometry(record)
     n_h, pitch, upper, lower = geometry.head_joints, geometry.pitch, geometry.upper, geometry.lower
     phi, labels = record["phi"], record.labels["phi"]
@@ -222,8 +222,8 @@ def joints(record: Record) -> Figure:
 
 
 def redundancy(record: Record) -> Figure:
-    """Modes (grounded wheels), cost, smallest singular value and support margin over time."""
-    many = len(mode_starts(record)) > NUMBERED  # then the numbers have axes of their own
+    """Draw modes (grounded wheels), cost, smallest singular value and support margin over time."""
+    many = len(mode_starts(record)) > NUMBERED  # the mode numbers then have a separate panel
     ratios = [1.3, *([0.8] if many else []), 1, 1, 1]
     figure = style.new_figure(6.7 + 1.1 * many, style.title(record, "modes and margins"))
     axes = figure.subplots(len(ratios), 1, sharex=True, height_ratios=ratios, squeeze=False)
@@ -246,11 +246,11 @@ def redundancy(record: Record) -> Figure:
 
 
 def _over_time(axis: Axes, record: Record, values: NDArray[np.float64], many: bool) -> None:
-    """A line; where ``many`` changes of mode would fill the panel with it, its range and its lowest value by turns."""
+    """Draw a line, or with ``many`` mode changes, which would fill the panel, its range and minimum in intervals."""
     if not many:
         axis.plot(record.time, values, color=GROUND)
         return
-    starts = turns(len(values))
+    starts = interval_starts(len(values))
     low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
     time = np.append(record.time[starts], record.time[-1])
     axis.stairs(high, time, baseline=low, fill=True, color=GROUND, alpha=0.25, lw=0, label="range")
@@ -259,7 +259,7 @@ def _over_time(axis: Axes, record: Record, values: NDArray[np.float64], many: bo
 
 
 def animate(record: Record, path: Path) -> Path:
-    """A short film of the run."""
+    """Write a short film of the run."""
     fps = 10
     speed = (record.time[-1] - record.time[0]) * fps / (FRAMES - 1)
     return film.write({"": record}, path, size=(480, 420), fps=fps, speed=float(speed) or 1.0, plot="")

@@ -1,4 +1,4 @@
-"""Figures of a snake at work: torques of its servos, how its gripper holds, and how objects move."""
+"""Figures of a snake at work: torques of its servos, grasps of its gripper, and motion of objects."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from dynsim.record.measures import GRIPPER_STATES
 from dynsim.record.poses import ORIENTATION, POSITION
 from dynsim.record.quaternion import continuous, of_turn, product, rotated
 
-# Servos with lines in colours of their own, those of the largest rms torque; most objects in a figure.
+# Number of servos (largest rms torque) with separate colours; maximum number of objects in a figure.
 LOADED, OBJECTS = 4, 4
 FAINT = "#B0B0B0"
-# States of the gripper: colours of the bands behind curves.
+# Colours of the bands for the states of the gripper.
 STATES = dict(zip(GRIPPER_STATES, ("#FFFFFF", "#FDEFD3", "#E1F3EC", "#FAE6F0"), strict=True))
-# Events of the gripper: how lines at them are drawn.
+# Line styles of the events of the gripper.
 EVENTS = {"captures": (0, (5, 2)), "slips": (0, (1, 1)), "loses": "-", "releases": (0, (5, 2, 1, 2))}
-# Least distance that is told from none [mm].
+# Smallest distance on the logarithmic axis [mm].
 LEAST = 0.1
-# Nearer to the axis of a hinge than this, the gripper tells its angle by its own turning [m].
+# If the gripper is closer to the axis of a hinge, the hinge angle follows from its orientation [m].
 ON_AXIS = 0.01
 LEGEND: dict[str, Any] = {"loc": "center left", "bbox_to_anchor": (1.0, 0.5)}
 
 
 def makers(record: Record) -> dict[str, Callable[[Record], Figure]]:
-    """Makers of these figures by file name, as far as the record has what they show."""
+    """Return the drawing functions by file name for which the record has data."""
     made: dict[str, Callable[[Record], Figure]] = {}
     if any("stall_torque_N_m" in motor for motor in record.summary.get("motors", ())):
         made["servos"] = servos
@@ -44,7 +44,7 @@ def makers(record: Record) -> dict[str, Callable[[Record], Figure]]:
 
 
 def servos(record: Record) -> Figure:
-    """Shaft torques beside stall torque, nominal torque and gear friction; servos of one kind share a panel."""
+    """Draw shaft torques with stall torque, nominal torque and gear friction; equal servos share a panel."""
     kinds: dict[tuple[float, ...], list[dict[str, Any]]] = {}
     for motor in record.summary["motors"]:
         if "stall_torque_N_m" in motor:
@@ -60,7 +60,7 @@ def servos(record: Record) -> Figure:
             name = motor["joint"]
             values = record["torque"][:, record.labels["torque"].index(name)]
             label = f"{greek(name)}: rms {motor['torque_rms_N_m']:.2f} N m" if name in colours else None
-            # The most loaded ones on top.
+            # The most loaded servos are on top.
             look = {"color": colours.get(name, FAINT), "lw": 1.1 if name in colours else 0.6, "zorder": 3.0 - 0.01 * k}
             axis.plot(record.time, values, label=label, **look)
         if len(order) > LOADED:
@@ -69,7 +69,7 @@ def servos(record: Record) -> Figure:
         if nominal:
             _both(axis, nominal, f"nominal, rms: {nominal:g} N m", color="black", ls=":", lw=0.9)
         if friction:
-            label = f"friction of the gear {friction:g} N m:\nholds this without current"
+            label = f"friction of the gear {friction:g} N m:\nheld without current"
             axis.axhspan(-friction, friction, color=style.SKY, alpha=0.25, lw=0, zorder=0, label=label)
         axis.set(xlim=(record.time[0], record.time[-1]), ylim=(-1.1 * stall, 1.1 * stall), ylabel="torque [N m]")
         _legend(axis)
@@ -78,7 +78,7 @@ def servos(record: Record) -> Figure:
 
 
 def gripper(record: Record) -> Figure:
-    """Distance to the grasp frame, and forces and torques on what the gripper holds with their bounds."""
+    """Draw the distance to the grasp frame, and forces and torques on the grasped object with their bounds."""
     config = record.provenance["scenario"]["plant"].get("gripper", {})
     forces = _held_forces(record)
     rows = 1 if forces is None else 3
@@ -100,13 +100,13 @@ def gripper(record: Record) -> Figure:
             axis.set_ylabel(label)
     _finish(axes, record)
     axes[-1].set_xlabel(
-        "t [s]" + ("" if forces is None else "      (of the gripper on what it holds; x: along the gripper)")
+        "t [s]" + ("" if forces is None else "      (of the gripper on the object; x: along the gripper)")
     )
     return figure
 
 
 def objects(record: Record) -> Figure:
-    """Angle or way of objects on joints beside the head's, and torque or force of the joint; height of free ones."""
+    """Draw position of objects on joints and of the head, and load of the joint; or the height of free objects."""
     bodies = object_bodies(record)
     some = list(bodies)[:OBJECTS]
     note = "" if len(some) == len(bodies) else f" ({len(some)} of {len(bodies)})"
@@ -122,7 +122,7 @@ def objects(record: Record) -> Figure:
 
 
 def _panels(record: Record, name: str, body: int) -> list[Callable[[Axes], None]]:
-    """What is drawn of an object, a function for each row."""
+    """Return one drawing function for each panel of an object."""
     assert record.scene is not None
     kind = record.scene.bodies[body].joint.kind
     if kind in ("revolute", "prismatic"):
@@ -137,7 +137,7 @@ def _panels(record: Record, name: str, body: int) -> list[Callable[[Axes], None]
 
 
 def _moved(axis: Axes, record: Record, name: str, body: int) -> None:
-    """Coordinate of an object on a hinge or on rails, and of the gripper about or along its axis in a hold."""
+    """Draw the coordinate of an object on a hinge or rails, and the motion of the gripper along it while grasped."""
     assert record.scene is not None
     turns = record.scene.bodies[body].joint.kind == "revolute"
     scale, unit = (180.0 / np.pi, "°") if turns else (1e3, "mm")
@@ -151,11 +151,11 @@ def _moved(axis: Axes, record: Record, name: str, body: int) -> None:
             along = own[start] + _followed(record, record[signal][rows], body)
             axis.plot(record.time[rows], scale * along, color=colour, ls=dashes, lw=1.1, label=label)
     style.at_least(axis, 1.0)
-    axis.set_ylabel(f"{'angle' if turns else 'way'} of {name} [{unit}]")
+    axis.set_ylabel(f"{'angle' if turns else 'displacement'} of {name} [{unit}]")
 
 
 def _followed(record: Record, w: Array, body: int) -> Array:
-    """How far poses of the controlled point have turned about, or gone along, the axis of a body's joint, (T,)."""
+    """Return the rotation about, or displacement along, the axis of the joint of a body, of poses ``w``, (T,)."""
     assert record.scene is not None
     joint = record.scene.bodies[body].joint
     axis = rotated(record[ORIENTATION][0, body].astype(float), np.array(joint.axis))
@@ -174,7 +174,7 @@ def _followed(record: Record, w: Array, body: int) -> Array:
 
 
 def _joint_loads(record: Record, name: str) -> dict[str, Array]:
-    """Torques or forces that a hinge or rails exert on their object, by what exerts them."""
+    """Return torques or forces that a hinge or rails exert on their object, by cause."""
     signals = (("friction", "joint_friction", name), ("spring", "tie_force", f"{name}.spring"))
     return {
         text: record[signal][:, record.labels[signal].index(label)]
@@ -208,17 +208,17 @@ def _standing(axis: Axes, record: Record, name: str, columns: list[int]) -> None
 
 
 def _held_forces(record: Record) -> Array | None:
-    """Forces x, y, z [N] and torques [N m] of the gripper on what it holds, (T, 6); None on the kinematic level."""
+    """Return forces x, y, z [N] and torques [N m] of the gripper on its object, (T, 6); None on the kinematic level."""
     names = [name for name in record.labels.get("tie_force", ()) if name.startswith("gripper.")]
     if not names:
         return None
-    # It holds one object at a time. Ties tell the force on their first body, the gripper.
+    # It holds one object at a time. The signal is the force on the first body of a tie, the gripper.
     columns = [record.labels["tie_force"].index(name) for name in names]
     return -record["tie_force"][:, columns].reshape(len(record), -1, 6).sum(axis=1)
 
 
 def _holds(record: Record, name: str) -> list[tuple[int, int]]:
-    """First row and the one after the last of each time in which the gripper holds an object."""
+    """Return the first row and the row after the last of each grasp of an object."""
     spans: list[tuple[int, int]] = []
     for event in record.events:
         if event.name != name or event.kind not in ("gripper captures", "gripper releases", "gripper loses"):
@@ -232,7 +232,7 @@ def _holds(record: Record, name: str) -> list[tuple[int, int]]:
 
 
 def _finish(axes: Array, record: Record) -> None:
-    """States of the gripper behind the curves, lines at its events, and legends."""
+    """Draw bands for the states of the gripper, lines at its events, and legends."""
     happened = {kind: [e.time for e in record.events if e.kind == f"gripper {kind}"] for kind in EVENTS}
     for axis in axes:
         axis.set_xlim(record.time[0], record.time[-1])
@@ -249,7 +249,7 @@ def _finish(axes: Array, record: Record) -> None:
             for time in times:
                 axis.axvline(time, color="#555555", ls=EVENTS[kind], lw=0.8, label=f"_{kind}")
         _legend(axis)
-    # Once for all panels, below.
+    # One legend below all panels.
     named = {h.get_label(): h for h in (*axes[0].collections, *axes[0].lines) if str(h.get_label()).startswith("_")}
     texts = [*STATES, *EVENTS]
     shown = {text: named[f"_{text}"] for text in texts if f"_{text}" in named}
@@ -258,13 +258,13 @@ def _finish(axes: Array, record: Record) -> None:
 
 
 def _both(axis: Axes, value: float, label: str, **look: Any) -> None:
-    """Lines at plus and minus a value."""
+    """Draw lines at plus and minus a value."""
     axis.axhline(value, label=f"± {label}", **look)
     axis.axhline(-value, **look)
 
 
 def _legend(axis: Axes) -> None:
-    """Beside the axes, lines drawn last first."""
+    """Place a legend without repeated entries next to the axes."""
     handles, labels = axis.get_legend_handles_labels()
     unique = dict(zip(labels, handles, strict=True))
     axis.legend(unique.values(), unique.keys(), **LEGEND)

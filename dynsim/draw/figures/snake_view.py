@@ -1,4 +1,4 @@
-"""Shared parts of all snake figures: colours, top and side view of one posture, chart of modes."""
+"""Parts shared by all snake figures: colours, top and side view of one posture, chart of modes."""
 
 from __future__ import annotations
 
@@ -25,32 +25,32 @@ from dynsim.snake.lifting import snake_geometry
 BODY, HEAD, GROUND, LIFT, TARGET, SUPPORT = "#444444", style.PULLING, style.BLUE, "#FFFFFF", style.GREEN, style.SKY
 OBJECT = "#E9CFA6"
 SYMBOLS = {"alpha": "α", "beta": "β", "gamma": "γ"}
-# Most modes whose numbers fit above the bars of a chart.
+# Maximum number of modes whose numbers fit above the bars of a chart.
 NUMBERED = 30
-# Intervals of a run. Where it has more modes than this, shares and ranges in the intervals are drawn, not each mode.
-TURNS = 160
-# Colours of shares of time from 0 to 1.
+# Number of intervals of a run. If it has more modes, shares and ranges in the intervals are drawn instead of each mode.
+INTERVALS = 160
+# Colours of fractions of time from 0 to 1.
 SHARES = LinearSegmentedColormap.from_list("shares", [LIFT, GROUND])
-# Least height of a top view, in parts of its width, as a straight robot is a thin line.
-LEAST_HEIGHT = 0.3
-# Font size of the numbers at the vertical axes of postures [point].
+# Minimum height of a top view relative to its width, because a straight robot is a thin line.
+MIN_HEIGHT = 0.3
+# Font size of tick labels at the vertical axes of postures [point].
 SMALL = 6.5
 
 
 def object_bodies(record: Record) -> dict[str, int]:
-    """Bodies of the objects beside the robot that a record has the poses of, by their names."""
+    """Return names and bodies of the objects whose poses are in the record."""
     names = record.provenance.get("scenario", {}).get("objects") or {}
     bodies = () if record.scene is None or POSITION not in record else record.scene.bodies
     return {body.name: k for k, body in enumerate(bodies) if body.name in names}
 
 
 class View:
-    """One posture, ready to be drawn from above, or from the side along the heading of the base part."""
+    """One posture, drawn from above or from the side along the heading of the base part."""
 
     def __init__(self, record: Record, row: int) -> None:
         scene = record.scene
         if scene is None:
-            raise RecordError("a record of a snake without its scene cannot be drawn: wheels and links are in it")
+            raise RecordError("cannot draw the record of a snake without a scene, which contains wheels and links")
         self.row, self.time, self.mode = row, float(record.time[row]), int(record["mode"][row])
         self.points: Array = record["posture"][row]
         self.path: Array = record["w"][:, :2]
@@ -66,16 +66,16 @@ class View:
         self.plane = SidePlane(np.array([x, y, 0.0]), np.array([np.cos(yaw), np.sin(yaw), 0.0]))
 
     def project(self, points: Array, above: bool) -> Array:
-        """Points in the plane of the drawing, (n, 3) → (n, 2) [m]."""
+        """Project points to the plane of the drawing, (n, 3) → (n, 2) [m]."""
         return points[:, :2] if above else self.plane.project(points)
 
     def extent(self, above: bool) -> Array:
-        """Everything that a view must show, (k, 2)."""
+        """Return all points that a view must show, (k, 2)."""
         wheels = [corners for pair in self.wheels for corners in pair]
         return self.project(np.concatenate([self.points, *wheels, *self.objects]), above)
 
     def draw(self, axes: Axes, above: bool) -> None:
-        """Objects, body, controlled point and wheels; from above with the support and the centre of mass."""
+        """Draw objects, body, controlled point and wheels; from above also support polygon and centre of mass."""
         for corners in self.objects:
             axes.add_patch(Polygon(outline(self.project(corners, above)), fc=OBJECT, ec=BODY, lw=0.5, zorder=1.5))
         if above:
@@ -88,7 +88,7 @@ class View:
         axes.plot(*flat.T, "-", color=BODY, lw=1.8, zorder=3, solid_capstyle="round")
         axes.plot(*flat[0], "o", color=HEAD, ms=4, zorder=5)
         for down, pair in zip(self.grounded, self.wheels, strict=True):
-            # From the side a lifted pair is a little above the ground: the model has no height for it ([T] II.A).
+            # In side view a lifted pair is drawn slightly above the ground; the model has no height for it ([T] II.A).
             raised = np.array([0.0, 0.0 if above or down else 0.35 * self.radius])
             look: dict[str, Any] = {"facecolor": GROUND if down else LIFT, "edgecolor": GROUND, "lw": 0.7}
             for corners in pair:
@@ -98,9 +98,9 @@ class View:
 
 
 def posture_grid(title: str, lines: Mapping[str, Sequence[tuple[View, str]]], one_scale: bool = True) -> Figure:
-    """Top views, each with its title, and the path of the point in green; every line of the grid has a label.
+    """Draw labelled rows of top views with their titles, and the path of the controlled point in green.
 
-    ``one_scale``: all lines show the same area, else each the one it needs.
+    With ``one_scale`` all rows show the same area, otherwise each row the area it needs.
     """
     columns = max(map(len, lines.values()))
     clouds = [[view.extent(above=True) for view, _ in line] for line in lines.values()]
@@ -141,7 +141,7 @@ def posture_grid(title: str, lines: Mapping[str, Sequence[tuple[View, str]]], on
 
 
 def posture_strip(title: str, line: Sequence[tuple[View, str]]) -> Figure:
-    """Postures with their titles: top view above, side view along the base's heading below."""
+    """Draw postures with their titles: top view above, side view along the heading of the base below."""
     views = [view for view, _ in line]
     top = _not_flat(limits([view.extent(above=True) for view in views], 0.08))
     side = limits([view.extent(above=False) for view in views], 0.08)
@@ -171,20 +171,20 @@ def posture_strip(title: str, line: Sequence[tuple[View, str]]) -> Figure:
 
 
 def mode_starts(record: Record) -> NDArray[np.int64]:
-    """Rows at which a mode begins, the first one among them."""
+    """Return the rows at which a mode begins, including the first row."""
     mode = record["mode"]
     return np.flatnonzero(np.diff(mode, prepend=mode[0] - 1))
 
 
 def mode_chart(axis: Axes, record: Record, title: str = "mode") -> None:
-    """Grounded (filled) and lifted (white) wheel pairs over time, with the mode numbers where these have room."""
+    """Draw grounded (filled) and lifted (white) wheel pairs over time, with mode numbers if they fit."""
     grounded, time, mode = record["grounded"], record.time, record["mode"]
     starts, last, pairs = mode_starts(record), len(time) - 1, grounded.shape[1]
-    numbered, dense = len(starts) <= NUMBERED, len(starts) > TURNS
+    numbered, dense = len(starts) <= NUMBERED, len(starts) > INTERVALS
     if dense:
         _shares(axis, record, grounded, np.arange(1.0, pairs + 1.0))
     for i in range(0 if dense else pairs):
-        # A bar ends where the pair is lifted, and at every change of mode while these can be told apart.
+        # A bar ends where the pair is lifted, and at every mode change if these can be distinguished.
         begins = starts if numbered else np.flatnonzero(np.diff(grounded[:, i], prepend=grounded[0, i] - 1))
         ends = np.append(begins[1:], last)
         bars = [(time[a], time[b] - time[a]) for a, b in zip(begins, ends, strict=True) if grounded[a, i]]
@@ -197,17 +197,17 @@ def mode_chart(axis: Axes, record: Record, title: str = "mode") -> None:
     axis.set_ylim(pairs + 0.6, -0.2 if numbered else 0.4)
     axis.set_yticks(range(1, pairs + 1))
     axis.set_ylabel("wheel pair")
-    # without numbers above the bars the title does not promise them
+    # The title mentions mode numbers only if they are drawn.
     title = f"{title}, and the " if numbered else title.removesuffix("mode")
-    length = (time[-1] - time[0]) / TURNS
+    length = (time[-1] - time[0]) / INTERVALS
     lifted = f"share of each {length:.2g} s, white: lifted" if dense else "blue) or lifted (white"
     axis.set_title(f"{title}wheel pairs on the ground ({lifted})", loc="left")
 
 
 def mode_steps(axis: Axes, record: Record) -> None:
-    """Mode numbers over time as steps, or as shares of time where these would fill the panel."""
+    """Draw mode numbers over time as steps, or as fractions of time if steps would fill the panel."""
     shown = np.unique(record["mode"])
-    if len(mode_starts(record)) > TURNS:
+    if len(mode_starts(record)) > INTERVALS:
         _shares(axis, record, record["mode"][:, None] == shown, shown.astype(float))
     else:
         axis.step(record.time, record["mode"], where="post", color=GROUND, lw=0.7)
@@ -216,16 +216,16 @@ def mode_steps(axis: Axes, record: Record) -> None:
         axis.set_yticks(shown)
 
 
-def turns(samples: int) -> NDArray[np.int64]:
-    """Rows at which parts of a run begin, see ``TURNS``."""
-    return np.unique(np.linspace(0, samples, TURNS + 1).astype(np.int64))[:-1]
+def interval_starts(samples: int) -> NDArray[np.int64]:
+    """Return the rows at which the intervals of a run begin, see ``INTERVALS``."""
+    return np.unique(np.linspace(0, samples, INTERVALS + 1).astype(np.int64))[:-1]
 
 
 def _shares(axis: Axes, record: Record, holds: NDArray[Any], places: NDArray[np.float64]) -> None:
-    """The part of each turn for which something holds, (T, k), as bars of such shades at (k,) places."""
-    starts = turns(len(record.time))
-    many = np.diff(starts, append=len(record.time))[:, None]
-    shares = np.add.reduceat(holds.astype(float), starts, axis=0) / many
+    """Draw the fraction of each interval for which conditions, (T, k), hold as shaded bars at ``places``, (k,)."""
+    starts = interval_starts(len(record.time))
+    counts = np.diff(starts, append=len(record.time))[:, None]
+    shares = np.add.reduceat(holds.astype(float), starts, axis=0) / counts
     edges = np.append(record.time[starts], record.time[-1])
     for position, share in zip(places, shares.T, strict=True):
         bar = [position - 0.4, position + 0.4]
@@ -233,7 +233,7 @@ def _shares(axis: Axes, record: Record, holds: NDArray[Any], places: NDArray[np.
 
 
 def error_axis(axis: Axes, *errors: NDArray[np.float64]) -> None:
-    """Lower limit of a logarithmic axis: what is rounding (a first sample that is exact) does not stretch it."""
+    """Set the limits of a logarithmic error axis such that rounding errors (an exact first sample) do not extend it."""
     values = np.concatenate(errors)
     values = values[values > 1e-15]
     if len(values):
@@ -243,31 +243,31 @@ def error_axis(axis: Axes, *errors: NDArray[np.float64]) -> None:
 
 
 def moments(record: Record, count: int) -> NDArray[np.int64]:
-    """Rows of ``count`` evenly spread samples, first and last among them."""
+    """Return the rows of ``count`` evenly spaced samples, including the first and the last."""
     return np.unique(np.linspace(0, len(record.time) - 1, min(count, len(record.time))).round().astype(np.int64))
 
 
 def limits(clouds: list[NDArray[np.float64]], margin: float) -> tuple[float, float, float, float]:
-    """x and y limits that hold all points, with a margin."""
+    """Return x and y limits that contain all points, with a margin."""
     points = np.vstack(clouds)
     (x0, y0), (x1, y1) = points.min(axis=0) - margin, points.max(axis=0) + margin
     return float(x0), float(x1), float(y0), float(y1)
 
 
 def _not_flat(box: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
-    """The same limits, higher where they would be a strip too thin for its ticks."""
+    """Increase the height of limits that would be a strip too thin for ticks."""
     x0, x1, y0, y1 = box
-    more = max(0.0, LEAST_HEIGHT * (x1 - x0) - (y1 - y0)) / 2
+    more = max(0.0, MIN_HEIGHT * (x1 - x0) - (y1 - y0)) / 2
     return x0, x1, y0 - more, y1 + more
 
 
 def greek(name: str) -> str:
-    """Joint name with its Greek letter."""
+    """Return a joint name with its Greek letter."""
     return name.replace("theta", "θ").replace("psi", "ψ")
 
 
 def _explain(figure: Figure, views: Sequence[View]) -> None:
-    """Below a figure: what its views show."""
+    """Add a legend of the views below a figure."""
     handles: list[Any] = [
         Line2D([], [], color=HEAD, marker="o", ls="", ms=4, label="controlled point"),
         Line2D([], [], color=BODY, lw=1.8, label="body"),

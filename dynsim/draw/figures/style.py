@@ -1,4 +1,4 @@
-"""Shared style of all figures: sizes, colours, titles, legends, axes over time, texts of numbers, saving."""
+"""Style shared by all figures: sizes, colours, titles, legends, time axes, number formats, saving."""
 
 from __future__ import annotations
 
@@ -24,21 +24,22 @@ from dynsim.system.terminal import plain
 
 T = TypeVar("T")
 Array = NDArray[np.float64]
-# A quantity over time, (T,) and (T,) or (T, k).
+# A quantity over time: times (T,), values (T,) or (T, k).
 Series = tuple[Array, Array]
 
-# Okabe and Ito's colours, which colour-blind readers tell apart; yellow is too faint on white.
+# Colours of Okabe and Ito, which colour-blind readers can distinguish; yellow is omitted because it is too faint on
+# white.
 BLUE, ORANGE, GREEN, PURPLE, SKY, BLACK = "#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#000000"
-# Kept for pulling contacts in every figure, so no variant may have it.
+# Reserved for pulling contacts in every figure, so no variant has it.
 PULLING = "#D55E00"
 GREY = "#7F7F7F"
-# Parts of links below a surface, where no contact point holds them.
+# Parts of links that lie below a surface because they have no contact point.
 DEEP = "#882255"
 VARIANT_COLOURS = (BLUE, GREEN, ORANGE, PURPLE, SKY, BLACK, "#8C6D31")
 AXIS_COLOURS = {"x": BLUE, "y": GREEN, "z": ORANGE}
 
 WIDTH = 7.2
-# Size of a figure's title [point], and how many characters of it fit.
+# Size of a figure title [point], and number of characters that fit.
 TITLE, TITLE_LONG = 10.0, 88
 DPI = 170
 _LOOK: Any = {
@@ -65,42 +66,42 @@ _LOOK: Any = {
     "ytick.major.width": 0.6,
     "legend.frameon": False,
     "legend.handlelength": 1.8,
-    # A line of a million points overflows Agg's cell block unless it is drawn in pieces.
+    # A line of a million points overflows the cell block of Agg unless it is drawn in pieces.
     "agg.path.chunksize": 20_000,
 }
-# Curves in space of more points than this are thinned: a figure is some 1200 pixels wide.
+# Curves in space with more points are thinned; a figure is about 1200 pixels wide.
 LINE_POINTS = 4000
-# A panel of the transient shows this times its length, and there is none where that is most of the run.
-TRANSIENT_ROOM, TRANSIENT_MOST = 1.2, 0.8
-# Height of a row of a legend [point].
+# A transient panel shows this multiple of the transient, unless that is more than this fraction of the run.
+TRANSIENT_ROOM, TRANSIENT_MAX_SHARE = 1.2, 0.8
+# Height of a legend row [point].
 LEGEND_ROW = 12.5
 
 
 @contextmanager
 def look() -> Iterator[None]:
-    """Matplotlib settings of all dynsim figures, for a ``with`` block; the caller's settings come back after it."""
+    """Apply the matplotlib settings of dynsim in a ``with`` block."""
     with matplotlib.rc_context(_LOOK):
         yield
 
 
 def new_figure(height: float, title: str, *, width: float = WIDTH) -> Figure:
-    """An empty figure [inch] that belongs to no pyplot and needs no display."""
+    """Create an empty figure with ``height`` and ``width`` [inch], independent of pyplot and displays."""
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
-    # A long title is smaller: it would be cut off at both sides.
+    # A long title is smaller, so that it is not cut off.
     figure.suptitle(title, fontsize=TITLE * min(1.0, TITLE_LONG / max(len(title), 1)))
     return figure
 
 
 def save(figure: Figure, path: Path) -> Path:
-    """Write a figure as PNG, PDF or SVG, by the suffix of ``path``; see :func:`dynsim.system.files.replacing`.
+    """Write a figure as PNG, PDF or SVG, depending on the suffix; see :func:`dynsim.system.files.replacing`.
 
     Raises
     ------
     RecordError
-        The file cannot be written; an older one is left as it was.
+        If the file cannot be written; an existing file is then unchanged.
     """
-    # Names from files: no font has a picture for a control character.
+    # Names from files may contain control characters, for which fonts have no glyph.
     for text in figure.findobj(Text):
         text.set_text(plain(text.get_text()))
     figure.set_dpi(DPI)
@@ -108,7 +109,7 @@ def save(figure: Figure, path: Path) -> Path:
 
 
 def save_all(makers: Mapping[str, Callable[[T], Figure | None]], of: T, folder: Path, kind: str) -> list[Path]:
-    """Every figure, by its name, that the record or records have data for, in dynsim's look; returns the files."""
+    """Draw and save every figure for which the record or records have data; return the files."""
     with look():
         return [
             save(figure, folder / f"{name}.{kind}") for name, make in makers.items() if (figure := make(of)) is not None
@@ -116,7 +117,7 @@ def save_all(makers: Mapping[str, Callable[[T], Figure | None]], of: T, folder: 
 
 
 def write(figure: Figure, path: Path) -> Path:
-    """Write a figure at its own resolution; the same figure gives the same bytes.
+    """Write a figure at its own resolution; equal figures give equal bytes.
 
     Raises
     ------
@@ -126,7 +127,7 @@ def write(figure: Figure, path: Path) -> Path:
     kind = path.suffix.removeprefix(".")
     with replacing(path) as stream, matplotlib.rc_context({"svg.hashsalt": path.stem}):
         if kind == "png":
-            # Drawn once; ``savefig`` draws twice, the first time for the layout.
+            # Draws once; ``savefig`` draws twice, the first time for the layout.
             FigureCanvasAgg(figure).print_png(stream)
         else:
             date = {"pdf": "CreationDate", "svg": "Date"}[kind]
@@ -135,27 +136,27 @@ def write(figure: Figure, path: Path) -> Path:
 
 
 def title(record: Record, subject: str) -> str:
-    """``subject`` with scenario and variant (of a measured run: the robot), and how far an incomplete run came."""
+    """Return a title with scenario and variant (or the measured robot), and the end time of an incomplete run."""
     note = "" if record.complete else f" (incomplete: ends at {record.time[-1]:.3g} s)"
     return f"{record.title or 'record'}: {subject}{note}"
 
 
 def comparison_title(records: Sequence[Record], subject: str) -> str:
-    """``subject`` with the scenario that the variants share."""
+    """Return a title with the scenario of the variants."""
     return f"{records[0].provenance.get('scenario', {}).get('name', '') or 'comparison'}: {subject}"
 
 
 def variant_styles(names: Sequence[T]) -> dict[T, dict[str, Any]]:
-    """Colour and width (and, beyond seven curves, line style) of variants, or of curves of one run, by position.
+    """Return colour, width and (beyond seven curves) line style of variants, or of curves of one run, by position.
 
-    Later ones lie on top and are thinner, so that equal curves are still seen to be several.
+    Later curves are on top and thinner, so that equal curves remain visible.
     """
-    many = len(VARIANT_COLOURS)
+    count = len(VARIANT_COLOURS)
     dashes = ("-", (0, (5, 1.5)), (0, (1, 1)), (0, (5, 1, 1, 1)))
     return {
         name: {
-            "color": VARIANT_COLOURS[k % many],
-            "linestyle": dashes[(k // many) % len(dashes)],
+            "color": VARIANT_COLOURS[k % count],
+            "linestyle": dashes[(k // count) % len(dashes)],
             "linewidth": 1.0 + 1.6 * 0.4**k if len(names) > 1 else 1.4,
         }
         for k, name in enumerate(names)
@@ -163,12 +164,12 @@ def variant_styles(names: Sequence[T]) -> dict[T, dict[str, Any]]:
 
 
 def number(value: float, digits: int = 4) -> str:
-    """``value`` with a real minus sign, as on the axes."""
+    """Format a number with a true minus sign, as on the axes."""
     return f"{value:.{digits}g}".replace("-", "−")
 
 
 def log_axis(axes: Axes, which: str = "y") -> None:
-    """A logarithmic axis, "x" or "y", with plain numbers, also for ranges of less than a decade."""
+    """Make an axis ("x" or "y") logarithmic with plain numbers, also for ranges of less than a decade."""
     axes.set(**{f"{which}scale": "log"})
     low, high = axes.get_ylim() if which == "y" else axes.get_xlim()
     near = high < 200.0 * low
@@ -179,7 +180,7 @@ def log_axis(axes: Axes, which: str = "y") -> None:
 
 
 def at_least(axes: Axes, span: float) -> None:
-    """Widen the vertical axis to a ``span``: rounding, or the steps of a sensor, are not blown up to its height."""
+    """Widen the vertical axis to at least ``span``, so that rounding or sensor resolution does not fill the axes."""
     low, high = axes.get_ylim()
     if high - low < span:
         middle = 0.5 * (low + high)
@@ -187,7 +188,7 @@ def at_least(axes: Axes, span: float) -> None:
 
 
 def shade_below_zero(axes: Axes, label: str) -> None:
-    """The zero line, and what lies below it shaded, if any of the axis does."""
+    """Draw the zero line and shade the part of the axes below it, if any."""
     axes.axhline(0.0, color=PULLING, linewidth=0.8)
     low, high = axes.get_ylim()
     if low < 0.0:
@@ -196,16 +197,16 @@ def shade_below_zero(axes: Axes, label: str) -> None:
 
 
 def legend_above(axes: Axes, columns: int = 3) -> None:
-    """The legend over the axes, where it hides nothing; room is kept for as many rows as it has."""
+    """Place the legend above the axes, where it hides nothing, with space for all its rows."""
     rows = -(-len(axes.get_legend_handles_labels()[1]) // columns)
     legend = axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=columns, borderaxespad=0.0)
-    # It may reach over the panel to its left; the empty title keeps the room above.
+    # It may extend over the panel to its left; an empty title reserves the space above.
     legend.set_in_layout(False)
     axes.set_title(" ", y=1.0, pad=6.0 + LEGEND_ROW * max(rows - 1, 0))
 
 
 def legend_below(figure: Figure, panels: Sequence[Axes], columns: int) -> None:
-    """One legend for some panels, below all of the figure."""
+    """Place one legend for several panels below the figure."""
     named: dict[str, Any] = {}
     for axes in panels:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
@@ -214,46 +215,51 @@ def legend_below(figure: Figure, panels: Sequence[Axes], columns: int) -> None:
 
 
 def settle_time(record: Record) -> float:
-    """``metrics.settle_s`` of the record's scenario [s]."""
+    """Return ``metrics.settle_s`` of the scenario of a record [s]."""
     return float(record.provenance.get("scenario", {}).get("metrics", {}).get("settle_s", 0.0))
 
 
 def sparse(points: Array) -> Array:
-    """At most about ``LINE_POINTS`` points of a curve in space."""
+    """Thin a curve in space to at most about ``LINE_POINTS`` points."""
     kept = np.linspace(0, len(points) - 1, min(len(points), LINE_POINTS)).astype(int)
     return points[kept]
 
 
 def line(axes: Axes, time: Array, values: Array, **options: Any) -> None:
-    """Plot a quantity over time; a single sample as a dot."""
+    """Plot a quantity over time; a single sample is a dot."""
     axes.plot(time, values, marker="o" if len(time) == 1 else None, markersize=3, **options)
 
 
 def time_rows(
     figure: Figure, rows: Sequence[Sequence[Series]], settle: float, *, compress: bool = False
 ) -> list[tuple[Axes, ...]]:
-    """Axes for quantities over time, one row each, with a column for the initial transient where it needs one.
+    """Create axes for quantities over time, one row each, with a column for the initial transient if needed.
 
-    A transient that would squeeze the settled rest of some row to less than two thirds of the height gets an enlarged
-    panel on the left; the axes on the right are then cut to the settled range. A transient that lasts for most of the
-    run gets none, as that panel would show the run a second time.
+    If the transient would compress the settled range of a row to less than two thirds of the height, it gets an
+    enlarged panel on the left, and the axes on the right are limited to the settled range. A transient that lasts for
+    most of the run gets no panel, because the panel would repeat the run.
 
     Parameters
     ----------
-    rows : for each row the series that will be drawn in it
-    settle : time from which on the values count as settled [s]
-    compress : draw what exceeds the settled range in the transient's panel on a logarithmic axis
+    figure : Figure
+        Figure to which the axes are added.
+    rows : sequence of sequences of Series
+        For each row, the series that will be drawn in it.
+    settle : float
+        Time from which the values count as settled [s].
+    compress : bool, optional
+        Use a logarithmic scale beyond the settled range in the transient panel.
 
     Returns
     -------
-    list of tuples of Axes
+    list of tuple of Axes
         For each row (transient, whole run) or (whole run,); draw everything in all of them.
     """
     end = max(time[-1] for row in rows for time, _ in row)
     transients = [_transient(row, settle) for row in rows]
-    # One that lasts for most of the run needs no panel.
+    # A transient that lasts for most of the run needs no panel.
     transients = [
-        transient if transient is not None and transient.end < TRANSIENT_MOST * end / TRANSIENT_ROOM else None
+        transient if transient is not None and transient.end < TRANSIENT_MAX_SHARE * end / TRANSIENT_ROOM else None
         for transient in transients
     ]
     window = max((transient.end for transient in transients if transient is not None), default=0.0)
@@ -280,7 +286,7 @@ def time_rows(
 
 @dataclass(frozen=True)
 class Transient:
-    """When a row settles [s], the range of its axis from then on, and the size of its largest value."""
+    """End of the transient of a row [s], range of its axis afterwards, and absolute value of its peak."""
 
     end: float
     low: float
@@ -289,7 +295,7 @@ class Transient:
 
 
 def _transient(row: Sequence[Series], settle: float) -> Transient | None:
-    """The transient of a row; None when the axis need not be cut."""
+    """Return the transient of a row, or None if its axis need not be limited."""
     settled = np.concatenate([values[time >= settle].ravel() for time, values in row])
     everything = np.concatenate([values.ravel() for _, values in row])
     settled, everything = settled[np.isfinite(settled)], everything[np.isfinite(everything)]
@@ -305,12 +311,12 @@ def _transient(row: Sequence[Series], settle: float) -> Transient | None:
         beyond = ((values < low) | (values > high)).reshape(len(time), -1).any(axis=1)
         if beyond.any():
             end = max(end, float(time[beyond][-1]))
-    # Some of what follows belongs in the picture of the transient.
+    # The panel also shows a little of the settled range.
     return Transient(max(1.5 * end, 0.02 * settle), low, high, float(np.abs(everything).max()))
 
 
 def _compress(axes: Axes, transient: Transient) -> None:
-    """Linear within the settled range and logarithmic beyond, where a peak would hide what follows it."""
+    """Make the axis linear within the settled range and logarithmic beyond, so that a peak does not hide the rest."""
     settled = max(abs(transient.low), abs(transient.high))
     if transient.largest > 3.0 * settled:
         axes.set_yscale("symlog", linthresh=settled)
@@ -319,6 +325,6 @@ def _compress(axes: Axes, transient: Transient) -> None:
         axes.set_yticks([-tick for tick in ticks[::-1]] + [0.0, *ticks])
         axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: number(value)))
         axes.yaxis.set_minor_locator(NullLocator())
-        # Curves bend where the scale changes: say so.
+        # Curves have a kink where the scale changes, so the scale is stated.
         text = f"logarithmic beyond ±{number(settled, 2)}"
         axes.text(0.98, 0.03, text, transform=axes.transAxes, ha="right", color=GREY, fontsize=6.5)

@@ -22,40 +22,45 @@ from dynsim.draw.figures.style import Array
 from dynsim.record.sensitivity import LEVEL, sensitivities, spread
 
 ENERGY = "electrical_energy_J"
-# Label, and factor to its unit. The first error that the table has is drawn.
+# Label, and factor to its unit. The first error in the table is drawn.
 ENERGIES = {ENERGY: ("electrical energy [J]", 1.0)}
 ERRORS = {
     "hand_error_rms_m": ("hand error, rms [mm]", 1e3),
     "final_position_error_m": ("final position error [mm]", 1e3),
 }
-# Unit parts at the ends of summary keys.
+# Parts of units at the end of summary keys.
 UNITS = {"m", "s", "rad", "N", "A", "V", "W", "J", "kg", "per"}
-# Most parameters of a tornado diagram, and number of bars of a histogram.
+# Maximum number of parameters in a tornado diagram, and of bars in a histogram.
 _BARS, _BINS = 12, 40
-# Values whose ratio is larger are drawn on a logarithmic axis or colour scale.
+# Values with a larger ratio are drawn on a logarithmic axis or colour scale.
 _WIDE = 8.0
-# Height and width of a panel, height of a bar of a tornado, of their surroundings, and of a colour bar [inch].
+# Height and width of a panel; heights of a bar of a tornado diagram, of the margins, and of a colour bar [inch].
 _PANEL, _ACROSS, _BAR, _ROOM = 2.1, 3.5, 0.22, 0.9
 _COLOURS = 0.5
-# A label of an axis, the title of a panel and a part of the figure's are not longer [characters].
+# Maximum length of an axis label, a panel title, and a part of the figure title [characters].
 _LABEL, _HEAD, _PART = 34, 58, 70
-# Rows of distributions.
+# Maximum number of rows of distributions.
 _ROWS = 6
-# Of variants among each other; and the most runs that have their number beside them.
+# Markers of variants; maximum number of runs that are labelled with their number.
 _MARKERS, _NUMBERED = "osD^vP*X", 12
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """A table of runs.
+    """Table of runs.
 
     Attributes
     ----------
-    name : of the scenario
-    rows : numbers and values by column; of runs that failed only what was varied
-    grid, sampled : columns that were varied
-    known : all variants of the scenario, in its order: their colours do not depend on which of them were run
-    plotted : columns of numbers that are drawn; none: energy and error
+    name : str
+        Name of the scenario.
+    rows : sequence of mapping
+        Numbers and values by column; a failed run has only its varied values.
+    grid, sampled : sequence of str
+        Columns that were varied.
+    known : sequence of str
+        All variants of the scenario in their order; colours do not depend on which variants were run.
+    plotted : sequence of str
+        Columns to draw; default: energy and error.
     """
 
     name: str
@@ -67,12 +72,12 @@ class Sweep:
 
     @property
     def variants(self) -> list[str]:
-        """In the order of the table; one without a name where there are none."""
+        """Variants in the order of the table; one without a name if there are no variants."""
         return list(dict.fromkeys(str(row.get("variant", "")) for row in self.rows))
 
     @property
     def failed(self) -> str:
-        """How many have no numbers, for titles; nothing when all have."""
+        """Number of runs without numbers, for titles; "" if all runs have numbers."""
         bad = sum(all(row.get(key) is None for key in self.metrics) for row in self.rows)
         return f"; {bad} of {len(self.rows)} failed" if bad else ""
 
@@ -83,7 +88,7 @@ class Sweep:
 
     @property
     def metrics(self) -> dict[str, tuple[str, float]]:
-        """What is drawn, as far as the table has it: the numbers asked for, else energy and error."""
+        """Columns to draw that are in the table: the requested columns, or energy and error."""
         if self.plotted:
             return {key: ENERGIES.get(key) or ERRORS.get(key) or named(key) for key in self.plotted if self._has(key)}
         energies = {key: look for key, look in ENERGIES.items() if self._has(key)}
@@ -94,14 +99,14 @@ class Sweep:
         return any(row.get(key) is not None for row in self.rows)
 
     def of(self, variant: str) -> list[Mapping[str, Any]]:
-        """Rows of one variant."""
+        """Return the rows of one variant."""
         return [row for row in self.rows if str(row.get("variant", "")) == variant]
 
 
 def named(key: str) -> tuple[str, float]:
-    """Label of a number by its key, with the unit that is in it, and 1: ``base.tip_margin_min`` is drawn as it is.
+    """Return label and scale of a number from its key and the unit in the key; ``base.tip_margin_min`` has no unit.
 
-    Names before the last point stay as they are: ``elbow_c: normal force max [N]``.
+    The part before the last dot is unchanged: ``elbow_c: normal force max [N]``.
     """
     name, _, number = key.rpartition(".")
     words = number.split("_")
@@ -114,12 +119,12 @@ def named(key: str) -> tuple[str, float]:
 
 
 def draw(sweep: Sweep, folder: Path, kind: str = "png") -> list[Path]:
-    """Every figure that the table has data for; returns the files.
+    """Draw every figure for which the table has data; return the files.
 
     Raises
     ------
     RecordError
-        A file cannot be written.
+        If a file cannot be written.
     """
     makers = {
         "sweep_lines": lines,
@@ -132,7 +137,7 @@ def draw(sweep: Sweep, folder: Path, kind: str = "png") -> list[Path]:
 
 
 def lines(sweep: Sweep) -> Figure | None:
-    """Energy and error over the only key of the grid, or else the first; None without a grid, or with two keys."""
+    """Draw energy and error over the only key of the grid; None without a grid, or with several keys."""
     if len(sweep.grid) != 1:
         return None
     (key,) = sweep.grid
@@ -161,7 +166,7 @@ def lines(sweep: Sweep) -> Figure | None:
 
 
 def heat_map(sweep: Sweep) -> Figure | None:
-    """Energy and error over the first two keys of the grid, for each variant; the mean over all else."""
+    """Draw energy and error over the first two keys of the grid, for each variant; the mean over all others."""
     if len(sweep.grid) < 2:
         return None
     x, y = sweep.grid[:2]
@@ -190,12 +195,12 @@ def heat_map(sweep: Sweep) -> Figure | None:
             axes.set_title(variant)
             _name_cells(axes, "y", y, ys)
             _name_cells(axes, "x", x, xs)
-        # Below its column: beside it, its label would stand at the next one.
+        # Below its column; next to it, its label would be at the next column.
         bar = figure.colorbar(image, ax=list(column), label=label, location="bottom", aspect=30, pad=0.02)
         if isinstance(norm, LogNorm):
             style.log_axis(bar.ax, "x")
     if empty:
-        figure.legend(handles=[Patch(color=style.GREY, label="no run ended well")], loc="outside lower right")
+        figure.legend(handles=[Patch(color=style.GREY, label="no run succeeded")], loc="outside lower right")
     for axes in panels[:, 1:].flat:
         axes.set_ylabel("")
     for axes in panels[:-1].flat:
@@ -204,7 +209,7 @@ def heat_map(sweep: Sweep) -> Figure | None:
 
 
 def pareto(sweep: Sweep) -> Figure | None:
-    """Energy against error of all runs, and by number those that no other run beats in both; None without both."""
+    """Draw energy against error of all runs, and number the runs of the Pareto front; None without both numbers."""
     if sweep.plotted or len(sweep.metrics) < 2:
         return None
     (energy, (energy_label, _)), (error, (error_label, scale)) = sweep.metrics.items()
@@ -216,7 +221,7 @@ def pareto(sweep: Sweep) -> Figure | None:
             (row[error], row[energy]) for row in sweep.of(variant) if None not in (row.get(error), row.get(energy))
         ]
         xs, ys = np.array(points, dtype=float).reshape(-1, 2).T
-        # Earlier ones are larger: equal runs of several variants are rings about each other.
+        # Earlier variants are larger, so that equal runs appear as concentric rings.
         larger = 1.0 + 1.8 * (len(sweep.variants) - 1 - k) / last
         size = (18 if len(sweep.rows) < 500 else 4) * larger**2
         mark = {"color": styles[variant]["color"], "marker": _MARKERS[k % len(_MARKERS)]}
@@ -231,7 +236,7 @@ def pareto(sweep: Sweep) -> Figure | None:
         *front.T,
         color=style.BLACK,
         linewidth=0.7,
-        # What lies left of and below the steps, no run reaches.
+        # No run is to the left of and below the steps.
         drawstyle="steps-post",
         marker="o",
         markersize=5,
@@ -248,7 +253,7 @@ def pareto(sweep: Sweep) -> Figure | None:
 
 
 def best(points: Sequence[tuple[float, float]]) -> Array:
-    """Points that no other one is below in one coordinate and not above in the other, by the first, (k, 2)."""
+    """Return the points that no other point dominates, sorted by the first coordinate, (k, 2)."""
     front: list[tuple[float, float]] = []
     for x, y in sorted(points):
         if not front or y < front[-1][1]:
@@ -257,25 +262,21 @@ def best(points: Sequence[tuple[float, float]]) -> Array:
 
 
 def samples(sweep: Sweep) -> Figure | None:
-    """Distribution of energy and error over the samples; None without samples.
+    """Draw the distribution of energy and error over the samples; None without samples.
 
-    A row for each variant and place of the grid: what the grid does is no law of the samples, and all places have the
-    same draws. Of many places, some that lie evenly among them.
+    There is one row per variant and grid point: variation by the grid is not part of the distribution, and all grid
+    points have the same draws. With many grid points, evenly spaced ones are shown.
     """
     if not sweep.sampled:
         return None
-    metrics, variants, places = sweep.metrics, sweep.variants, _grid_places(sweep)
+    metrics, variants, places = sweep.metrics, sweep.variants, _grid_points(sweep)
     room = max(_ROWS // len(variants), 1)
     shown = [places[k] for k in np.linspace(0, len(places) - 1, min(room, len(places))).round().astype(int)]
-    note = (
-        f"; {len(shown)} of {len(places)} places of the grid, all in statistics.json"
-        if len(shown) < len(places)
-        else ""
-    )
+    note = f"; {len(shown)} of {len(places)} grid points, all in statistics.json" if len(shown) < len(places) else ""
     figure = style.new_figure(
         _PANEL * len(variants) * len(shown) + _ROOM,
-        f"{sweep.name}: {len(sweep.rows)} runs by the law of their parameters{sweep.failed}{note}",
-        # A title of two numbers with their intervals is as wide as a panel.
+        f"{sweep.name}: {len(sweep.rows)} runs with random parameters{sweep.failed}{note}",
+        # A title with two numbers and their intervals is as wide as a panel.
         width=max(style.WIDTH, _ACROSS * len(metrics)),
     )
     rows = [(variant, grid_place) for variant in variants for grid_place in shown]
@@ -284,7 +285,7 @@ def samples(sweep: Sweep) -> Figure | None:
     panels = figure.subplots(len(rows), len(metrics), squeeze=False)
     for row, (variant, grid_place) in zip(panels, rows, strict=True):
         here = list(_at(sweep.of(variant), grid_place))
-        # Where there is one place, it goes without saying.
+        # A single grid point is not named.
         where = [f"{names[key]} = {_level(value)}" for key, value in grid_place.items()] if len(places) > 1 else []
         texts = [variant] * bool(variant) + [_short(", ".join(where), _HEAD - len(variant))] * bool(where)
         head = f"{', '.join(texts)}\n" if texts else ""
@@ -296,14 +297,14 @@ def samples(sweep: Sweep) -> Figure | None:
 
 
 def _distribution(axes: Axes, values: Array, head: str, colour: str) -> None:
-    """Histogram of the draws at one place, with their mean and its interval, and that of the draws themselves."""
+    """Draw the histogram of the draws at one grid point, with the mean, its interval, and the interval of the draws."""
     if len(values) < 2:
         axes.set_title(f"{head}too few runs with numbers: {len(values)}", fontsize=7.5)
         return
     if np.ptp(values) == 0.0:
         axes.set_title(f"{head}{len(values)} runs, all {style.number(values[0])}", fontsize=7.5)
         return
-    # As narrow as the number of samples allows: Freedman and Diaconis, or Sturges where they are few.
+    # Bin width by the rule of Freedman and Diaconis, or of Sturges for few samples.
     bins = min(_BINS, len(np.histogram_bin_edges(values, "auto")) - 1)
     axes.hist(values, bins=bins, color=colour, alpha=0.7)
     statistics = spread(values)
@@ -319,7 +320,7 @@ def _distribution(axes: Axes, values: Array, head: str, colour: str) -> None:
 
 
 def tornado(sweep: Sweep) -> Figure | None:
-    """What one standard deviation of each sampled key does to energy and error; None where no line can be fitted."""
+    """Draw the effect of one standard deviation of each sampled key; None if no linear model can be fitted."""
     effects = {
         (variant, metric): fit
         for variant in sweep.variants
@@ -330,7 +331,7 @@ def tornado(sweep: Sweep) -> Figure | None:
         return None
     variants, metrics = sweep.variants, sweep.metrics
     bars = min(len(sweep.sampled), _BARS)
-    title = f"{sweep.name}: what one standard deviation of each does{sweep.failed}"
+    title = f"{sweep.name}: effect of one standard deviation of each parameter{sweep.failed}"
     figure = style.new_figure((_BAR * bars + _ROOM) * len(variants) + 0.5, title)
     panels = figure.subplots(len(variants), len(metrics), squeeze=False)
     for row, variant in zip(panels, variants, strict=True):
@@ -338,7 +339,7 @@ def tornado(sweep: Sweep) -> Figure | None:
             axes.set_xlabel(f"change of {label}")
             fit = effects.get((variant, metric))
             if fit is None:
-                axes.set_title(f"{variant}: no line fits")
+                axes.set_title(f"{variant}: no linear fit")
                 continue
             order = np.argsort(-np.abs(fit.effect), kind="stable")[:bars][::-1]
             effect, half = scale * fit.effect[order], scale * fit.half_width[order]
@@ -348,7 +349,7 @@ def tornado(sweep: Sweep) -> Figure | None:
             axes.axvline(0.0, color=style.BLACK, linewidth=0.6)
             axes.grid(visible=False, axis="y")
             axes.margins(x=0.05)
-            explained = f"a line explains {100.0 * fit.explained:.3g} % of the variance"
+            explained = f"linear fit explains {100.0 * fit.explained:.3g} % of the variance"
             axes.set_title("\n".join([variant] * bool(variant) + [explained]), fontsize=7.5)
     return figure
 
@@ -358,31 +359,31 @@ def _fit(sweep: Sweep, variant: str, metric: str) -> Any:
     if not rows or not sweep.sampled:
         return None
     values = np.array([row[metric] for row in rows], dtype=float)
-    # What the grid does is not what the samples do.
-    for here in _together(rows, sweep.grid).values():
+    # Remove the effect of the grid from the effect of the samples.
+    for here in _grouped(rows, sweep.grid).values():
         values[here] -= values[here].mean()
-    # All places have the same draws: each counts once, or the intervals would be those of more than there are.
-    draws = list(_together(rows, sweep.sampled).values())
+    # All grid points have the same draws: each counts once, otherwise the intervals would be too narrow.
+    draws = list(_grouped(rows, sweep.sampled).values())
     parameters = np.array([[rows[draw[0]][key] for key in sweep.sampled] for draw in draws], dtype=float)
     return sensitivities(parameters, np.array([values[draw].mean() for draw in draws]))
 
 
-def _together(rows: Sequence[Mapping[str, Any]], keys: Sequence[str]) -> dict[tuple[str, ...], list[int]]:
-    """Which rows share the values of some keys, by those."""
+def _grouped(rows: Sequence[Mapping[str, Any]], keys: Sequence[str]) -> dict[tuple[str, ...], list[int]]:
+    """Group the indices of rows by their values of some keys."""
     groups: dict[tuple[str, ...], list[int]] = {}
     for k, row in enumerate(rows):
         groups.setdefault(tuple(str(row[key]) for key in keys), []).append(k)
     return groups
 
 
-def _grid_places(sweep: Sweep) -> list[dict[str, Any]]:
-    """Values of the grid's keys, each set of them once, in the order of the table."""
-    firsts = [rows[0] for rows in _together(sweep.rows, sweep.grid).values()]
+def _grid_points(sweep: Sweep) -> list[dict[str, Any]]:
+    """Return each combination of grid values once, in the order of the table."""
+    firsts = [rows[0] for rows in _grouped(sweep.rows, sweep.grid).values()]
     return [{key: sweep.rows[k][key] for key in sweep.grid} for k in firsts]
 
 
 def _levels(rows: Sequence[Mapping[str, Any]], key: str) -> list[Any]:
-    """Values of a key of the grid: numbers by size, others as they come."""
+    """Return the values of a grid key: numbers in ascending order, others in the order of the table."""
     levels = list({str(row[key]): row[key] for row in rows}.values())
     return sorted(levels) if _numeric(levels) else levels
 
@@ -402,7 +403,7 @@ def _name_places(axes: Axes, which: str, key: str, levels: Sequence[Any]) -> Non
 
 
 def _name_cells(axes: Axes, which: str, key: str, levels: Sequence[Any]) -> None:
-    """Name the rows or columns of an image: at most about eight of them."""
+    """Label the rows or columns of an image, at most about eight of them."""
     shown = range(0, len(levels), -(-len(levels) // 8))
     texts = [f"{levels[k]:.3g}" if _numeric(levels) else str(levels[k]) for k in shown]
     axes.set(**{f"{which}ticks": list(shown), f"{which}ticklabels": texts, f"{which}label": _short(key)})
@@ -417,7 +418,7 @@ def _values(rows: Sequence[Mapping[str, Any]] | Iterator[Mapping[str, Any]], met
 
 
 def _scale(axes: Axes, which: str, values: Array) -> None:
-    """A logarithmic axis for positive values of very different size; else one from zero, unless that squeezes them."""
+    """Use a logarithmic axis for positive values of very different size, otherwise start at zero if possible."""
     values = values[np.isfinite(values)]
     low, high = values.min(initial=np.inf), values.max(initial=-np.inf)
     if _is_wide(low, high):
@@ -427,13 +428,13 @@ def _scale(axes: Axes, which: str, values: Array) -> None:
 
 
 def _with_interval(value: float, half: float) -> str:
-    """A value and its half width to two digits of that."""
+    """Format a value and its half-width with two significant digits of the half-width."""
     places = max(1 - math.floor(math.log10(half)), 0) if half > 0.0 else 3
     return f"{value:.{places}f} ± {half:.{places}f}".replace("-", "−")
 
 
 def _is_wide(low: float, high: float) -> bool:
-    """Whether values between these are positive and of very different size."""
+    """Return whether values between these limits are positive and of very different size."""
     return bool(low > 0.0 and high > _WIDE * low)
 
 

@@ -45,14 +45,14 @@ from dynsim.snake.published import (
 from dynsim.system.files import write_text
 
 STOPPED = "joint at its limit"
-# Scenarios of Fig 13: the motion alone, and with a pipe.
+# Scenarios of Fig 13: without and with a pipe.
 PICK_UPS = ("snake_operator", "snake_pick_up")
 
 Maker = Callable[[Mapping[str, Record]], Figure]
 
 
 def figures(scenario: str, records: Mapping[str, Record]) -> dict[str, Maker]:
-    """Makers of the figures beside [T] by file name, as far as their variants were run."""
+    """Return the drawing functions of comparisons with [T] by file name, for the variants that were run."""
     makers: dict[str, Maker] = {}
     if scenario == "snake_positioning" and set(records) & set(TABLE_III):
         makers["table_iii"] = positioning
@@ -75,12 +75,12 @@ def figures(scenario: str, records: Mapping[str, Record]) -> dict[str, Maker]:
 
 
 def figures_of_run(record: Record) -> dict[str, Callable[[Record], Figure]]:
-    """Makers of the figures beside [T] that one run is enough for."""
+    """Return the drawing functions of comparisons with [T] that need one run only."""
     return {"fig_13": picking_up} if record.summary["scenario"] in PICK_UPS and record["gripper"].any() else {}
 
 
 def write_tables(scenario: str, records: Mapping[str, Record], folder: Path) -> list[Path]:
-    """Write the tables beside [T] as CSV; returns the files."""
+    """Write the comparison tables with [T] as CSV; return the files."""
     written = []
     for name, rows in tables(scenario, records).items():
         stream = io.StringIO()
@@ -90,9 +90,9 @@ def write_tables(scenario: str, records: Mapping[str, Record], folder: Path) -> 
 
 
 def positioning(records: Mapping[str, Record]) -> Figure:
-    """Table III of [T]: deviation from the target displacement, measured there and simulated here."""
+    """Table III of [T]: deviation from the target displacement, measured in [T] and simulated here."""
     moved = [name for name in TABLE_III if name in records]
-    figure = style.new_figure(4.7, "displacements of the head beside Table III of [T]")
+    figure = style.new_figure(4.7, "displacements of the head and Table III of [T]")
     axes = figure.subplots(2, 1, sharex=True)
     width = 0.8 / 3
     for axis, part, unit in ((axes[0], range(3), "mm"), (axes[1], range(3, 6), "rad")):
@@ -124,9 +124,9 @@ def positioning(records: Mapping[str, Record]) -> Figure:
 
 
 def dynamic_positioning(records: Mapping[str, Record]) -> Figure:
-    """Table III of [T]: deviation from the target displacement, measured there, and simulated in three ways."""
+    """Table III of [T]: deviation from the target displacement, measured in [T] and simulated in three ways."""
     moved = [name for name in TABLE_III if name in records]
-    figure = style.new_figure(6.6, "displacements of the head beside Table III of [T]")
+    figure = style.new_figure(6.6, "displacements of the head and Table III of [T]")
     axes = figure.subplots(6, 1, sharex=True)
     marks = {"kinematic": ("|", "black"), "dynamic": ("D", HEAD), "measured": ("o", GROUND)}
     for i, axis in enumerate(axes):
@@ -150,7 +150,7 @@ def dynamic_positioning(records: Mapping[str, Record]) -> Figure:
 
 
 def sag_and_feedback(records: Mapping[str, Record]) -> Figure:
-    """Figs 7(a) and 7(b): the head while β changes, by feedforward, and with the head measured; lines as there."""
+    """Figs 7(a) and 7(b) of [T]: the head while β changes, by feedforward and with the head measured."""
     figure = style.new_figure(7.2, "the head while β changes, as in Fig 7 of [T]")
     axes = figure.subplots(6, 2, sharex=True, sharey="row")
     shown = {"beta": "(a) feedforward", "beta_measured": "(b) measured by motion capture"}
@@ -169,7 +169,7 @@ def sag_and_feedback(records: Mapping[str, Record]) -> Figure:
 
 
 def wheel_loads(records: Mapping[str, Record]) -> Figure:
-    """Loads of the wheel pairs over time, of every manoeuvre by feedforward."""
+    """Draw the loads of the wheel pairs over time, for every manoeuvre by feedforward."""
     moved = [name for name in TABLE_III if name in records]
     figure = style.new_figure(1.25 * len(moved) + 1.2, "loads of the wheel pairs")
     axes = figure.subplots(len(moved), 1, sharex=True, squeeze=False)[:, 0]
@@ -189,7 +189,7 @@ def wheel_loads(records: Mapping[str, Record]) -> Figure:
 
 
 def motion(records: Mapping[str, Record]) -> Figure:
-    """Figs 8 and 16: top views over time with the costs of eq 19 and eq 20."""
+    """Figs 8 and 16 of [T]: top views over time with the costs of eq 19 and eq 20."""
     shown = {"cyclic": "eq 19\n(Fig 8)", "eq20": "eq 20 printed\n(Fig 16)", "eq20_min": "eq 20, 1/min d\n(Fig 16)"}
     lines = {}
     for name, label in shown.items():
@@ -205,7 +205,7 @@ def _view_at(record: Record, time: float) -> View:
 
 
 def head_and_cost(record: Record) -> Figure:
-    """Fig 9: pose of the head, mode and V over time; lines as there, and the error that its text states."""
+    """Fig 9 of [T]: pose of the head, mode and V over time, and the error that its text states."""
     figure = style.new_figure(6.9, style.title(record, "head, mode and cost, as in Fig 9 of [T]"))
     axes = figure.subplots(4, 2, sharex=True)
     time = record.time
@@ -237,7 +237,7 @@ def head_and_cost(record: Record) -> Figure:
 
 
 def joint_angles(record: Record) -> Figure:
-    """Fig 10: every joint angle over time with its limits, lines as there."""
+    """Fig 10 of [T]: every joint angle over time with its limits."""
     geometry, phi = snake_geometry(record), record["phi"]
     names, count = record.labels["phi"], phi.shape[1]
     lines = -(-count // 3)
@@ -265,8 +265,8 @@ def joint_angles(record: Record) -> Figure:
 
 
 def policies(records: Mapping[str, Record]) -> Figure:
-    """Modes of the three policies over time, with V, the largest yaw angle and the support margin."""
-    figure = style.new_figure(9.3, style.comparison_title(list(records.values()), "policies of switching modes"))
+    """Draw the modes of the three policies over time, with V, the largest yaw angle and the support margin."""
+    figure = style.new_figure(9.3, style.comparison_title(list(records.values()), "mode switching policies"))
     axes = figure.subplots(6, 1, sharex=True, height_ratios=[1, 1, 1, 1.2, 1, 1])
     for axis, name in zip(axes, POLICIES, strict=False):
         mode_chart(axis, records[name], f"{name}: mode")
@@ -287,10 +287,10 @@ def policies(records: Mapping[str, Record]) -> Figure:
 
 
 def door(record: Record) -> Figure:
-    """Fig 14: the pull with its stops at joint limits and the postures after switching modes, top view."""
+    """Fig 14 of [T]: the pull with its stops at joint limits and the postures after switching modes, top view."""
     fixing = record["mode"][0]
     changes = mode_sequence(record)
-    # a stop ends with the first mode that is not the fixing one, a recovery with the return to it
+    # A stop ends with the first mode other than the fixing mode, a recovery with the return to the fixing mode.
     stops = [
         (t, STOPPED if mode != fixing else "after switching modes")
         for (_, before), (t, mode) in pairwise(changes)
@@ -311,7 +311,7 @@ def door(record: Record) -> Figure:
 
 
 def picking_up(record: Record) -> Figure:
-    """Fig 13: reaching, grasping, after picking up; an object is in it where the scenario has one."""
+    """Fig 13 of [T]: reaching, grasping, after picking up; with the object, if the scenario has one."""
     closed = np.flatnonzero(record["gripper"])
     height = record["w"][closed, 2]
     lifted = closed[np.argmax(height > height.max() - 1e-4)]  # the first time; later ones differ by rounding

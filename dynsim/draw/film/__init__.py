@@ -1,7 +1,7 @@
-"""Films of records, painted without display, graphics card or browser.
+"""Render records to a GIF or MP4 file; no display needed.
 
-Record(s) → robots of :mod:`dynsim.draw.geometry.robot` → painted frames (:mod:`dynsim.draw.film.painter`) over a plot
-(:mod:`dynsim.draw.film.film`) → file (:mod:`dynsim.draw.film.film`)
+Records become robots (:mod:`dynsim.draw.geometry.robot`), robots become frames (:mod:`dynsim.draw.film.painter`), and
+:mod:`dynsim.draw.film.film` adds a plot and writes the file.
 """
 
 from dynsim.draw.film.film import Film, write

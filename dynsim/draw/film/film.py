@@ -1,4 +1,4 @@
-"""A film of one or several robots side by side, with a clock and a plot with a cursor."""
+"""Film of one or several robots side by side, with a clock and a plot with a cursor, and its encoding as GIF or MP4."""
 
 from __future__ import annotations
 
@@ -24,33 +24,44 @@ from dynsim.record import TIME, Record
 from dynsim.system.files import replacing
 from dynsim.system.terminal import plain
 
-# The plot below the robots of a film: one signal over time, drawn once, with a moving cursor.
-
-
-# Signals shown by default: the first of them that the record, or one of several records, has.
-ONE = ("contact_normal_force", "wheel_load", "hand_error", "support_margin", "position_error", "power", "q", "phi")
-SEVERAL = ("energy_electrical", "hand_error", "position_error", "tip_margin", "support_margin", "q", "phi")
+# Signals plotted by default: the first one in a record, or in one of several records.
+SIGNALS_OF_ONE = (
+    "contact_normal_force",
+    "wheel_load",
+    "hand_error",
+    "support_margin",
+    "position_error",
+    "power",
+    "q",
+    "phi",
+)
+SIGNALS_OF_SEVERAL = ("energy_electrical", "hand_error", "position_error", "tip_margin", "support_margin", "q", "phi")
 DPI = 100
 CURSOR = "#202428"
-# Number of columns of a signal with lines of their own: the largest ones. A band shows the range of all columns.
+# Number of columns of a signal that are drawn as lines (the largest); a band shows the range of all columns.
 NAMED = 4
-# Least width of a plot with a legend beside it [pixel], and most letters of a name in it.
-LEGEND_MIN, LETTERS = 400, 16
-# Height of one name in the legend [pixel]; names that do not fit are left out.
+# Minimum width of a plot with a legend next to it [pixel], and maximum length of a name in the legend.
+LEGEND_MIN, MAX_LETTERS = 400, 16
+# Height of a legend entry [pixel]; entries that do not fit are omitted.
 LEGEND_ROW = 14
 
 
 class Strip:
-    """A plot of one signal of all records over time, of a size [pixel].
+    """Plot of one signal of all records over time.
 
     Parameters
     ----------
-    signal : name, None for the first of a list that is there
+    records : mapping of str to Record
+        Names and records.
+    size : tuple of int
+        Width and height [pixel].
+    signal : str, optional
+        Name of the signal; default: the first default signal in the records.
 
     Raises
     ------
     RecordError
-        No record has the signal, or it is no quantity over the record's time.
+        If no record has the signal, or it cannot be plotted over the main time axis.
     """
 
     def __init__(self, records: Mapping[str, Record], size: tuple[int, int], signal: str | None = None) -> None:
@@ -63,7 +74,7 @@ class Strip:
                 self._draw(records, self.signal)
 
     def frame(self, time: float) -> Image.Image | None:
-        """The plot with its cursor at an instant [s]; None where there is nothing to plot."""
+        """Return the plot with its cursor at a time [s], or None if there is nothing to plot."""
         if self._image is None:
             return None
         image = self._image.copy()
@@ -82,7 +93,7 @@ class Strip:
             values = record[name].reshape(len(record), -1)
             called = {} if record.scene is None else record.scene.wheel_names
             names = [called.get(text, text) for text in record.labels[name] or (name,) * values.shape[1]]
-            many = values.shape[1] > 1
+            has_columns = values.shape[1] > 1
             shown = largest(values, 1 if several else NAMED)
             if len(shown) < values.shape[1]:
                 colour, opacity = (colours[label]["color"], 0.2) if several else ("#CFCFCF", 1.0)
@@ -90,14 +101,14 @@ class Strip:
                 text = None if several else f"all {values.shape[1]}"
                 axes.fill_between(record.time, low, high, color=colour, alpha=opacity, linewidth=0, label=text)
             for rank, k in enumerate(shown):
-                colour = style.VARIANT_COLOURS[rank] if many and not several else colours[label]["color"]
-                text = _cut(plain(label), LETTERS) if several else _cut(plain(names[k]), LETTERS)
-                text += f": {_cut(plain(names[k]), LETTERS)}" if several and many else ""
+                colour = style.VARIANT_COLOURS[rank] if has_columns and not several else colours[label]["color"]
+                text = _cut(plain(label), MAX_LETTERS) if several else _cut(plain(names[k]), MAX_LETTERS)
+                text += f": {_cut(plain(names[k]), MAX_LETTERS)}" if several and has_columns else ""
                 style.line(axes, record.time, values[:, k], color=colour, label=text)
         unit = next(iter(having.values())).units[name]
         title = f"{name.replace('_', ' ')}{f' [{unit}]' if unit not in ('', '1') else ''}"
         if several and any(record[name][0].size > 1 for record in having.values() if len(record)):
-            title += ": largest by rms, and range of all"
+            title += ": largest by rms, and range of all columns"
         axes.set_title(title, fontsize=7.5, loc="left", pad=3)
         axes.set_xlabel("time [s]", fontsize=7, labelpad=0)
         axes.tick_params(labelsize=7)
@@ -107,7 +118,7 @@ class Strip:
         axes.set_ylim(*_limits([record[name] for record in having.values()]))
         if several or len(axes.lines) > 1:
             handles, labels = axes.get_legend_handles_labels()
-            # The range of all first: it lies behind the others.
+            # The range of all columns is first, because it is behind the lines.
             most = max((self._size[1] - 20) // LEGEND_ROW, 1)
             self.legend = tuple(labels[:most])
             look: dict[str, Any] = {"bbox_to_anchor": (1.0, 1.0), "fontsize": 6.5, "borderaxespad": 0.2}
@@ -118,7 +129,7 @@ class Strip:
 
 
 def largest(values: style.Array, count: int) -> list[int]:
-    """Columns with the largest root mean square over time, at most so many, in their order; (T, n)."""
+    """Return at most ``count`` columns of values, (T, n), with the largest rms values over time, in their order."""
     effort = np.nan_to_num(values.astype(float) ** 2).sum(axis=0)
     return sorted(np.argsort(-effort, kind="stable")[:count].tolist())
 
@@ -128,7 +139,7 @@ def _cut(name: str, letters: int) -> str:
 
 
 def chosen(records: Mapping[str, Record], signal: str | None) -> str | None:
-    """The signal to plot, see :class:`Strip`."""
+    """Return the signal to plot, see :class:`Strip`."""
 
     def plotted(name: str) -> bool:
         return any(
@@ -136,15 +147,17 @@ def chosen(records: Mapping[str, Record], signal: str | None) -> str | None:
         )
 
     if signal is None:
-        return next((name for name in (SEVERAL if len(records) > 1 else ONE) if plotted(name)), None)
+        return next(
+            (name for name in (SIGNALS_OF_SEVERAL if len(records) > 1 else SIGNALS_OF_ONE) if plotted(name)), None
+        )
     if not plotted(signal):
         names = sorted({name for record in records.values() for name in record if plotted(name)})
-        raise RecordError(f"no signal {signal!r} over the record's time to plot; there are {', '.join(names)}")
+        raise RecordError(f"no signal {signal!r} that can be plotted over time; choices: {', '.join(names)}")
     return signal
 
 
 def _limits(values: list[style.Array]) -> tuple[float, float]:
-    """Range of the axis: a spike at the start does not squeeze the rest."""
+    """Return the range of the axis, cutting off a spike that would compress the rest."""
     pooled = np.concatenate([array.ravel() for array in values])
     pooled = pooled[np.isfinite(pooled)]
     if not len(pooled):
@@ -157,56 +170,53 @@ def _limits(values: list[style.Array]) -> tuple[float, float]:
     return low - room, high + room
 
 
-# Writing of frames to a film file: GIF by Pillow, MP4 by PyAV; limits on its length.
+# Encoding: GIF with Pillow, MP4 with PyAV.
 
-
-# Largest frame rate of a GIF [1/s]: times are multiples of 0.01 s, and players slow down frames of less than 0.02 s.
+# Maximum frame rate of a GIF [1/s]: times are multiples of 0.01 s, and players slow down frames shorter than 0.02 s.
 GIF_FPS_MAX = 50
-# Most pixels of all frames of a GIF, a byte each in memory.
+# Maximum number of pixels of all frames of a GIF; each takes one byte of memory.
 GIF_PIXELS_MAX = 1_000_000_000
-# Most frames of a film: more would take hours to paint.
+# Maximum number of frames of a film; more would take hours to paint.
 FRAMES_MAX = 100_000
-# Number of frames from which the palette of a GIF is made.
+# Number of frames from which the palette of a GIF is computed.
 SAMPLED = 6
-# Colours of a palette that differ by no more than this (of 255) are merged.
+# Palette colours that differ by no more than this (of 255) are merged.
 NEARLY = 9
-# Quality parameter of H.264: smaller is better and gives larger files; 18 is almost the original.
+# Quality parameter (CRF) of H.264: smaller values give better and larger files; 18 is nearly lossless.
 QUALITY = 20
 
 
 def check_length(kind: str, count: int, size: tuple[int, int]) -> None:
-    """Refuse more frames than a film may have.
+    """Raise if a film would have too many frames.
 
     Raises
     ------
     RecordError
-        There are more; of a GIF all stay in memory until the last one is there.
+        If there are too many frames, or a GIF, whose frames are all in memory, would be too large.
     """
     if count > FRAMES_MAX:
-        raise RecordError(f"{count} frames are no film; take a higher --speed or a lower --fps")
+        raise RecordError(f"too many frames ({count}, limit {FRAMES_MAX}); raise --speed or lower --fps")
     if kind == "gif" and count * size[0] * size[1] > GIF_PIXELS_MAX:
         raise RecordError(
-            f"a GIF of {count} frames of {size[0]}x{size[1]} pixels takes too much memory; write an .mp4, or take a "
-            "higher --speed, a lower --fps or a smaller --size"
+            f"a GIF of {count} frames of {size[0]}x{size[1]} pixels needs too much memory; write an .mp4, "
+            "raise --speed, or lower --fps or --size"
         )
 
 
 def check(kind: str, fps: int) -> None:
-    """Refuse what cannot be written, before the first frame is painted.
+    """Check format and frame rate before the first frame is painted.
 
     Raises
     ------
     RecordError
-        Another kind of file than "gif" and "mp4", PyAV is not installed, or too many frames a second for a GIF.
+        If the format is not "gif" or "mp4", PyAV is not installed, or the frame rate is too high for a GIF.
     """
     if kind not in ("gif", "mp4"):
         raise RecordError(
-            f"a film is a file.mp4 or a file.gif, not .{kind}" if kind else "a film is FILE.mp4 or FILE.gif"
+            f"unknown film format .{kind}; use .mp4 or .gif" if kind else "the film file must end in .mp4 or .gif"
         )
     if kind == "gif" and fps > GIF_FPS_MAX:
-        raise RecordError(
-            f"a GIF has at most {GIF_FPS_MAX} frames a second, not {fps}; write an .mp4, or take a lower --fps"
-        )
+        raise RecordError(f"--fps {fps} is too high for a GIF (limit {GIF_FPS_MAX}); write an .mp4, or lower --fps")
     if kind == "mp4":
         _av()
 
@@ -214,9 +224,12 @@ def check(kind: str, fps: int) -> None:
 def write_gif(
     stream: BinaryIO, frames: Iterable[Image.Image], sampled: Iterable[Image.Image], count: int, fps: int, last_s: float
 ) -> None:
-    """One palette for all frames, from those ``sampled``, so that nothing flickers; the last frame is held [s]."""
+    """Write a GIF with one palette, computed from ``sampled`` frames, which avoids flicker.
+
+    ``last_s`` is the extra duration of the last frame [s].
+    """
     palette = _palette(list(sampled))
-    # Hundredths of a second, rounded so that none is lost over the film.
+    # Hundredths of a second; rounding errors do not add up over the film.
     ends = np.rint(100.0 * np.arange(count + 1) / fps).astype(int)
     times = (10 * np.diff(ends)).tolist()
     times[-1] += round(1000 * last_s)
@@ -230,7 +243,7 @@ def _palette(frames: list[Image.Image]) -> Image.Image:
     sheet = Image.new("RGB", (width, height * len(frames)))
     for k, frame in enumerate(frames):
         sheet.paste(frame, (0, k * height))
-    # Small marks have few pixels, and their colours must be told apart all the same; what is nearly one of them is it.
+    # Fixed colours of marks, which have few pixels; similar colours are merged with them.
     kept = np.array([ImageColor.getrgb(colour) for colour in (*VARIANT_COLOURS, PULLING, GREY, "#FFFFFF")])
     colours = sheet.quantize(120, method=Image.Quantize.MEDIANCUT).getpalette() or []
     others = np.array(colours, dtype=int).reshape(-1, 3)[:120]
@@ -241,12 +254,14 @@ def _palette(frames: list[Image.Image]) -> Image.Image:
 
 
 def write_mp4(stream: BinaryIO, frames: Iterable[Image.Image], fps: int, last_s: float) -> None:
-    """H.264 as every browser and office program plays it; the last frame is repeated for ``hold`` [s].
+    """Write H.264 video that every browser and office program can play.
+
+    ``last_s`` is the extra duration of the last frame [s].
 
     Raises
     ------
     RecordError
-        PyAV is not installed.
+        If PyAV is not installed.
     """
     av = _av()
     frames = iter(frames)
@@ -273,19 +288,17 @@ def _av() -> Any:
     try:
         import av
     except ImportError as error:
-        raise RecordError(
-            "an .mp4 needs PyAV: pip install 'dynsim[video]'; or write a .gif, which needs nothing more"
-        ) from error
+        raise RecordError("an .mp4 requires PyAV: pip install 'dynsim[video]'; or write a .gif") from error
     return av
 
 
-# Heights of the title, and of the plot as a part of the picture.
+# Height of the title [pixel], and of the plot relative to the frame.
 HEAD, PLOT = 26, 0.24
-# Least height of the plot, and least size of a film that has one [pixel].
+# Minimum height of the plot, and minimum size of a film with a plot [pixel].
 PLOT_MIN, WITH_PLOT = 84, (240, 220)
-# Margin around a robot: at most [pixel], and as a part of a small picture.
+# Margin around a robot: maximum [pixel], and relative to a small frame.
 ROOM, ROOM_SHARE = 14, 0.05
-# Least width and height of the picture of one robot [pixel].
+# Minimum width and height of the cell of one robot [pixel].
 CELL_MIN = 60
 SIZE_MIN, SIZE_MAX = 160, 4096
 FPS_MAX, SPEED_MAX = 120, 1000.0
@@ -296,17 +309,40 @@ class Film:
 
     Parameters
     ----------
-    records : one, or several that are shown beside each other
-    view : "side", "top" or "iso"
-    size : width and height [pixel], even numbers
-    speed : of the film, 1: as fast as the motion was
-    fps : frames a second
-    plot : signal below the robots, None: one that suits them where there is room, "": none
+    records : mapping of str to Record
+        Names and records; several are shown side by side.
+    view : {"iso", "side", "top"}, optional
+        View direction.
+    size : tuple of int, optional
+        Width and height [pixel], even numbers from 160 to 4096.
+    speed : float, optional
+        Playback speed; 1 is real time.
+    fps : int, optional
+        Frame rate [1/s], 1 to 120.
+    plot : str, optional
+        Signal to plot below the robots; "" for no plot; default: chosen automatically if there is space.
+
+    Attributes
+    ----------
+    times : (n,) ndarray
+        Times of the frames [s].
+    size : tuple of int
+        Width and height [pixel].
+    fps : int
+        Frame rate [1/s].
 
     Raises
     ------
     RecordError
-        A record has nothing to be seen, the signal is not there, or a number is beyond bounds.
+        If no record can be shown, the signal does not exist, or a number is out of range.
+
+    Examples
+    --------
+    >>> import dynsim
+    >>> scenario = dynsim.load_scenario("elbow_comparison", variant="two_elbows", overrides={"duration_s": 0.1})
+    >>> film = dynsim.film.Film({"two elbows": dynsim.simulate(scenario)}, size=(320, 240), fps=20)
+    >>> film.frame(0.05).size, len(film.times)
+    ((320, 240), 3)
     """
 
     def __init__(
@@ -320,7 +356,7 @@ class Film:
         plot: str | None = None,
     ) -> None:
         if view not in FROM:
-            raise RecordError(f"a film is seen from {', '.join(FROM)}, not {view!r}")
+            raise RecordError(f"unknown view {view!r}; choices: {', '.join(FROM)}")
         _check(size, speed, fps)
         self.size, self.fps = size, fps
         shown = robots(records)
@@ -332,7 +368,9 @@ class Film:
         strip = (width, max(round(PLOT * height), PLOT_MIN))
         has_room = width >= WITH_PLOT[0] and height >= WITH_PLOT[1]
         if plot and not has_room:
-            raise RecordError(f"a film with a plot is at least {WITH_PLOT[0]}x{WITH_PLOT[1]}, not {width}x{height}")
+            raise RecordError(
+                f"a film with a plot must be at least {WITH_PLOT[0]}x{WITH_PLOT[1]}, not {width}x{height}"
+            )
         self._strip = Strip(kept, strip, plot) if plot != "" and has_room else None
         has_plot = self._strip is not None and self._strip.signal is not None
         self._area = (0, HEAD, width, height - (strip[1] if has_plot else 0))
@@ -341,7 +379,9 @@ class Film:
         low, high = bounds(some, axes)
         self._places, cell = _layout(len(some), self._area, high - low)
         if min(cell) < CELL_MIN:
-            raise RecordError(f"{len(some)} robots need a larger --size than {width}x{height}, or fewer records")
+            raise RecordError(
+                f"--size {width}x{height} is too small for {len(some)} robots; increase it, or use fewer records"
+            )
         room = min(ROOM, round(ROOM_SHARE * min(cell)))
         area = [room * FINER, room * FINER, (cell[0] - room) * FINER, (cell[1] - room) * FINER]
         if len(some) > 1:
@@ -364,7 +404,22 @@ class Film:
         self._title = plain(str(name) if len(some) > 1 else title)
 
     def frame(self, time: float) -> Image.Image:
-        """The picture at an instant of the records [s]."""
+        """Return the frame at a time.
+
+        Parameters
+        ----------
+        time : float
+            Time of the records [s].
+
+        Returns
+        -------
+        PIL.Image.Image
+            The frame.
+
+        Examples
+        --------
+        See :class:`Film`.
+        """
         image = Image.new("RGB", self.size, PAPER)
         for corner, painter in zip(self._places, self.painters.values(), strict=True):
             image.paste(painter.frame(time), corner)
@@ -381,7 +436,22 @@ class Film:
         return image
 
     def frames(self, done: Callable[[int], None] = lambda count: None) -> Iterator[Image.Image]:
-        """All pictures; ``done`` is told how many there were."""
+        """Yield all frames.
+
+        Parameters
+        ----------
+        done : callable, optional
+            Called after each frame with the number of frames so far.
+
+        Yields
+        ------
+        PIL.Image.Image
+            The next frame.
+
+        Examples
+        --------
+        See :class:`Film`.
+        """
         for k, time in enumerate(self.times.tolist(), start=1):
             yield self.frame(time)
             done(k)
@@ -399,23 +469,54 @@ def write(
     plot: str | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Path:
-    """Write a film of records, ``.gif`` or ``.mp4``: complete or not at all.
+    """Write a film of records atomically, as ``.gif`` or ``.mp4``.
 
     Parameters
     ----------
-    records, view, size, speed, fps, plot : see :class:`Film`
-    hold : how long the last frame stays [s]
-    progress : is told after each frame how many of how many there are
+    records : mapping of str to Record
+        Names and records; several are shown side by side.
+    path : str or path-like
+        File to write; its suffix determines the format.
+    view : {"iso", "side", "top"}, optional
+        View direction.
+    size : tuple of int, optional
+        Width and height [pixel], even numbers from 160 to 4096.
+    speed : float, optional
+        Playback speed; 1 is real time.
+    fps : int, optional
+        Frame rate [1/s], 1 to 120.
+    hold : float, optional
+        Extra duration of the last frame [s], 0 to 60.
+    plot : str, optional
+        Signal to plot below the robots; "" for no plot; default: chosen automatically if there is space.
+    progress : callable, optional
+        Called after each frame with the number of frames so far and in total.
+
+    Returns
+    -------
+    Path
+        The written file.
 
     Raises
     ------
     RecordError
-        As :class:`Film`; another kind of file; PyAV is not installed, which an MP4 needs; the file cannot be written.
+        As for :class:`Film`; also if the format is unknown, PyAV is missing for an MP4, the film has too many frames,
+        or the file cannot be written.
+
+    Examples
+    --------
+    >>> import dynsim, pathlib, tempfile
+    >>> scenario = dynsim.load_scenario("elbow_comparison", variant="two_elbows", overrides={"duration_s": 0.1})
+    >>> records = {"two elbows": dynsim.simulate(scenario)}
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = dynsim.film.write(records, pathlib.Path(folder) / "arm.gif", size=(320, 240), fps=20)
+    >>> path.name
+    'arm.gif'
     """
     path = Path(path)
     kind = path.suffix.lower().removeprefix(".")
     if not (math.isfinite(hold) and 0.0 <= hold <= 60.0):
-        raise RecordError(f"the last frame can be held for 0 to 60 s, not {hold:g}")
+        raise RecordError(f"hold must be 0 to 60 s, got {hold:g}")
     check(kind, fps)
     film = Film(records, view=view, size=size, speed=speed, fps=fps, plot=plot)
     total = len(film.times)
@@ -432,30 +533,33 @@ def write(
 
 def _check(size: tuple[int, int], speed: float, fps: int) -> None:
     if any(side % 2 or not SIZE_MIN <= side <= SIZE_MAX for side in size):
-        raise RecordError(f"width and height are even numbers from {SIZE_MIN} to {SIZE_MAX}, not {size[0]}x{size[1]}")
+        raise RecordError(
+            f"width and height must be even numbers from {SIZE_MIN} to {SIZE_MAX}, got {size[0]}x{size[1]}"
+        )
     if not (math.isfinite(speed) and 0.0 < speed <= SPEED_MAX):
-        raise RecordError(f"the speed of a film is more than 0 and at most {SPEED_MAX:g}, not {speed:g}")
+        raise RecordError(f"speed must be greater than 0 and at most {SPEED_MAX:g}, got {speed:g}")
     if not 1 <= fps <= FPS_MAX:
-        raise RecordError(f"a film has 1 to {FPS_MAX} frames a second, not {fps}")
+        raise RecordError(f"fps must be 1 to {FPS_MAX}, got {fps}")
 
 
 def _times(records: Mapping[str, Record], speed: float, fps: int) -> Array:
-    """Instants of the frames, the last one that of the last sample."""
+    """Return the times of the frames; the last one is the time of the last sample."""
     start = min((float(record.time[0]) for record in records.values() if len(record)), default=0.0)
     end = max((float(record.time[-1]) for record in records.values() if len(record)), default=0.0)
     frames = (end - start) * fps / speed
-    if not frames < FRAMES_MAX:  # before there is a table of them
-        raise RecordError(f"{frames:.3g} frames are no film; take a higher --speed or a lower --fps")
+    if not frames < FRAMES_MAX:  # before the array of times is created
+        raise RecordError(f"too many frames ({frames:.3g}, limit {FRAMES_MAX}); raise --speed or lower --fps")
     steps = math.ceil(round(frames, 6))
     return np.minimum(start + np.arange(steps + 1) * (speed / fps), end)
 
 
 def _layout(count: int, area: tuple[int, int, int, int], seen: Array) -> tuple[list[tuple[int, int]], tuple[int, int]]:
-    """Places and size of so many pictures in an area, in the rows and columns that show robots largest.
+    """Return positions and size of ``count`` cells in an area, in the rows and columns that show the robots largest.
 
     Parameters
     ----------
-    seen : (3,) size of what is shown: right, up, near [m]
+    seen : (3,) ndarray
+        Size of the scene: right, up, towards the viewer [m].
     """
     left, top, right, bottom = area
     wide, high = np.maximum(seen[:2], 1e-9)

@@ -1,4 +1,4 @@
-"""Frames of one robot: static background drawn once, moving faces drawn from far to near.
+"""Frames of one robot: static background drawn once, moving faces drawn from far to near; drawing tools and camera.
 
 Painted with Pillow at ``FINER`` times the size and then reduced, which smooths all edges. Faces are sorted by the depth
 of their centres, which suffices for faces that are small compared with their distances.
@@ -50,26 +50,24 @@ from dynsim.record.poses import ORIENTATION, POSITION
 from dynsim.record.quaternion import rotated
 from dynsim.record.scene import HERE, WORLD, SceneSurface
 
-# Lines, dashes, arrows, rings and labels drawn on an image, in pixels; the font of films.
-
-
+# Drawing tools, in pixels.
 Box = tuple[float, float, float, float]
 
 
 @cache
 def font(size: int) -> ImageFont.FreeTypeFont:
-    """The font that matplotlib brings, so that films look the same everywhere."""
+    """Return the font that is shipped with matplotlib, so that films look the same everywhere."""
     return ImageFont.truetype(Path(matplotlib.get_data_path(), "fonts", "ttf", "DejaVuSans.ttf"), size)
 
 
 def line(draw: ImageDraw.ImageDraw, points: Array, colour: tuple[int, ...], width: int) -> None:
-    """A path through points, (n, 2) [pixel]."""
+    """Draw a path through points, (n, 2) [pixel]."""
     if len(points) > 1:
         draw.line(points.ravel().tolist(), fill=colour, width=width, joint="curve")
 
 
 def dashes(draw: ImageDraw.ImageDraw, points: Array, length: float, colour: str, width: int) -> None:
-    """A path as dashes that are as long as their gaps [pixel]."""
+    """Draw a dashed path; dashes and gaps have the same length [pixel]."""
     if len(points) < 2:
         return
     distance = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
@@ -80,7 +78,7 @@ def dashes(draw: ImageDraw.ImageDraw, points: Array, length: float, colour: str,
 
 
 def arrow(draw: ImageDraw.ImageDraw, tail: Array, head: Array, colour: str, width: int) -> None:
-    """From tail to head [pixel], its head filled."""
+    """Draw an arrow with a filled head from tail to head [pixel]."""
     along = head - tail
     size = float(np.linalg.norm(along))
     if size < 1e-6:
@@ -95,7 +93,7 @@ def arrow(draw: ImageDraw.ImageDraw, tail: Array, head: Array, colour: str, widt
 
 
 def ring(draw: ImageDraw.ImageDraw, x: float, y: float, radius: float, colour: str, width: int) -> None:
-    """A circle about a dot [pixel]."""
+    """Draw a circle around a dot [pixel]."""
     draw.circle((x, y), radius, outline=colour, width=width)
     draw.circle((x, y), 2, fill=colour)
 
@@ -107,17 +105,25 @@ def labels(
     size: tuple[int, int],
     paper: str,
 ) -> list[Box]:
-    """Texts above their places, on paper of their own: over what is there, within the picture, beside each other.
+    """Draw texts on background patches above their anchors, inside the image and without overlap.
 
     Parameters
     ----------
-    texts : text, middle of its lower edge (2,), colour
-    size : of the picture
+    draw : ImageDraw
+        Target of the drawing.
+    texts : sequence of tuple
+        Text, centre of its lower edge (2,) [pixel], colour.
+    face : FreeTypeFont
+        Font.
+    size : tuple of int
+        Size of the image [pixel].
+    paper : str
+        Colour of the patches.
 
     Returns
     -------
-    list
-        Where they are: left, top, right, bottom.
+    list of tuple of float
+        Positions of the labels: left, top, right, bottom [pixel].
     """
     edge = 0.2 * face.size
     boxes: list[Box] = []
@@ -126,7 +132,7 @@ def labels(
         x = min(max(float(anchor[0]) - 0.5 * width, 0.0), size[0] - width)
         y = min(max(float(anchor[1]) - height, 0.0), size[1] - height)
         for _ in texts:
-            # Above what it would hide.
+            # Move it above the labels that it would hide.
             hidden = [box for box in boxes if x < box[2] and box[0] < x + width and y < box[3] and box[1] < y + height]
             if not hidden:
                 break
@@ -137,11 +143,9 @@ def labels(
     return boxes
 
 
-# The camera of a film: a parallel projection, so that the scale does not depend on the distance; named views.
-
-
+# Camera: parallel projection, so that the scale does not depend on the distance.
 View = Literal["side", "top", "iso"]
-# Directions from the robot to the camera, in axes whose x is the robot's longest horizontal extent.
+# Directions from the robot to the camera; the x axis is the longest horizontal extent of the robot.
 FROM: dict[str, tuple[float, float, float]] = {
     "side": (0.0, -1.0, 0.0),
     "top": (0.0, 0.0, 1.0),
@@ -151,14 +155,18 @@ FROM: dict[str, tuple[float, float, float]] = {
 
 @dataclass(frozen=True)
 class Camera:
-    """A parallel projection: p = scale · (right, −up) · (r − centre) + middle.
+    """Parallel projection p = scale · (right, −up) · (r − centre) + middle.
 
     Attributes
     ----------
-    axes : (3, 3) unit vectors in the world: right, up and towards the viewer
-    centre : (3,) the point r that is shown in the middle [m]
-    scale : [pixel/m]
-    middle : (2,) of the picture [pixel]; y is down
+    axes : (3, 3) ndarray
+        Unit vectors in the world: right, up and towards the viewer.
+    centre : (3,) ndarray
+        Point r shown in the middle [m].
+    scale : float
+        Scale [pixel/m].
+    middle : (2,) ndarray
+        Middle of the image [pixel]; y is down.
     """
 
     axes: Array
@@ -168,7 +176,10 @@ class Camera:
 
     @classmethod
     def fitted(cls, axes: Array, low: Array, high: Array, area: tuple[float, float, float, float]) -> Camera:
-        """See a box along the axes of a view from ``low`` to ``high`` in an area (left, top, right, bottom) [pixel]."""
+        """Create a camera that fits a box into an area (left, top, right, bottom) [pixel].
+
+        ``low`` and ``high`` are the corners of the box along ``axes`` [m].
+        """
         left, top, right, bottom = area
         size = np.maximum(high - low, 1e-9)
         scale = float(min((right - left) / size[0], (bottom - top) / size[1]))
@@ -176,14 +187,14 @@ class Camera:
         return cls(axes, 0.5 * (low + high) @ axes, scale, middle)
 
     def project(self, points: Array) -> Array:
-        """(…, 3) world [m] → (…, 3): x and y [pixel], and how near to the viewer [m]."""
+        """Project world points, (…, 3) [m], to x and y [pixel] and the coordinate towards the viewer [m], (…, 3)."""
         seen = (points - self.centre) @ self.axes.T
         seen[..., :2] = self.middle + seen[..., :2] * np.array([self.scale, -self.scale])
         return np.asarray(seen)
 
 
 def view_axes(view: View, azimuth: float) -> Array:
-    """Unit vectors to the right, up and towards the viewer, (3, 3)."""
+    """Return the unit vectors right, up and towards the viewer, (3, 3)."""
     c, s = np.cos(azimuth), np.sin(azimuth)
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     back = np.array(FROM[view])
@@ -195,27 +206,27 @@ def view_axes(view: View, azimuth: float) -> Array:
 
 Array = NDArray[np.float64]
 FINER = 2
-# Most triangles of all meshes: a film of a robot is some 500 pixels wide.
+# Maximum number of triangles of all meshes; the image of a robot is about 500 pixels wide.
 TRIANGLES = 20_000
 PAPER, GROUND, LINES, FAINT, SURFACE = "#FFFFFF", "#F1F3F5", "#D3D8DE", "#ECEEF1", "#C9D3DE"
 BODY, HUB, WHEEL, SUPPORT = "#AEB7C4", "#4A5260", "#3A4048", "#D5EAF8"
 FRICTION = "#7A3E9D"
-# Friction forces of less than this share of the largest normal force get no arrow.
-FRICTION_SHOWN = 1e-3
+# Friction forces below this fraction of the largest normal force have no arrow.
+MIN_FRICTION_SHARE = 1e-3
 MODES = {0: GREY, 1: ORANGE, 2: GREEN}
-# Towards the light, seen by the viewer: right, up, near.
+# Direction to the light in view coordinates: right, up, towards the viewer.
 LIGHT = np.array([-0.35, 0.75, 0.56]) / np.linalg.norm([-0.35, 0.75, 0.56])
-# Height of a picture [pixel] below which texts are smaller.
-LOW = 200
-# Most points of a path.
-WAY = 600
+# Image height below which texts are smaller [pixel].
+SMALL_HEIGHT = 200
+# Maximum number of points of a path.
+PATH_POINTS = 600
 
 
 @dataclass(frozen=True)
 class _Solids:
-    """Faces of everything that moves: corners in the frames of their bodies, faces of four corners, colours.
+    """Faces of all moving solids: corners in body frames, faces with four corners, colours.
 
-    ``aside``: how far the corners are moved by an open and a closed gripper, (2, n, 3) [m].
+    ``aside``: displacement of the corners by an open and a closed gripper, (2, n, 3) [m].
     """
 
     corners: Array
@@ -227,14 +238,22 @@ class _Solids:
 
 
 class Painter:
-    """Paints a robot at instants of its record into an image of a size.
+    """Painter of a robot at times of its record.
 
     Parameters
     ----------
-    camera : for the picture at ``FINER`` times its size
-    bounds : the box in which everything moves [m]
-    tint : colour of the hand's way
-    title : is written in it, and then hubs have it too: the robot is one of several
+    robot : DrawnRobot
+        Robot to paint.
+    camera : Camera
+        Camera for an image of ``FINER`` times the size.
+    size : tuple of int
+        Width and height of the image [pixel].
+    bounds : tuple of ndarray
+        Box in which everything moves [m].
+    tint : str, optional
+        Colour of the hand path.
+    title : str, optional
+        Title in the image, if there are several robots; the hubs then have the colour ``tint``.
     """
 
     def __init__(
@@ -259,7 +278,7 @@ class Painter:
         self._fixed = [shown for shape in robot.scene.fixed if (shown := drawn_shape(shape, meshes)) is not None]
         self._meshes = simplified(meshes.unique, TRIANGLES)
         self._wheels = wheel_groups(record, robot.scene)
-        # The body that has a gripper.
+        # The body with the gripper.
         hand = robot.scene.hand
         self._grip = gripping(record)
         self._gripped = hand.body if hand is not None and self._grip is not None else WORLD
@@ -267,16 +286,16 @@ class Painter:
         self._contacts = contacts(robot)
         self._sunk = penetrations(record, robot.scene)
         self._full = largest_force(self._contacts)
-        self._ways = dict(paths(record, robot.scene))
+        self._paths = dict(paths(record, robot.scene))
         self._supports = supports(robot.scene, self._wheels)
         self._pressure = cop_of(record)
-        # Of one robot among several it is as small as its part of the film.
-        self._font = font((13 if size[1] >= LOW else 11) * FINER)
+        # Smaller text in the smaller images of several robots.
+        self._font = font((13 if size[1] >= SMALL_HEIGHT else 11) * FINER)
         self.labels: list[Box] = []
         self._still = self._background(*bounds)
 
     def frame(self, time: float) -> Image.Image:
-        """The robot at an instant [s], between samples in straight lines."""
+        """Return the image of the robot at a time [s], with linear interpolation between samples."""
         position, turn, row, share = self._pose(time)
         image = self._still.copy()
         draw = ImageDraw.Draw(image)
@@ -287,18 +306,18 @@ class Painter:
                 draw.polygon([tuple(corner) for corner in corners.tolist()], fill=SUPPORT, outline=SKY)
             self._paint_bodies(draw, position, turn, row)
             self._paint_pressure(draw, hull, row)
-            self._paint_way(draw, time, row)
+            self._paint_path(draw, time, row)
             for point in self._sunk:
                 self._paint_sunk(draw, point, position, turn, row, share)
             forces = [self._paint_contact(draw, contact, position, turn, row, share) for contact in self._contacts]
             self._paint_hand(draw, position, turn)
-            # Last, so that nothing lies over a sign.
-            self._tell_grip(draw, row)
+            # Last, so that labels are on top.
+            self._paint_grip_state(draw, row)
             self.labels = labels(draw, [force for force in forces if force], self._font, image.size, PAPER)
         return image.reduce(FINER)
 
     def hand(self, time: float) -> tuple[float, float] | None:
-        """Where the hand's mark is in the picture [pixel]; None for a robot without a hand."""
+        """Return the position of the hand mark in the image [pixel], or None for a robot without a hand."""
         point = self.robot.scene.hand
         if point is None:
             return None
@@ -307,7 +326,7 @@ class Painter:
         return float(x) / FINER, float(y) / FINER
 
     def _pose(self, time: float) -> tuple[Array, Array, int, float]:
-        """Places and turns of all bodies at an instant, the sample before it, and how far it is to the next one."""
+        """Return positions and orientations of all bodies at a time, the preceding sample and the fraction after it."""
         row, share = 0, 0.0
         if len(self._time) > 1:
             row = int(np.clip(np.searchsorted(self._time, time, side="right") - 1, 0, len(self._time) - 2))
@@ -342,7 +361,7 @@ class Painter:
         )
 
     def _fingers(self, shapes: list[list[dict[str, Any]]]) -> list[tuple[dict[str, Any], Array]]:
-        """Fingers of a gripper between open and closed, and where those states move them, (2, 3) [m]."""
+        """Return the fingers of a gripper halfway between open and closed, and their displacements, (2, 3) [m]."""
         hand = self.robot.scene.hand
         if hand is None or self._gripped == WORLD:
             return []
@@ -352,7 +371,7 @@ class Painter:
         return [(shape, side * np.outer(both["aside"], [0.0, 1.0, 0.0])) for side in (-1.0, 1.0)]
 
     def _colours(self, shape: dict[str, Any], faces: int, plain: str) -> Array:
-        """Colours of a shape's faces, (n, 3): its own, those of its mesh's file, or a plain one."""
+        """Return the colours of the faces of a shape, (n, 3): from the shape, from its mesh file, or a default."""
         colours = np.tile(np.array(_rgb(plain), dtype=float), (faces, 1))
         if "colour" in shape:
             colours[:] = 255.0 * np.array(shape["colour"][:3])
@@ -364,7 +383,7 @@ class Painter:
         image = Image.new("RGB", (self.size[0] * FINER, self.size[1] * FINER), PAPER)
         draw = ImageDraw.Draw(image)
         if not self.robot.scene.surfaces:
-            # To see by where things are.
+            # A grid helps to judge positions.
             self._paint_floor(draw, low, high, float(low[2]), real=False)
         for surface in self.robot.scene.surfaces:
             plane = surface.kind == "plane" and surface.direction is not None
@@ -375,17 +394,17 @@ class Painter:
         for shape in self._fixed:
             points, cells = solid(shape, self._meshes)
             self._paint_faces(draw, points, cells, self._colours(shape, len(cells), HUB))
-        if (target := self._ways.get("target")) is not None:
-            dashes(draw, _apart(self.camera.project(target)[:, :2]), 6.0 * FINER, BLACK, FINER)
-        if (path := self._ways.get("hand")) is not None:
+        if (target := self._paths.get("target")) is not None:
+            dashes(draw, _finite_path(self.camera.project(target)[:, :2]), 6.0 * FINER, BLACK, FINER)
+        if (path := self._paths.get("hand")) is not None:
             faint = tuple(int(0.65 * 255 + 0.35 * part) for part in _rgb(self.tint))
-            line(draw, _apart(self.camera.project(path)[:, :2]), faint, FINER)
+            line(draw, _finite_path(self.camera.project(path)[:, :2]), faint, FINER)
         if self.title:
             draw.text((10 * FINER, 8 * FINER), self.title, fill=self.tint, font=self._font)
         return image
 
     def _paint_surface(self, draw: ImageDraw.ImageDraw, surface: SceneSurface, low: Array, high: Array) -> None:
-        """A sphere or cylinder as a closed solid, or, if it is large, as the others: the part next to the robot."""
+        """Paint a small sphere or cylinder as a closed solid, any other surface as a patch near the robot."""
         colour = np.array(_rgb(SURFACE))
         round_one = surface.kind in ("sphere", "cylinder")
         drawn = drawn_surface(surface, low, high) if round_one else {"kind": surface.kind}
@@ -396,11 +415,11 @@ class Painter:
         radius = float(drawn["radius"])
         shape = {"q": HERE, **drawn, "size": [abs(radius), drawn.get("length", 0.0)]}
         corners, faces = solid(shape, [], finer=3)
-        # Of one that holds the robot the far wall is seen.
+        # If the robot is inside, the far wall is visible.
         self._paint_faces(draw, corners, faces if radius > 0.0 else faces[:, ::-1], colour)
 
     def _paint_floor(self, draw: ImageDraw.ImageDraw, low: Array, high: Array, z: float, *, real: bool = True) -> None:
-        """A horizontal plane with a grid; from the side all below its line. What is not ``real`` is only a grid."""
+        """Paint a horizontal plane with a grid (in side view, the area below it), or only the grid if not ``real``."""
         width, height = (side * FINER for side in self.size)
         up = float(self.camera.axes[2][2])
         level = float(self.camera.project(np.array([*(0.5 * (low + high))[:2], z]))[1])
@@ -410,7 +429,7 @@ class Painter:
             draw.rectangle([0, level, width, height], fill=GROUND)
             draw.line([0, level, width, level], fill=GREY, width=FINER)
             return
-        # What the picture shows of it, from the corners of the picture along the line of sight.
+        # Visible part: the corners of the image projected along the line of sight.
         seen = np.array([[0.0, 0.0], [width, 0.0], [width, height], [0.0, height]])
         flat = (seen - self.camera.middle) * np.array([1.0, -1.0]) / self.camera.scale
         points = self.camera.centre + flat @ self.camera.axes[:2]
@@ -451,10 +470,10 @@ class Painter:
         *,
         both: bool = False,
     ) -> None:
-        """Faces that turn to the viewer (or ``both`` sides), from the farthest on, lit from the upper left."""
+        """Paint faces that are turned to the viewer (or ``both`` sides), from far to near, lit from the upper left."""
         seen = self.camera.project(corners)
         shown = seen[faces]
-        # Area and direction from the diagonals, which a triangle that repeats a corner has as well.
+        # Area and direction from the diagonals; this also works for a triangle that repeats a corner.
         a, b = shown[:, 2] - shown[:, 0], shown[:, 3] - shown[:, 1]
         scale = np.array([1.0, -1.0, self.camera.scale])
         normal = np.cross(a * scale, b * scale)
@@ -473,7 +492,7 @@ class Painter:
             draw.polygon(corner, fill=tuple(fill))
 
     def _support(self, position: Array, turn: Array, row: int) -> Array:
-        """Corners of what the robot stands on, (n, 2) [m], turning to the left."""
+        """Return the corners of the support polygon, (n, 2) [m], counterclockwise."""
         down = self._wheels.down
         on = [
             support
@@ -484,7 +503,7 @@ class Painter:
         return outline(np.array(points)) if points else np.zeros((0, 2))
 
     def _paint_pressure(self, draw: ImageDraw.ImageDraw, hull: Array, row: int) -> None:
-        """Where the robot presses, a ring: orange outside of what it stands on."""
+        """Paint a ring at the centre of pressure or mass; orange outside the support polygon."""
         if self._pressure is None or not np.isfinite(self._pressure[1][row]).all():
             return
         at = self._pressure[1][row]
@@ -492,18 +511,18 @@ class Painter:
         x, y, _ = self.camera.project(np.array([*at, 0.0]))
         ring(draw, x, y, 5.0 * FINER, BLACK if inside else PULLING, 2 * FINER)
 
-    def _paint_way(self, draw: ImageDraw.ImageDraw, time: float, row: int) -> None:
-        path = self._ways.get("hand")
+    def _paint_path(self, draw: ImageDraw.ImageDraw, time: float, row: int) -> None:
+        path = self._paths.get("hand")
         if path is None or row < 1:
             return
-        line(draw, _apart(self.camera.project(path[: row + 1])[:, :2]), _rgb(self.tint), 2 * FINER)
+        line(draw, _finite_path(self.camera.project(path[: row + 1])[:, :2]), _rgb(self.tint), 2 * FINER)
 
     def _paint_contact(
         self, draw: ImageDraw.ImageDraw, contact: DrawnContact, position: Array, turn: Array, row: int, share: float
     ) -> tuple[str, Array, str] | None:
-        """Arrows of the normal force, and of all of it with friction: away from the surface for a push, else to it.
+        """Paint arrows of the normal and total force: away from the surface if it pushes, towards it if it pulls.
 
-        Returns the force in words, where to write it [pixel], and its colour; None where there is none.
+        Returns the text of the force, its position [pixel] and colour, or None without a force.
         """
         if contact.at is None:
             at = _on(contact.point.body, np.array(contact.point.position), position, turn)
@@ -517,7 +536,7 @@ class Painter:
         if np.isfinite(force) and force != 0.0 and mode != 0:
             normal = force * contact.normal[row]
             friction = None if contact.tangent is None else _between(contact.tangent, row, share)
-            if friction is not None and np.linalg.norm(friction) > FRICTION_SHOWN * self._full:
+            if friction is not None and np.linalg.norm(friction) > MIN_FRICTION_SHARE * self._full:
                 self._paint_force(draw, at, normal + friction, force < 0.0, FRICTION, 2 * FINER)
             end = self._paint_force(draw, at, normal, force < 0.0, colour, 3 * FINER)
             text = f"{force:+.3g} N".replace("-", "−"), end - [0.0, 2.0 * FINER], colour
@@ -527,7 +546,7 @@ class Painter:
     def _paint_sunk(
         self, draw: ImageDraw.ImageDraw, point: Penetration, position: Array, turn: Array, row: int, share: float
     ) -> None:
-        """A ring about a joint that is below a surface, and by how much."""
+        """Paint a ring around a joint that is below a surface, with its depth."""
         depth = float(_between(point.depth, row, share))
         if not depth > point.least:
             return
@@ -539,7 +558,7 @@ class Painter:
     def _paint_force(
         self, draw: ImageDraw.ImageDraw, at: Array, force: Array, pulls: bool, colour: str, width: int
     ) -> Array:
-        """The arrow of a force [N] at a contact, on the free side; returns its end away from the contact [pixel]."""
+        """Paint the arrow of a force [N] at a contact, on the free side; return its far end [pixel]."""
         size = float(np.linalg.norm(force))
         long = max(0.13 * self.robot.reach * min((size / self._full) ** 0.5, 1.6), 14.0 * FINER / self.camera.scale)
         here = self.camera.project(at)[:2]
@@ -547,8 +566,8 @@ class Painter:
         arrow(draw, *((there, here) if pulls else (here, there)), colour, width)
         return np.asarray(there)
 
-    def _tell_grip(self, draw: ImageDraw.ImageDraw, row: int) -> None:
-        """The state of a gripper in words, below the title, where the record knows it."""
+    def _paint_grip_state(self, draw: ImageDraw.ImageDraw, row: int) -> None:
+        """Write the state of a gripper below the title, if the record contains it."""
         if "gripper_state" in self.robot.record:
             text = f"gripper: {GRIPPER_STATES[int(self.robot.record['gripper_state'][row])]}"
             draw.text((10 * FINER, (24 if self.title else 8) * FINER), text, fill=HUB, font=self._font)
@@ -562,7 +581,7 @@ class Painter:
 
 
 def arrow_colour(force: float) -> str:
-    """Of a normal force: blue where the surface pushes, orange where it pulls."""
+    """Return the colour of a normal force: blue if the surface pushes, orange if it pulls."""
     return PULLING if force < 0.0 else BLUE
 
 
@@ -578,11 +597,11 @@ def _between(values: Array, row: int, share: float) -> Array:
 
 
 def _on(body: int, point: Array, position: Array, turn: Array) -> Array:
-    """Where a point on a body is in the world, (3,) [m]."""
+    """Return the world position of a point on a body, (3,) [m]."""
     return point if body == WORLD else np.asarray(position[body] + rotated(turn[body], point))
 
 
-def _apart(points: Array) -> Array:
-    """Points of a path as they are known, at most ``WAY`` of them."""
+def _finite_path(points: Array) -> Array:
+    """Return the finite points of a path, at most ``PATH_POINTS``."""
     points = points[np.isfinite(points).all(axis=1)]
-    return points[np.linspace(0, len(points) - 1, min(len(points), WAY)).astype(int)] if len(points) else points
+    return points[np.linspace(0, len(points) - 1, min(len(points), PATH_POINTS)).astype(int)] if len(points) else points

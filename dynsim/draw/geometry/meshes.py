@@ -1,4 +1,4 @@
-"""Meshes of URDF robots: located, read once each, and simplified to a number of triangles for a page or film."""
+"""Meshes of URDF robots: found, read once each, and simplified to a number of triangles for a page or film."""
 
 from __future__ import annotations
 
@@ -17,9 +17,6 @@ from dynsim.errors import RecordError, first_few
 from dynsim.record import Record
 from dynsim.system.inputs import read_bytes
 
-# Triangles from mesh files: STL (text and binary), OBJ and COLLADA, the subset that URDF robots use.
-
-
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 BYTES_MAX = 100_000_000
@@ -28,13 +25,16 @@ _RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("more", "
 
 
 class Mesh(NamedTuple):
-    """A surface of triangles.
+    """Triangle mesh.
 
     Attributes
     ----------
-    corners : (n, 3) [m]
-    triangles : (m, 3) indices of corners
-    colours : (m, 3) red, green and blue from 0 to 1, NaN where the file has none; None: it has none at all
+    corners : (n, 3) ndarray
+        Positions [m].
+    triangles : (m, 3) ndarray of int
+        Indices of corners.
+    colours : (m, 3) ndarray or None
+        Red, green and blue from 0 to 1, NaN for triangles without a colour; None for a file without colours.
     """
 
     corners: Array
@@ -43,27 +43,27 @@ class Mesh(NamedTuple):
 
 
 def read_mesh(path: Path) -> Mesh:
-    """The mesh of a file, in the frame and unit that a URDF file takes it in, a COLLADA file's with its colours.
+    """Read a mesh file (STL, OBJ or COLLADA), in the frame and unit of URDF.
 
-    The unit of a COLLADA file is handled, its upward axis is not: so do the viewers that robots are made with.
+    The unit of a COLLADA file is applied; its upward axis is ignored, as in other robot viewers.
 
     Raises
     ------
     RecordError
-        The file cannot be read, is of another format, or broken.
+        If the file cannot be read, has another format, or is damaged.
     """
     reader = {".stl": _stl, ".obj": _obj, ".dae": _collada}.get(path.suffix.lower())
     if reader is None:
-        raise RecordError(f"{path}: not a mesh that can be read (.stl, .obj, .dae)")
+        raise RecordError(f"{path}: unsupported mesh format; use .stl, .obj or .dae")
     content = read_bytes(path, RecordError, BYTES_MAX)
     try:
         mesh = reader(content)
-    # Broken files make pycollada raise almost anything.
+    # With damaged files pycollada raises exceptions of almost any type.
     except Exception as error:
-        raise RecordError(f"{path}: not a mesh that can be read: {error}") from error
+        raise RecordError(f"{path}: cannot read mesh: {error}") from error
     corners, triangles, colours = mesh
     if not len(triangles) or triangles.min() < 0 or triangles.max() >= len(corners):
-        raise RecordError(f"{path}: no triangles, or some of corners that it does not have")
+        raise RecordError(f"{path}: has no triangles, or triangles with invalid corner indices")
     good = np.isfinite(corners[triangles]).all(axis=(1, 2))
     return Mesh(corners, triangles[good], None if colours is None else colours[good])
 
@@ -99,8 +99,8 @@ def _collada(content: bytes) -> Mesh:
     import collada
 
     if b"<!DOCTYPE" in content or b"<!ENTITY" in content:
-        raise ValueError("entities are not read")
-    # A mesh is worth more than its colours: broken ones would take what they are bound to with them.
+        raise ValueError("XML entities are not allowed")
+    # Remove invalid colours: otherwise the geometry that uses them would be lost.
     content = _COLOUR.sub(lambda match: match[0] if len(match[1].split()) > 2 else b"", content)
     for text in (content, re.sub(b"<bind_material>.*?</bind_material>", b"", content, flags=re.DOTALL)):
         document = collada.Collada(io.BytesIO(text), ignore=[collada.DaeError])
@@ -132,28 +132,28 @@ def _collada(content: bytes) -> Mesh:
 
 
 def _diffuse(material: Any) -> Array:
-    """Red, green and blue of a material from 0 to 1; NaN where it has a texture or none of them."""
+    """Return red, green and blue of a material from 0 to 1; NaN if it has a texture or no colour."""
     colour = getattr(material.effect, "diffuse", None)
     if isinstance(colour, tuple) and len(colour) > 2 and np.isfinite(colour[:3]).all():
         return np.clip(colour[:3], 0.0, 1.0)
     return _UNKNOWN
 
 
-# Most triangles of all meshes of a page: some 1 MB.
+# Maximum number of triangles of all meshes of a page, about 1 MB.
 TRIANGLES = 100_000
-# Corners closer than this share of a mesh's size are merged: STL repeats them for every triangle.
+# Corners closer than this fraction of the mesh size are merged; STL repeats them for every triangle.
 _WELD = 2.0**-20
-# Such shares used before a mesh is simplified, as thin triangles, frequent in meshes from CAD, hinder that. The next
-# share is tried if more than this many times the allowed triangles are left.
+# Fractions for merging before a mesh is simplified, because thin triangles, frequent in CAD meshes, hinder
+# simplification. The next fraction is tried if more than this multiple of the allowed triangles is left.
 _COARSE, _TOO_MANY = (1 / 500, 1 / 250, 1 / 120, 1 / 60, 1 / 30), 1.5
-# Parameter of fast_simplification: edges are collapsed up to an error of a hundredth of the size.
+# Parameter of fast_simplification: edges are collapsed up to an error of 1 % of the size.
 _AGGRESSIVENESS = 2.5
-# Least number of triangles of a solid, those of a tetrahedron.
-_LEAST = 4
+# Minimum number of triangles of a solid (a tetrahedron).
+_MIN_TRIANGLES = 4
 
 
 class Meshes:
-    """Meshes, each once; files of a record's meshes are searched for in the folder of its robot's file."""
+    """Set of distinct meshes; mesh files are searched for in the folder of the robot file of a record."""
 
     def __init__(self) -> None:
         self.unique: list[Mesh] = []
@@ -162,13 +162,13 @@ class Meshes:
         self._missing: dict[str, None] = {}
 
     def of_robot(self, record: Record) -> None:
-        """Search for the next meshes in the folders of this record's robot."""
+        """Search for further meshes in the folders of the robot of this record."""
         scenario = record.provenance.get("scenario", {})
         files = named(scenario.get("plant", {}) if isinstance(scenario, Mapping) else {}, "file")
         self._folders = tuple(Path(file).parent for file in files if isinstance(file, str))
 
     def index(self, file: str) -> int | None:
-        """Number of a mesh among those of the page; None where there is none, or it cannot be read."""
+        """Return the index of a mesh on the page, or None if it is not found or cannot be read."""
         for path in self._places(file):
             if path not in self._known:
                 self._known[path] = self._read(path)
@@ -178,12 +178,12 @@ class Meshes:
         return None
 
     def notes(self) -> list[str]:
-        """What could not be drawn."""
+        """Return notes about meshes that could not be drawn."""
         names = list(self._missing)
         return [f"meshes not found, rods instead: {first_few(names)}"] if names else []
 
     def _places(self, file: str) -> Iterator[Path]:
-        """Where a mesh may lie: beside the robot's file, or in its package, found like ROS does or above that file."""
+        """Yield possible paths of a mesh: next to the robot file, or in its package, as in ROS or above that file."""
         if not file.startswith("package://"):
             for folder in self._folders:
                 yield folder / file.removeprefix("file://")
@@ -210,12 +210,12 @@ class Meshes:
 
 
 def welded(mesh: Mesh, near: float = _WELD) -> Mesh:
-    """The same surface with corners as one that are ``near``, a share of its size, without triangles that are lines.
+    """Merge corners closer than ``near`` times the mesh size, and remove triangles that become lines.
 
     Raises
     ------
     ValueError
-        Nothing is left of it.
+        If nothing is left.
     """
     corners, triangles, colours = mesh
     low, size = _box(corners[triangles])
@@ -233,24 +233,24 @@ def welded(mesh: Mesh, near: float = _WELD) -> Mesh:
 
 
 def _box(corners: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-    """The lowest corner of the box about some points, and its longest side [m]."""
+    """Return the lowest corner of the bounding box of some points, and its longest edge [m]."""
     pooled = corners.reshape(-1, 3)
     low = pooled.min(axis=0)
     return low, float((pooled.max(axis=0) - low).max())
 
 
 def simplified(meshes: Sequence[Mesh], most: int = TRIANGLES) -> list[Mesh]:
-    """The same surfaces with together about ``most`` triangles; all of those that have no more.
+    """Simplify meshes to about ``most`` triangles in total; smaller meshes are unchanged.
 
     Edges collapse where the surface changes least (quadric error metrics, Garland and Heckbert 1997). Parts of one
-    colour are simplified apart from each other, the largest first, and keep their borders: no crack opens between them.
+    colour are simplified separately, the largest first, and keep their borders, so that no gaps open between them.
     """
     limit = _limit([len(rows) for mesh in meshes for rows in _by_colour(mesh)], most)
     return [_simplified(mesh, limit) for mesh in meshes]
 
 
 def _simplified(mesh: Mesh, most: int) -> Mesh:
-    """A mesh with at most about so many triangles of each colour."""
+    """Simplify a mesh to at most about ``most`` triangles of each colour."""
     sizes = [len(rows) for rows in _by_colour(mesh)]
     wanted = sum(min(size, most) for size in sizes)
     if wanted == sum(sizes):
@@ -264,7 +264,7 @@ def _simplified(mesh: Mesh, most: int) -> Mesh:
 
 
 def _by_colour(mesh: Mesh) -> list[NDArray[np.intp]]:
-    """Rows of the triangles of each colour."""
+    """Return the rows of the triangles of each colour."""
     if mesh.colours is None:
         return [np.arange(len(mesh.triangles))]
     _, number = np.unique(np.nan_to_num(mesh.colours, nan=-1.0), axis=0, return_inverse=True)
@@ -273,18 +273,18 @@ def _by_colour(mesh: Mesh) -> list[NDArray[np.intp]]:
 
 
 def _limit(counts: Sequence[int], most: int) -> int:
-    """The largest size to which those that are larger must come down, so that all have ``most`` together."""
+    """Return the size to which larger parts must be reduced, so that all parts have ``most`` triangles in total."""
     left = most
     for k, count in enumerate(sorted(counts)):
         share = left // (len(counts) - k)
         if count > share:
-            return max(share, _LEAST)
+            return max(share, _MIN_TRIANGLES)
         left -= count
     return most
 
 
 def _decimated(mesh: Mesh, rows: NDArray[np.intp], most: int) -> Mesh:
-    """Some triangles of a mesh as a mesh of at most about so many."""
+    """Return some triangles of a mesh as a mesh with at most about ``most`` triangles."""
     used, faces = np.unique(mesh.triangles[rows], return_inverse=True)
     corners, faces = mesh.corners[used], faces.reshape(-1, 3)
     paint = None if mesh.colours is None else mesh.colours[rows]
@@ -292,7 +292,7 @@ def _decimated(mesh: Mesh, rows: NDArray[np.intp], most: int) -> Mesh:
         return Mesh(corners, faces, paint)
     from fast_simplification import simplify
 
-    # Its thresholds are lengths: a mesh may be in millimetres.
+    # Scaled to unit size, because the thresholds are lengths and a mesh may be in millimetres.
     low, size = _box(corners)
     unit = (corners - low) / size
     fewer, faces = simplify(unit, faces.astype(np.int32), target_count=most, agg=_AGGRESSIVENESS, preserve_border=True)
@@ -310,7 +310,7 @@ def _joined(parts: Sequence[Mesh]) -> Mesh:
 
 
 def named(tree: Any, key: str) -> Iterator[Any]:
-    """Values of a key, wherever it is."""
+    """Yield the values of a key anywhere in a tree."""
     if isinstance(tree, Mapping):
         for name, value in tree.items():
             if name == key:

@@ -1,4 +1,4 @@
-"""The moving robot of a record for pages and films: bodies, wheels, surfaces, poses, paths, contacts, penetrations."""
+"""Moving robot of a record for pages and films: bodies, wheels, surfaces, poses, paths, contacts, penetrations."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from dynsim.record.poses import ORIENTATION, POSITION, TOUCHING, contact_positio
 from dynsim.record.scene import NOT_BELOW, WORLD, Point, Scene, Vector3
 
 Array = NDArray[np.float64]
-# Largest error of poses that are interpolated between the frames of a page [m].
+# Maximum error of poses interpolated between the frames of a page [m].
 POSE_ERROR = 4e-5
-# Most frames; longer runs have fewer frames than POSE_ERROR needs.
+# Maximum number of frames; longer runs have fewer frames than POSE_ERROR requires.
 FRAMES = 20_000
 WORLD_AXES = np.eye(3)
 HERE_POINT: Vector3 = (0.0, 0.0, 0.0)
 
 
 def robots(records: Mapping[str, Record]) -> dict[str, DrawnRobot]:
-    """Robots of those records that have something to be seen, by the names of the records.
+    """Return the robots of all records that can be shown, with the names of the records.
 
     Raises
     ------
     RecordError
-        None has samples and a scene with the poses of its bodies.
+        If no record has samples and a scene with body poses.
     """
     drawn = {name: robot for name, record in records.items() if (robot := robot_of(record)) is not None}
     if not drawn:
@@ -40,7 +40,7 @@ def robots(records: Mapping[str, Record]) -> dict[str, DrawnRobot]:
 
 @dataclass(frozen=True)
 class DrawnRobot:
-    """A record whose bodies were placed, and the samples that become frames of the page."""
+    """Record with body poses, and the samples that become frames of the page."""
 
     record: Record
     scene: Scene
@@ -49,24 +49,24 @@ class DrawnRobot:
 
 
 def gripping(record: Record) -> Array | None:
-    """State of the gripper, (T,): its number, without one 1 where it is closed; None without a gripper."""
+    """Return the state of the gripper, (T,): its number, or 1 if closed; None without a gripper."""
     return next((record[name] for name in ("gripper_state", "gripper") if name in record), None)
 
 
 def placed(record: Record) -> tuple[Scene | None, str]:
-    """The scene of a record that has the poses of its bodies, or what it lacks to be drawn."""
+    """Return the scene of a record with body poses, or None and the reason."""
     scene = record.scene
     if scene is None or not scene.bodies:
         return None, "the record has no scene"
     if POSITION not in record or ORIENTATION not in record:
-        return None, "not every joint was recorded"
+        return None, "some joints were not recorded"
     if record[POSITION].shape != (len(record), len(scene.bodies), 3):
-        return None, "the scene has other bodies than the record"
+        return None, "the bodies of scene and record differ"
     return scene, ""
 
 
 def robot_of(record: Record) -> DrawnRobot | None:
-    """The robot of a record; None without samples, a scene, or the poses of its bodies."""
+    """Return the robot of a record, or None without samples, scene or body poses."""
     scene, _ = placed(record)
     if scene is None or not len(record):
         return None
@@ -80,13 +80,13 @@ def robot_of(record: Record) -> DrawnRobot | None:
 
 
 def _frames(record: Record, reach: float) -> NDArray[np.intp]:
-    """Samples between which the poses of all others follow to ``POSE_ERROR``: each 2^n-th one, and the last."""
+    """Return every 2^n-th sample and the last, such that the others can be interpolated to ``POSE_ERROR``."""
     count = len(record)
     position, turn = record[POSITION].reshape(count, -1), record[ORIENTATION].reshape(count, -1)
     stride, arm = 1, min(reach, 1.0)
     while 4 * stride < count:
         rows = _every(count, 2 * stride)
-        # What is left out, and the ends of its interval.
+        # Omitted samples, and the ends of their intervals.
         between = np.delete(np.arange(count), rows)
         left = np.searchsorted(rows, between) - 1
         a, b = rows[left], rows[left + 1]
@@ -108,18 +108,18 @@ def _every(count: int, stride: int) -> NDArray[np.intp]:
 
 
 def bounds(robots: Sequence[DrawnRobot], axes: Array = WORLD_AXES) -> tuple[Array, Array]:
-    """The box along some axes, unit vectors (3, 3), in which everything moves, with some room, (3,) and (3,) [m]."""
+    """Return the corners, (3,) and (3,) [m], of the box along ``axes``, (3, 3), in which everything moves."""
     pooled = moving(robots) @ axes.T
     low, high = pooled.min(axis=0), pooled.max(axis=0)
-    # What hardly moves is not blown up to fill the window, and what is flat has some depth to stand in.
+    # A robot that hardly moves does not fill the window, and a flat scene has some depth.
     span, reach = float((high - low).max()), max(robot.reach for robot in robots)
-    least = max(0.24 * span, 0.6 * reach if span < 0.6 * reach else 0.0)
-    room = np.maximum(0.5 * (least - (high - low)), 0.0) + 0.03 * least + max(map(_thickness, robots))
+    smallest = max(0.24 * span, 0.6 * reach if span < 0.6 * reach else 0.0)
+    room = np.maximum(0.5 * (smallest - (high - low)), 0.0) + 0.03 * smallest + max(map(_thickness, robots))
     return low - room, high + room
 
 
 def moving(robots: Sequence[DrawnRobot]) -> Array:
-    """Places of all bodies and the hand, its target, and ends of what stands still, (n, 3) [m]."""
+    """Return positions of all bodies, the hand and its target, and the extent of fixed shapes, (n, 3) [m]."""
     points = []
     for robot in robots:
         record = robot.record
@@ -127,7 +127,7 @@ def moving(robots: Sequence[DrawnRobot]) -> Array:
             record[POSITION].reshape(-1, 3).astype(np.float64),
             *(path for _, path in paths(record, robot.scene)),
         ]
-        # The last samples of a run that diverged are far from everything else.
+        # The last samples of a diverging run are far from all others.
         points += clouds if record.complete else [_without_ends(cloud) for cloud in clouds]
         for shape in robot.scene.fixed:
             middle, half = np.array(shape.position), 0.5 * max(shape.size) if shape.kind != "mesh" else 0.0
@@ -137,13 +137,13 @@ def moving(robots: Sequence[DrawnRobot]) -> Array:
 
 
 def _without_ends(points: Array) -> Array:
-    """Points without the outermost hundredth at either end of each axis, (T, 3)."""
+    """Clip points, (T, 3), to the 1st and 99th percentile along each axis."""
     points = points[np.isfinite(points).all(axis=1)]
     return np.clip(points, *np.percentile(points, (1.0, 99.0), axis=0)) if len(points) else points
 
 
 def _thickness(robot: DrawnRobot) -> float:
-    """How far shapes reach beside the lines between the bodies, more or less [m]."""
+    """Return approximately how far shapes extend from the lines between bodies [m]."""
     shapes = [shape for body in robot.scene.bodies for shape in body.shapes]
     round_ = [shape.size[0] for shape in shapes if shape.kind in ("cylinder", "capsule", "sphere")]
     boxes = [0.5 * sorted(shape.size)[1] for shape in shapes if shape.kind == "box"]
@@ -152,7 +152,10 @@ def _thickness(robot: DrawnRobot) -> float:
 
 
 def azimuth(robots: Sequence[DrawnRobot]) -> float:
-    """Direction in which robot and hand reach furthest, (−π/2, π/2] about z [rad]: the page looks across it."""
+    """Return the horizontal direction of the largest extent of robot and hand, (−π/2, π/2] about z [rad].
+
+    The page looks across this direction.
+    """
     clouds = [robot.record[POSITION][robot.rows][..., :2].reshape(-1, 2).astype(np.float64) for robot in robots]
     clouds += [path[robot.rows, :2] for robot in robots for _, path in paths(robot.record, robot.scene)]
     points = np.concatenate(clouds)
@@ -163,7 +166,7 @@ def azimuth(robots: Sequence[DrawnRobot]) -> float:
 
 
 def paths(record: Record, scene: Scene) -> Iterator[tuple[str, Array]]:
-    """Ways of the hand and of its target, as far as they are known, (T, 3) [m] each."""
+    """Yield the paths of the hand and of its target, if known, (T, 3) [m] each."""
     if scene.hand is not None:
         yield "hand", np.asarray(point_positions(record, scene.hand), dtype=np.float64)
     target = hand_target(record)
@@ -175,16 +178,24 @@ def paths(record: Record, scene: Scene) -> Iterator[tuple[str, Array]]:
 
 @dataclass(frozen=True)
 class DrawnContact:
-    """What a contact point did.
+    """Contact point over time.
 
     Attributes
     ----------
-    friction : coefficient of the cone that its force cannot leave, 0 where it is not known
-    normal : unit vectors into the free side, (T, 3)
-    force : normal force, positive where the surface pushes, (T,) [N]
-    tangent : the rest of its force, (T, 3) [N], None where it was not recorded
-    mode : 0 open, 1 slips, 2 sticks, (T,), under the unilateral law
-    at : where the force acts on a sphere or capsule, (T, 3) [m]; None: at the point of its body
+    point : Point
+        Point of the scene.
+    friction : float
+        Coefficient of its friction cone, 0 if unknown.
+    normal : (T, 3) ndarray
+        Unit vectors into the free side.
+    force : (T,) ndarray
+        Normal force [N], positive if the surface pushes.
+    tangent : (T, 3) ndarray or None
+        Tangential force [N], if recorded.
+    mode : (T,) ndarray or None
+        0 open, 1 slips, 2 sticks, under the unilateral law.
+    at : (T, 3) ndarray or None
+        Position of the force on a sphere or capsule [m]; None: the point itself.
     """
 
     point: Point
@@ -197,7 +208,7 @@ class DrawnContact:
 
 
 def contacts(robot: DrawnRobot, rows: NDArray[np.intp] | slice = slice(None)) -> list[DrawnContact]:
-    """Contact points at samples of the record; under the unilateral law those that ever touched."""
+    """Return the contact points at samples of the record; under the unilateral law only points that ever touched."""
     record, scene = robot.record, robot.scene
     if "contact_normal_force" not in record:
         return []
@@ -225,13 +236,18 @@ def contacts(robot: DrawnRobot, rows: NDArray[np.intp] | slice = slice(None)) ->
 
 @dataclass(frozen=True)
 class Penetration:
-    """A joint or the hand that was below a surface by more than the radius of its link.
+    """Joint or hand that was below a surface by more than the radius of its link.
 
     Attributes
     ----------
-    body, position : index, and the point in the body's frame [m]
-    least : it counts from this depth on: the radius, and what poses are not told apart by [m]
-    depth : how far the point is below the surface, (T,) [m], negative above it
+    name, surface : str
+        Names of the point and of the surface.
+    body, position : int, tuple of float
+        Index of the body, and point in its frame [m].
+    least : float
+        Smallest depth that counts [m]: the radius plus the resolution of the poses.
+    depth : (T,) ndarray
+        Depth below the surface [m], negative above it.
     """
 
     name: str
@@ -243,9 +259,9 @@ class Penetration:
 
 
 def penetrations(record: Record, scene: Scene, rows: NDArray[np.intp] | slice = slice(None)) -> list[Penetration]:
-    """Joints, and the hand, below surfaces at samples of the record: surfaces hold contact points only.
+    """Return joints, and the hand, that are below surfaces at samples of the record.
 
-    Bodies of a mobile base, and wheels, stand where the model has them.
+    Surfaces support only declared contact points. Bodies of a mobile base and wheels are excluded.
     """
     wheels = {k for k, body in enumerate(scene.bodies) if body.joint.signal == "rho"} | set(scene.base)
     points = [(body.joint.name, k, HERE_POINT) for k, body in enumerate(scene.bodies) if k not in wheels]
@@ -264,14 +280,14 @@ def penetrations(record: Record, scene: Scene, rows: NDArray[np.intp] | slice = 
 
 
 def largest_force(contacts: Sequence[DrawnContact]) -> float:
-    """The force whose arrow has full length [N]: the 98th percentile, so that a spike does not shrink the rest."""
+    """Return the force with an arrow of full length [N]: the 98th percentile, so that a peak does not shrink others."""
     sizes = np.abs(np.concatenate([contact.force for contact in contacts])) if contacts else np.zeros(0)
     sizes = sizes[np.isfinite(sizes)]
     return max(float(np.percentile(sizes, 98.0)) if len(sizes) else 1.0, 1e-6)
 
 
 def _friction(record: Record, name: str) -> float:
-    """The coefficient of the cone that the force of a contact cannot leave; 0 where it is not known."""
+    """Return the coefficient of the friction cone of a contact, 0 if unknown."""
     contacts = record.provenance.get("scenario", {}).get("contacts", {})
     points = contacts.get("points") or {}
     point = points.get(name, {}) if isinstance(points, Mapping) else {}

@@ -1,4 +1,4 @@
-"""Shapes of bodies and surfaces for pages and films, and their faces; rods for bodies without shapes."""
+"""Shapes of bodies, surfaces and wheels for pages and films, and their faces; rods for bodies without shapes."""
 
 from __future__ import annotations
 
@@ -15,17 +15,14 @@ from dynsim.record.poses import ORIENTATION, POSITION
 from dynsim.record.quaternion import of_turn, rotated
 from dynsim.record.scene import HERE, WORLD, Body, Scene, SceneSurface, Shape
 
-# Grids of points on the surfaces of a scene, for quadrics on the part near the robot; corners of boxes.
-
-
-# Numbers of points along each side of the drawn part of a curved surface, and of a face of a box.
+# Points along each side of the drawn part of a curved surface, and along each side of a box face.
 PATCH, FACE = 41, 13
 
 
 def surface_grids(surface: SceneSurface, low: Array, high: Array) -> list[Array]:
-    """Grids of points on a surface, (n, m, 3) [m] each, NaN where there are none.
+    """Return grids of points on a surface, (n, m, 3) [m] each; NaN marks missing points.
 
-    All of a height field and of the six faces of a box, of a quadric the part next to the box from ``low`` to ``high``.
+    They cover a height field, the six faces of a box, or the part of a quadric near the box from ``low`` to ``high``.
     """
     if surface.kind == "height_field":
         x, y = np.meshgrid(*surface.grid)
@@ -36,7 +33,7 @@ def surface_grids(surface: SceneSurface, low: Array, high: Array) -> list[Array]
 
 
 def _box_faces(surface: SceneSurface) -> list[Array]:
-    """Points of the six faces of a box, its edges sharp, (n, n, 3) each."""
+    """Return points on the six faces of a box with sharp edges, (n, n, 3) each."""
     half, R = 0.5 * np.array(surface.edges), rotated(np.array(surface.orientation), np.eye(3))
     u, v = np.meshgrid(*2 * [np.linspace(-1.0, 1.0, FACE)])
     faces = []
@@ -48,19 +45,22 @@ def _box_faces(surface: SceneSurface) -> list[Array]:
 
 
 def quadric_patch(surface: SceneSurface, low: Array, high: Array) -> Array:
-    """Points of a quadric over its tangent plane next to a box, along the normal to the nearest root of C.
+    """Return points of a quadric above its tangent plane near a box, at the root of C nearest along the normal.
 
     With r = r₀ + s n on the normal n, C(r) = a s² + b s + c, where a = n·Q n/2, b = n·(Q r₀ + b) and c = C(r₀).
 
     Parameters
     ----------
-    low, high : (3,) corners of the box [m]; its middle is where the tangent plane is sought from
+    surface : SceneSurface
+        The quadric.
+    low, high : (3,) ndarray
+        Corners of the box [m]; the search for the tangent plane starts at its centre.
 
     Returns
     -------
-    Array
-        (n, n, 3) [m], NaN where there is no root, or none within the longest edge of the box. A plane has the four
-        corners only, without seams between.
+    (n, n, 3) ndarray
+        Points [m]; NaN without a root, or if the root is farther than the longest edge of the box. A plane has only
+        four corners, so that it has no seams.
     """
     anchor, normal = 0.5 * (low + high), np.array([0.0, 0.0, 1.0])
     for _ in range(20):
@@ -68,7 +68,7 @@ def quadric_patch(surface: SceneSurface, low: Array, high: Array) -> Array:
             return np.full((2, 2, 3), np.nan)
         normal = surface.normal(anchor)
         anchor = anchor - surface.gap(anchor) * normal
-    # Along the axes of the world where that is possible.
+    # Along the axes of the world if possible.
     across = np.eye(3)[:2] if abs(normal[2]) > 0.99 else np.linalg.svd(normal[None])[2][1:]
     reach = (box_corners(low, high) - anchor) @ across.T
     Q = np.array(surface.Q)
@@ -88,10 +88,10 @@ def quadric_patch(surface: SceneSurface, low: Array, high: Array) -> Array:
 
 
 def round_patch(surface: SceneSurface, low: Array, high: Array) -> Array:
-    """Points of a sphere or cylinder, (n, n, 3) [m]: all of a small one, else the part around the point next to a box.
+    """Return points of a sphere or cylinder, (n, n, 3) [m]: all of a small one, or the part nearest to a box.
 
-    Its meridians or generators start there, so that the part ends in a smooth edge: an ellipse on a sphere, as long and
-    as wide as the box, or half as wide as long.
+    The meridians or generators start at the point nearest to the box, so that the part has a smooth edge. On a sphere
+    it is an ellipse as long and as wide as the box, but at least half as wide as long.
     """
     centre, radius = np.array(surface.position), abs(float(surface.radius or 0.0))
     middle, reach = 0.5 * (low + high), 0.6 * float(np.linalg.norm(high - low))
@@ -107,7 +107,7 @@ def round_patch(surface: SceneSurface, low: Array, high: Array) -> Array:
     towards = away / size
     turn = np.linspace(-1.0, 1.0, PATCH)
     if axis is None:
-        # Along the box, which may be much longer than wide, unless its longest edge points at the centre.
+        # Along the longest edge of the box that does not point to the centre; the box may be much longer than wide.
         edges = np.eye(3)[np.argsort(low - high)]
         along = next(edge for edge in edges if abs(edge @ towards) < 0.9)
         along = along - towards * (along @ towards)
@@ -118,7 +118,7 @@ def round_patch(surface: SceneSurface, low: Array, high: Array) -> Array:
             polar = share * widest
         else:
             reaches = 0.6 * np.abs(sides) @ (high - low) / radius
-            # A box may have no width at all, and stand on the sphere.
+            # The box may have zero width and touch the sphere.
             a, b = np.minimum(np.maximum(reaches, max(0.5 * reaches.max(), 0.2 * widest)), np.pi)
             polar = share / np.hypot(np.cos(round_about) / a, np.sin(round_about) / b)
         across = np.cos(round_about)[..., None] * sides[0] + np.sin(round_about)[..., None] * sides[1]
@@ -131,14 +131,14 @@ def round_patch(surface: SceneSurface, low: Array, high: Array) -> Array:
 
 
 def box_corners(low: Array, high: Array) -> Array:
-    """The eight corners of a box, (8, 3)."""
+    """Return the eight corners of a box, (8, 3)."""
     return np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
 
 
 def box_about(clouds: Sequence[Array], room: float = 0.0) -> tuple[Array, Array]:
-    """Corners of the box about all points that are finite, (…, k) each, with ``room`` in parts of its longest edge.
+    """Return the corners of the bounding box of all finite points, (…, k) each, with a margin.
 
-    A unit box where there is none.
+    ``room`` is the margin relative to the longest edge. Without finite points the result is a unit box.
     """
     points = np.concatenate([cloud.reshape(-1, cloud.shape[-1]) for cloud in clouds])
     points = points[np.isfinite(points).all(axis=1)]
@@ -151,18 +151,18 @@ def box_about(clouds: Sequence[Array], room: float = 0.0) -> tuple[Array, Array]
 
 Array = NDArray[np.float64]
 Faces = NDArray[np.int64]
-# Numbers of faces around a round solid, and between its equator and a pole.
+# Number of faces around a round solid, and between its equator and a pole.
 AROUND, RINGS = 28, 4
-# Number of pieces as long as thick at either end of a long rod.
+# Number of short pieces at each end of a long rod, as long as its radius.
 ENDS = 3
-# Radius of a rod drawn for a body without shapes, in parts of the robot's reach.
+# Radius of a rod drawn for a body without shapes, relative to the reach of the robot.
 ROD = 0.008
-# A spherical or cylindrical surface larger than this many times the view is drawn only near the robot.
+# A spherical or cylindrical surface larger than this multiple of the view is drawn only near the robot.
 LARGE = 4.0
 
 
 def drawn_shape(shape: Shape, meshes: Meshes) -> dict[str, Any] | None:
-    """A shape as the page reads it; None for a mesh that was not found."""
+    """Return a shape in the format of the page, or None if its mesh was not found."""
     drawn: dict[str, Any] = {
         "kind": shape.kind,
         "size": list(shape.size),
@@ -180,14 +180,14 @@ def drawn_shape(shape: Shape, meshes: Meshes) -> dict[str, Any] | None:
 
 
 def body_shapes(scene: Scene, reach: float, meshes: Meshes) -> list[list[dict[str, Any]]]:
-    """Shapes of every body; rods to what it carries where it has none, and a hub about the axis of its joint."""
+    """Return the shapes of every body; a body without shapes gets rods to its children, and joints get hubs."""
     radius = _radius(scene, ROD * reach)
     base = set(scene.base)
     drawn = []
     for k, body in enumerate(scene.bodies):
         shapes = [shown for shape in body.shapes if (shown := drawn_shape(shape, meshes)) is not None]
         wanted = [child for child in scene.bodies if child.parent == k]
-        # A rod leads away from its joint, a wheel lies about it.
+        # A rod extends from its joint, a wheel surrounds it.
         bare = not shapes or (_is_tube(body) and np.abs(body.shapes[0].position).max() > 1e-9)
         if not shapes and k not in base:
             ends = [np.array(child.joint.position) for child in wanted if not child.joint.part_of]
@@ -206,7 +206,7 @@ def body_shapes(scene: Scene, reach: float, meshes: Meshes) -> list[list[dict[st
 
 
 def _stems(scene: Scene, k: int) -> list[dict[str, Any]]:
-    """A thin rod to the hand of a body whose own one ends before it."""
+    """Return thin rods to the hand of a body whose first shape ends before the hand."""
     tube = scene.bodies[k].shapes[0]
     far = float(np.linalg.norm(tube.position)) + 0.5 * tube.size[1] + tube.size[0]
     ends = [np.array(point.position) for point in scene.points if point.role == "hand" and point.body == k]
@@ -214,7 +214,7 @@ def _stems(scene: Scene, k: int) -> list[dict[str, Any]]:
 
 
 def thinnest(shapes: list[list[dict[str, Any]]]) -> float:
-    """The least radius of what is round [m], but for stems; 0 where nothing is."""
+    """Return the smallest radius of the round shapes [m], except stems; 0 without round shapes."""
     round_ones = (
         s for shape in shapes for s in shape if s["kind"] in ("cylinder", "capsule") and s.get("role") != "stem"
     )
@@ -222,7 +222,7 @@ def thinnest(shapes: list[list[dict[str, Any]]]) -> float:
 
 
 def gripper(shapes: list[list[dict[str, Any]]], reach: float) -> dict[str, Any]:
-    """Two fingers at the hand, boxes in its body's axes [m]: how far ahead, and aside when open and when closed."""
+    """Return two fingers at the hand, as boxes in its body frame [m]: distance ahead, and aside open and closed."""
     size = max(1.7 * thinnest(shapes), 0.012 * reach)
     return {"size": [1.6 * size, 0.4 * size, 0.8 * size], "ahead": 0.5 * size, "aside": [0.8 * size, 0.28 * size]}
 
@@ -233,7 +233,7 @@ def _radius(scene: Scene, default: float) -> float:
 
 
 def _is_tube(body: Body) -> bool:
-    """Whether it is drawn as a rod of dynsim's own: a cylinder without colour through the body's origin."""
+    """Return whether a body is drawn as a rod of dynsim: its first shape is a cylinder or capsule without colour."""
     return bool(body.shapes) and body.shapes[0].kind in ("cylinder", "capsule") and body.shapes[0].colour is None
 
 
@@ -259,7 +259,7 @@ def _hub(body: Body, radius: float) -> dict[str, Any]:
 
 
 def from_z(direction: Array) -> Array:
-    """A turn that takes z to a unit vector, (4,)."""
+    """Return a rotation from z to a unit vector, (4,)."""
     axis = np.cross([0.0, 0.0, 1.0], direction)
     size = float(np.linalg.norm(axis))
     if size < 1e-12:
@@ -268,7 +268,7 @@ def from_z(direction: Array) -> Array:
 
 
 def drawn_surface(surface: SceneSurface, low: Array, high: Array) -> dict[str, Any]:
-    """A surface next to the box from ``low`` to ``high`` in which everything moves."""
+    """Return a surface near the box from ``low`` to ``high``, in which everything moves, in the format of the page."""
     drawn: dict[str, Any] = {"name": surface.name, "kind": surface.kind}
     span = float((high - low).max())
     near = abs(surface.radius or 0.0) <= LARGE * span
@@ -305,9 +305,9 @@ def drawn_surface(surface: SceneSurface, low: Array, high: Array) -> dict[str, A
 
 
 def solid(shape: dict[str, Any], meshes: list[Mesh], finer: int = 1) -> tuple[Array, Faces]:
-    """Corners, (n, 3) [m], and faces, (m, 4), of a shape of :func:`drawn_shape`.
+    """Return corners, (n, 3) [m], and faces, (m, 4), of a shape of :func:`drawn_shape`.
 
-    A triangle repeats a corner. What is round has ``finer`` times as many faces around it.
+    A triangle repeats a corner. ``finer`` multiplies the number of faces of round shapes.
     """
     size = shape["size"]
     if shape["kind"] == "mesh":
@@ -318,7 +318,7 @@ def solid(shape: dict[str, Any], meshes: list[Mesh], finer: int = 1) -> tuple[Ar
     elif shape["kind"] == "box":
         corners, faces = _box(np.array(size))
     else:
-        # Radius and height of rings, from below.
+        # Radius and height of rings, from bottom to top.
         rings_each = RINGS * finer
         angle = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 2 * rings_each + 1)
         radius = size[0]
@@ -337,10 +337,11 @@ def solid(shape: dict[str, Any], meshes: list[Mesh], finer: int = 1) -> tuple[Ar
 
 
 def _cuts(radius: float, half: float) -> Array:
-    """Heights from −half to half at which a round side is cut: into pieces as long as its radius, at most three an end.
+    """Return heights from −half to half at which a round side is cut into pieces.
 
-    Faces are painted in the order of their middles: those of a whole rod that leans to the viewer are nearer than a
-    hub at its end, which they would cover.
+    The pieces are as long as the radius, in a long rod at most three at each end. Faces are painted in the order of
+    their centres: the centre of an uncut rod that leans towards the viewer may be nearer than the hub at its end, which
+    the rod would hide.
     """
     if 2.0 * half <= 2.0 * ENDS * radius:
         return np.linspace(-half, half, max(int(np.ceil(2.0 * half / max(radius, 1e-12))), 1) + 1)
@@ -355,7 +356,7 @@ def _box(size: Array) -> tuple[Array, Faces]:
 
 
 def _turned(rings: Array, sides: int) -> tuple[Array, Faces]:
-    """The solid that rings (radius, height) about z enclose."""
+    """Return the solid of revolution of rings (radius, height) about z."""
     angle = 2.0 * np.pi * np.arange(sides) / sides
     around = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     corners = np.concatenate([np.column_stack([radius * around, np.full(sides, z)]) for radius, z in rings])
@@ -369,7 +370,7 @@ def _turned(rings: Array, sides: int) -> tuple[Array, Faces]:
 
 
 def grid_faces(grid: Array) -> tuple[Array, Faces]:
-    """Corners and cells of a grid of points, (n, m, 3), as far as they are known."""
+    """Return corners and finite cells of a grid of points, (n, m, 3)."""
     rows, columns, _ = grid.shape
     number = np.arange(rows * columns).reshape(rows, columns)
     cells = np.stack([number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]], axis=-1).reshape(-1, 4)
@@ -378,7 +379,7 @@ def grid_faces(grid: Array) -> tuple[Array, Faces]:
 
 
 def corners_of(record: Record, scene: Scene, body: int, row: int) -> list[tuple[Array, Faces]]:
-    """Corners in the world, (n, 3) [m], and faces, (m, 4), of each shape of a body at a sample; meshes are left out."""
+    """Return world corners, (n, 3) [m], and faces, (m, 4), of each shape of a body at a sample, without meshes."""
     pose = record[POSITION][row, body].astype(np.float64), record[ORIENTATION][row, body].astype(np.float64)
     if not np.isfinite(pose[0]).all():
         return []
@@ -387,8 +388,8 @@ def corners_of(record: Record, scene: Scene, body: int, row: int) -> list[tuple[
 
 
 def outline(points: Array) -> Array:
-    """Corners of the convex hull of points in a plane, (n, 2) → (m, 2), turning to the left; of a line its ends."""
-    from scipy.spatial import ConvexHull, QhullError  # takes a third of a second
+    """Return the corners of the convex hull of plane points, (n, 2) → (m, 2), counterclockwise; the ends of a line."""
+    from scipy.spatial import ConvexHull, QhullError  # imported here because it takes a third of a second
 
     try:
         return np.asarray(points[ConvexHull(points).vertices])
@@ -396,18 +397,19 @@ def outline(points: Array) -> Array:
         return np.asarray(points[np.lexsort(points.T)[[0, -1]]])
 
 
-# Wheels of a record in groups, times on the ground, support polygon, and centre of pressure or mass.
-
-
+# Groups of wheels, their ground contact, support polygon, and centre of pressure or mass.
 @dataclass(frozen=True)
 class WheelGroups:
-    """Wheels that are lifted together.
+    """Groups of wheels that are lifted together.
 
     Attributes
     ----------
-    names : of the groups
-    places : for each group (body, index of the shape on it)
-    down : (T, groups), 1 on the ground; None where it was not recorded
+    names : tuple of str
+        Names of the groups.
+    places : tuple of tuple of tuple of int
+        For each group, body and index of the shape of its wheels.
+    down : (T, groups) ndarray or None
+        1 on the ground, 0 lifted, if recorded.
     """
 
     names: tuple[str, ...] = ()
@@ -416,11 +418,11 @@ class WheelGroups:
 
 
 def wheel_groups(record: Record, scene: Scene) -> WheelGroups:
-    """Pairs of a snake, or the two wheels of a mobile base."""
+    """Return the wheel pairs of a snake, or the two wheels of a mobile base."""
     if "grounded" in record:
         names = record.labels["grounded"]
         index = {body.name: k for k, body in enumerate(scene.bodies)}
-        places = [_of_pair(scene, index[name]) if name in index else () for name in names]
+        places = [_pair_wheels(scene, index[name]) if name in index else () for name in names]
         return WheelGroups(names, tuple(places), np.asarray(record["grounded"], dtype=np.float64))
     wheels = scene.base[1:]
     if "wheel_load" in record and wheels:
@@ -430,15 +432,15 @@ def wheel_groups(record: Record, scene: Scene) -> WheelGroups:
     return WheelGroups()
 
 
-def _of_pair(scene: Scene, pair: int) -> tuple[tuple[int, int], ...]:
-    """Wheels on a body: its own beside its middle, and those that turn on it."""
+def _pair_wheels(scene: Scene, pair: int) -> tuple[tuple[int, int], ...]:
+    """Return the wheels of a pair: shapes of its body beyond the centre line, and wheels that rotate on it."""
     own = [(pair, k) for k, shape in enumerate(scene.bodies[pair].shapes) if shape.position[1] != 0.0]
     turning = [k for k, body in enumerate(scene.bodies) if body.parent == pair and body.joint.position[1] != 0.0]
     return (*own, *((k, 0) for k in turning))
 
 
 def supports(scene: Scene, groups: WheelGroups) -> list[dict[str, Any]]:
-    """Points whose hull the robot stands on: on which body, and with which group of wheels they are on the ground."""
+    """Return the points that span the support polygon: body, position, and group of wheels."""
     if scene.supports:
         return [{"body": point.body, "p": list(point.position), "group": -1} for point in scene.supports]
     points = []
@@ -449,7 +451,7 @@ def supports(scene: Scene, groups: WheelGroups) -> list[dict[str, Any]]:
 
 
 def cop_of(record: Record) -> tuple[str, Array] | None:
-    """What must lie within the support: centre of pressure of a mobile base, centre of mass of a snake, (T, 2)."""
+    """Return the point that must be in the support polygon: centre of pressure (base) or of mass (snake), (T, 2)."""
     for signal, name in (("center_of_pressure", "centre of pressure"), ("centre_of_mass", "centre of mass")):
         if signal in record:
             return name, np.asarray(record[signal][:, :2], dtype=np.float64)
