@@ -262,8 +262,12 @@ class BracePlan:
 
         Examples
         --------
-        >>> record = plan.record(1)  # doctest: +SKIP
-        >>> record.summary["joule_heat_J"]  # doctest: +SKIP
+        >>> import dynsim
+        >>> scenario = dynsim.load_scenario("pressing")
+        >>> plan = dynsim.plan_braces(scenario, candidates=["link_6"], count=(1, 1), starts=1, verify=False)
+        >>> record = plan.record(1)
+        >>> record["q"].shape, round(record.summary["joule_heat_J"])
+        ((2001, 10), 199)
         """
         return simulate(self.scenario(count))
 
@@ -536,7 +540,7 @@ def _radius_warning(names: Sequence[str]) -> str:
 def _load_warning(names: Sequence[str]) -> str:
     """Return the warning about loads other than payloads."""
     return (
-        f"plan: loads.{first_few(names)}: ignored by the planner, which supports payloads only; simulated runs include "
+        f"plan: loads.{first_few(names)}: ignored by the planner, which supports only payloads; simulated runs include "
         "these loads and reject plans whose heat they raise; define a constant weight as `type: payload`"
     )
 
