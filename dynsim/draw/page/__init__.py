@@ -1,8 +1,7 @@
-"""Viewer pages: one HTML file with scene, data and program, for any browser, without a network.
+"""Write a self-contained HTML page that shows records in 3D.
 
-    Record(s) → head and blocks (:mod:`dynsim.draw.page.content`) → text (:mod:`dynsim.draw.page.content`)
-
-It depends on records alone: simulated and measured ones are shown in the same way.
+The page contains scene, data and program, and works in any browser without a network. It depends on records alone:
+simulated and measured records are shown in the same way. See :mod:`dynsim.draw.page.content`.
 """
 
 from dynsim.draw.page.content import Inline, page, viewable, write

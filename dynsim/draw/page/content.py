@@ -1,4 +1,4 @@
-"""Data of a viewer page: body poses, paths, contacts, supports, motors, signals, events."""
+"""Viewer page: its data (body poses, paths, contacts, supports, motors, signals, events), HTML text and display."""
 
 from __future__ import annotations
 
@@ -50,23 +50,23 @@ from dynsim.record.poses import ORIENTATION, POSITION
 from dynsim.record.scene import Scene
 from dynsim.system.files import replacing
 
-# Compression of time series for pages: quantised, differenced, and split into byte planes.
+# Compression of time series: quantised, differenced, and split into byte planes.
 
-
-# Largest code of a finite value by number of bits; 32 bits are used where half a step of 16 exceeds the allowed error.
+# Largest code of a finite value by number of bits; 32 bits are used if half a step of 16 bits exceeds the allowed
+# error.
 _CODES = {16: 2**16 - 2, 32: 2**32 - 2}
 _TYPES: dict[int, np.dtype[Any]] = {16: np.dtype("<u2"), 32: np.dtype("<u4")}
 
 
 class Blocks:
-    """Collects blocks; the description of a block goes into the head of the page."""
+    """Collection of data blocks; the description of each block is stored in the head of the page."""
 
     def __init__(self) -> None:
         self._parts: list[bytes] = []
         self._size = 0
 
     def add(self, columns: ArrayLike, error: float = np.inf) -> dict[str, Any]:
-        """Add columns, (T,) or (T, …), each to half a step of its range in 16 bits, or 32 where ``error`` is less."""
+        """Add columns, (T,) or (T, …), quantised to 16 bits of their range, or to 32 bits if ``error`` requires it."""
         data = np.asarray(columns, dtype=np.float64)
         data = data.reshape(len(data), -1) if len(data) else data.reshape(0, 1)
         known = np.isfinite(data)
@@ -89,7 +89,7 @@ class Blocks:
         return header | {"offset": low.tolist(), "scale": scale.tolist()}
 
     def raw(self, data: NDArray[Any]) -> dict[str, Any]:
-        """Add an array of whole numbers ≥ 0 as it is (a mesh), little endian: in 16 bits, or 32 if one needs them."""
+        """Add an array of integers ≥ 0 unchanged (for meshes), little endian, in 16 bits, or 32 if necessary."""
         bits = 16 if data.max(initial=0) < 2**16 else 32
         content = data.astype(_TYPES[bits]).tobytes()
         self._parts.append(content)
@@ -97,21 +97,21 @@ class Blocks:
         return {"at": start, "count": int(data.size), "bits": bits}
 
     def packed(self, head: dict[str, Any]) -> str:
-        """Head and blocks: the length of the head in 4 bytes, its JSON, the blocks; compressed, in base64."""
+        """Return head and blocks as text: head length in 4 bytes, head as JSON, blocks; compressed, in base64."""
         text = json.dumps(head, allow_nan=False, separators=(",", ":"), ensure_ascii=True).encode("ascii")
         content = len(text).to_bytes(4, "little") + text + b"".join(self._parts)
-        # No time in it: the same record gives the same page.
+        # Without a time stamp, so that equal records give equal pages.
         return base64.b64encode(gzip.compress(content, 6, mtime=0)).decode("ascii")
 
 
 def packed_mesh(mesh: Mesh, blocks: Blocks) -> dict[str, Any]:
-    """A mesh as the page reads it: corners in 16 bits within their box, triangles, and the colours of these."""
+    """Return a mesh in the format of the page: corners in 16 bits within their box, triangles, and their colours."""
     corners, triangles, colours = mesh
     low, high = corners.min(axis=0), corners.max(axis=0)
     step = np.where(high > low, (high - low) / 65535.0, 1.0)
     paint: dict[str, Any] = {}
     if colours is not None:
-        # −1 for none: numbers that are none are equal to nothing.
+        # −1 marks a missing colour, because NaN is not equal to itself.
         palette, number = np.unique(np.round(np.nan_to_num(colours, nan=-1.0), 3), axis=0, return_inverse=True)
         paint["palette"] = [None if row[0] < 0.0 else row.tolist() for row in palette]
         paint["paint"] = blocks.raw(number.reshape(-1))
@@ -124,22 +124,21 @@ def packed_mesh(mesh: Mesh, blocks: Blocks) -> dict[str, Any]:
 
 
 Array = NDArray[np.float64]
-# Most samples of a signal in plots; of longer signals the least and the largest value of each bin are kept.
+# Maximum number of samples of a plotted signal; for longer signals the minimum and maximum of each bin are kept.
 PLOTTED = 8000
-# Largest relative error of the heat by the trapezoidal rule against that of the record: currents may jump between
-# samples.
+# Maximum relative difference between heat by the trapezoidal rule and recorded heat; currents may jump between samples.
 HEAT_ERROR = 0.05
-# Signals that the 3D view shows, and plots do not.
+# Signals that are shown in the 3D view but not in plots.
 _SHOWN = {POSITION, ORIENTATION, "posture"}
 
 
 def packed(records: Mapping[str, Record], *, ghost: bool = False) -> str:
-    """Head and blocks of a page, in base64; see :func:`dynsim.draw.page.content.page`.
+    """Return head and blocks of a page in base64, see :func:`dynsim.draw.page.content.page`.
 
     Raises
     ------
     RecordError
-        No record has samples and a scene with the poses of its bodies.
+        If no record has samples and a scene with body poses.
     """
     shown = robots(records)
     every = list(shown.values())
@@ -161,7 +160,24 @@ def packed(records: Mapping[str, Record], *, ghost: bool = False) -> str:
 
 
 def viewable(record: Record) -> bool:
-    """Whether a page has something to show of a record: samples, a scene, and the poses of its bodies."""
+    """Return whether a page can show a record.
+
+    Parameters
+    ----------
+    record : Record
+        Record to check.
+
+    Returns
+    -------
+    bool
+        True if the record has samples and a scene with body poses.
+
+    Examples
+    --------
+    >>> import dynsim
+    >>> dynsim.view.viewable(dynsim.Record([0.0, 1.0]))
+    False
+    """
     return robot_of(record) is not None
 
 
@@ -220,7 +236,7 @@ def _record(name: str, robot: DrawnRobot, blocks: Blocks, meshes: Meshes, low: A
 
 
 def _contacts(robot: DrawnRobot, blocks: Blocks) -> list[dict[str, Any]]:
-    """Every contact point: on which body, its normal, normal force and friction over time; mode and place if known."""
+    """Return every contact point: body, normal, normal force and friction over time; mode and position if known."""
     entries = []
     for contact in contacts(robot, robot.rows):
         point = contact.point
@@ -244,7 +260,7 @@ def _contacts(robot: DrawnRobot, blocks: Blocks) -> list[dict[str, Any]]:
 
 
 def _motors(record: Record, scene: Scene) -> list[list[Any]]:
-    """Name of each motor and the index of the body that it moves; of a wheel of a base, the wheel."""
+    """Return the name of each motor and the index of the body that it moves (a wheel for a motor of the base)."""
     names = record.labels["current"] if "current" in record else record.labels.get("v", ())
     by_joint = {body.joint.name: k for k, body in enumerate(scene.bodies)}
     by_label = {
@@ -255,14 +271,14 @@ def _motors(record: Record, scene: Scene) -> list[list[Any]]:
 
 
 def shared(record: Record, key: str) -> float | None:
-    """A number of the motors by its key in the scenario; None where they have none, or several."""
+    """Return the value of a key that all motors of the scenario share, or None."""
     values = named(record.provenance.get("scenario", {}).get("plant", {}), key)
     numbers = {float(value) for value in values if isinstance(value, (int, float))}
     return _finite(numbers.pop()) if len(numbers) == 1 else None
 
 
 def resistance(record: Record) -> float | None:
-    """R of the motors [Ω] where they share one, and R ∫ Σ i² dt is the heat that was recorded."""
+    """Return the resistance R that all motors share [Ω] if R ∫ Σ i² dt equals the recorded heat, or None."""
     R = shared(record, "resistance_ohm")
     if R is None or not {"current", "heat_joule"} <= set(record) or len(record) < 2:
         return None
@@ -272,12 +288,12 @@ def resistance(record: Record) -> float | None:
 
 
 def _finite(value: float | None) -> float | None:
-    """JSON has no infinity."""
+    """Return the value, or None if it is not finite, because JSON has no infinity."""
     return value if value is not None and math.isfinite(value) else None
 
 
 def _signals(record: Record, blocks: Blocks) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """Signals for the plots, and their time axes."""
+    """Return the signals for the plots, and their time axes."""
     signals, axes = [], {}
     for name, signal in (record.signals | _hand_error(record)).items():
         data = signal.data
@@ -307,7 +323,7 @@ def _signals(record: Record, blocks: Blocks) -> tuple[list[dict[str, Any]], dict
 
 
 def _resolution(values: Array) -> float:
-    """What is told apart where a plot shows most of the values: a spike at the start does not coarsen the rest."""
+    """Return the resolution required in a plot of most values; a peak at the start does not make it coarser."""
     known = values[np.isfinite(values)]
     if not len(known):
         return np.inf
@@ -316,7 +332,7 @@ def _resolution(values: Array) -> float:
 
 
 def _hand_error(record: Record) -> dict[str, Signal]:
-    """How far the hand is from its target, where a record says both and not this."""
+    """Return the distance of the hand from its target as a signal, if the record contains both but not this signal."""
     target = hand_target(record)
     if target is None or "hand_position" not in record or "hand_error" in record:
         return {}
@@ -325,7 +341,7 @@ def _hand_error(record: Record) -> dict[str, Signal]:
 
 
 def _thinned(time: Array, values: NDArray[Any]) -> tuple[Array, Array]:
-    """At most ``PLOTTED`` instants; of a longer run two for each bin, its extremes in their order."""
+    """Return at most ``PLOTTED`` samples; for a longer run, the two extremes of each bin in their order."""
     values = np.asarray(values, dtype=np.float64)
     if len(time) <= PLOTTED:
         return time, values
@@ -340,28 +356,43 @@ def _thinned(time: Array, values: NDArray[Any]) -> tuple[Array, Array]:
     return np.append(at, time[-1]), np.concatenate([kept, values[-1:]])
 
 
-# The HTML text of a viewer page: its scripts and styles, three.js from its package, and the data; writing of pages.
-
-
+# HTML text of a page: scripts and styles, three.js from its package, and the data.
 SCRIPTS = ("decode", "solids", "marks", "actor", "stage", "plots", "controls", "main")
-"""Files of the page's program, in the order in which they are loaded."""
+"""Files of the program of the page, in loading order."""
 _THREE = ("jupyter_threejs_sage", "static/r130/three.min.js")
 
 
 def page(records: Mapping[str, Record], *, ghost: bool = False, scripts: Sequence[str] = (), connect: str = "") -> str:
-    """The page of one record, or of several beside each other.
+    """Return the HTML text of the page of one or several records.
 
     Parameters
     ----------
-    records : by the names that the page shows
-    ghost : several are laid over each other, the first one solid
-    scripts : texts of further programs, which run after the page's own and find it as ``dynsim``
-    connect : the one address that a page of a live drive may connect to; a page of records has none
+    records : mapping of str to Record
+        Displayed names and records.
+    ghost : bool, optional
+        Overlay several records, the first one solid; default: side by side.
+    scripts : sequence of str, optional
+        Additional JavaScript programs. They run after the program of the page, which they access as ``dynsim``.
+    connect : str, optional
+        The only address to which the page may connect (for live driving); default: none.
+
+    Returns
+    -------
+    str
+        HTML text.
 
     Raises
     ------
     RecordError
-        There is nothing to be seen: no record with samples and a scene; or three.js is not installed.
+        If no record has samples and a scene with body poses, or three.js is not installed.
+
+    Examples
+    --------
+    >>> import dynsim
+    >>> scenario = dynsim.load_scenario("elbow_comparison", variant="two_elbows", overrides={"duration_s": 0.1})
+    >>> text = dynsim.view.page({"two elbows": dynsim.simulate(scenario)})
+    >>> text.startswith("<!DOCTYPE html>")
+    True
     """
     data = packed(records, ghost=ghost)
     titles = (record.title.partition(" / ")[0] for record in records.values())
@@ -371,12 +402,36 @@ def page(records: Mapping[str, Record], *, ghost: bool = False, scripts: Sequenc
 
 
 def write(records: Mapping[str, Record], path: str | os.PathLike[str], *, ghost: bool = False) -> Path:
-    """Write the page of :func:`page` to a file: complete or not at all.
+    """Write the page of one or several records to a file atomically.
+
+    Parameters
+    ----------
+    records : mapping of str to Record
+        Displayed names and records.
+    path : str or path-like
+        File to write.
+    ghost : bool, optional
+        Overlay several records, the first one solid; default: side by side.
+
+    Returns
+    -------
+    Path
+        The written file.
 
     Raises
     ------
     RecordError
-        As :func:`page`, or the file cannot be written.
+        As for :func:`page`; also if the file cannot be written.
+
+    Examples
+    --------
+    >>> import dynsim, pathlib, tempfile
+    >>> scenario = dynsim.load_scenario("elbow_comparison", variant="two_elbows", overrides={"duration_s": 0.1})
+    >>> record = dynsim.simulate(scenario)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = dynsim.view.write({"two elbows": record}, pathlib.Path(folder) / "view.html")
+    >>> path.name
+    'view.html'
     """
     content = page(records, ghost=ghost).encode("utf-8", errors="replace")
     with replacing(Path(path)) as stream:
@@ -395,52 +450,82 @@ def _filled(values: Mapping[str, str], scripts: Sequence[str]) -> str:
 
 
 def three() -> str:
-    """The text of three.js, with its licence in its first lines.
+    """Return the text of three.js, including its licence.
 
     Raises
     ------
     RecordError
-        The package is not installed.
+        If the package is not installed.
     """
     package, file = _THREE
     try:
         return resources.files(package).joinpath(file).read_text(encoding="utf-8")
     except (ModuleNotFoundError, FileNotFoundError) as error:
-        raise RecordError("to view records in 3D: pip install jupyter-threejs-sage") from error
+        raise RecordError("viewing records in 3D requires three.js: pip install jupyter-threejs-sage") from error
 
 
 def _inline(program: str) -> str:
-    """As it may stand within a script element."""
+    """Escape a program for a script element."""
     return re.sub(r"</(script)", r"<\\/\1", program, flags=re.IGNORECASE).replace("<!--", r"<\!--")
-
-
-# A viewer page shown inside a notebook.
 
 
 @dataclass(frozen=True)
 class Inline:
-    """A page that a notebook shows in a frame of its own, ``height`` pixels high; :meth:`save` writes it to a file."""
+    """Page that a notebook displays in a frame.
+
+    Parameters
+    ----------
+    page : str
+        HTML text.
+    height : int, optional
+        Height of the frame [pixel].
+
+    Examples
+    --------
+    >>> import dynsim
+    >>> inline = dynsim.view.Inline("<p>text</p>", height=300)
+    >>> '<iframe' in inline._repr_html_()
+    True
+    """
 
     page: str
     height: int = 640
 
     def _repr_html_(self) -> str:
-        # Scripts run, but not with the rights of the notebook.
+        # Scripts may run, but without the rights of the notebook.
         return (
             f'<iframe sandbox="allow-scripts allow-downloads" srcdoc="{html.escape(self.page)}" '
             f'style="width:100%;height:{int(self.height)}px;border:0" title="dynsim"></iframe>'
         )
 
     def __repr__(self) -> str:
-        return f"<page of {len(self.page) / 1e6:.2f} MB; save(FILE) writes it>"
+        return f"<page of {len(self.page) / 1e6:.2f} MB; write it with save(FILE)>"
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the page to a file.
 
+        Parameters
+        ----------
+        path : str or path-like
+            File to write.
+
+        Returns
+        -------
+        Path
+            The written file.
+
         Raises
         ------
         RecordError
-            The file cannot be written.
+            If the file cannot be written.
+
+        Examples
+        --------
+        >>> import dynsim, pathlib, tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = dynsim.view.Inline("<p>text</p>").save(pathlib.Path(folder) / "view.html")
+        >>> path.name
+        'view.html'
         """
         with replacing(Path(path)) as stream:
             stream.write(self.page.encode("utf-8", errors="replace"))

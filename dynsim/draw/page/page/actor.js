@@ -1,8 +1,7 @@
 "use strict";
-// One robot in the scene. What it shows at an instant is a sample: from the tables of a record, or from a live frame.
+// One robot in the scene. It shows samples from the tables of a record, or from live frames:
 //   {time, poses: [x, y, z, w, x, y, z for each body], contacts: [{force, normal, tangent, mode}], wheels: [1 or 0],
-//    depths: [m] of data.sunk, pressure: [x, y] or null, gripper: number of its
-//    state, 0 where it is open, or null}
+//    depths: [m] of data.sunk, pressure: [x, y] or null, gripper: number of its state (0 is open), or null}
 
 class Actor {
   constructor(data, bytes, meshes, index) {
@@ -65,7 +64,7 @@ class Actor {
           painted: !own && Boolean(mesh.geometry.attributes.color) };
         paint.push(part);
         if (role === "wheel") {
-          // A mark on the rim, or nobody would see it turn.
+          // A mark that makes the rotation visible.
           const [radius, width] = shape.size;
           const spoke = new THREE.Mesh(new THREE.BoxGeometry(1.5 * radius, 0.22 * radius, 1.06 * width), new THREE.MeshBasicMaterial());
           mesh.add(spoke);
@@ -103,7 +102,7 @@ class Actor {
       this.hand.add(new THREE.Mesh(new THREE.SphereGeometry(0.75 * size, 16, 12), this.handMaterial));
       return;
     }
-    // Two fingers ahead of the controlled point, which close.
+    // Two fingers in front of the controlled point, which open and close.
     this.fingers = [-1, 1].map((side) => {
       const finger = new THREE.Mesh(new THREE.BoxGeometry(...this.data.fingers.size), this.handMaterial);
       finger.userData = { side };
@@ -112,14 +111,14 @@ class Actor {
     });
   }
 
-  // The sample of the record at a time: positions in straight lines, turns along them, modes as they were.
+  // Sample of the record at a time: positions and orientations interpolated linearly, modes held.
   at(t) {
     this.live = false;
     const times = this.times, out = this.sample, n = this.bodies.length;
     const clipped = Math.min(Math.max(t, this.span[0]), this.span[1]);
     const i = times.length > 1 ? D.before(times, clipped) : 0, j = Math.min(i + 1, times.length - 1);
     const gap = times[j] - times[i], share = gap > 0 ? Math.min((clipped - times[i]) / gap, 1) : 0;
-    // The instant of a frame shows what was then, not what was just before it.
+    // Exactly at a frame, use this frame instead of the previous one.
     const held = share > 1 - 1e-9 ? j : i;
     const mix = (table, k) => { const c = table.column(k), a = c[i]; return share > 0 ? a + share * (c[j] - a) : a; };
     out.time = clipped;
@@ -144,13 +143,13 @@ class Actor {
     return out;
   }
 
-  // Put everything where a sample has it.
+  // Show a sample.
   show(sample, layers, colours) {
     this.shown = sample;
     const poses = sample.poses;
     for (let b = 0; b < this.bodies.length; b++) {
       const o = 7 * b, object = this.bodies[b].object;
-      if (!(poses[o] - poses[o] === 0)) continue;  // a run that diverged: it stays where it was last
+      if (!(poses[o] - poses[o] === 0)) continue;  // diverging run: keep the last pose
       object.position.set(poses[o], poses[o + 1], poses[o + 2]);
       object.quaternion.set(poses[o + 4], poses[o + 5], poses[o + 6], poses[o + 3]).normalize();
     }
@@ -165,7 +164,7 @@ class Actor {
       Object.assign(wheel, { down, colours });
       wheel.part.material.color.set(down ? colours.down : colours.lifted);
       wheel.part.spoke.material.color.set(down ? colours.lifted : colours.down);
-      // The model has no height for a lifted wheel; it is drawn a little above the ground.
+      // The model has no height for a lifted wheel; it is drawn slightly above the ground.
       wheel.part.mesh.position.copy(wheel.rest);
       if (!down) wheel.part.mesh.position.z += 0.35 * wheel.radius;
     }
@@ -179,7 +178,7 @@ class Actor {
     if (this.grown) this.grown.line.visible = Boolean(layers.trace && this.live);
   }
 
-  // A live frame: the path of the hand grows, that of the record is not shown.
+  // Live frame: extend the live path of the hand; the path of the record is hidden.
   extend(sample) {
     if (!this.hand) return;
     this.grown ??= new M.Growing(this.inner);
@@ -209,7 +208,7 @@ class Actor {
     return this.hand.getWorldPosition(out);
   }
 
-  // Colours of the theme, of hubs (and all of a ghost, which is translucent), and of the hand's way.
+  // Set the colours of the theme, of hubs (of everything for a translucent ghost), and of the hand path.
   dress(colours, tint, way, ghost) {
     this.colours = colours;
     this.tint = new THREE.Color(tint);
@@ -236,20 +235,20 @@ class Actor {
     }
   }
 
-  // Paint the body that each motor moves; colours by body index, none: as they were dressed.
+  // Colour the body that each motor moves, by body index; without colours, restore the theme.
   paint(colourOf) {
     this.bodies.forEach((body, k) => {
       const colour = colourOf ? colourOf.get(k) : null;
       for (const part of body.paint) {
         if (part.role !== "wheel") part.material.color.copy(colour ?? (colourOf ? this.plain : part.base));
-        // Colours of a mesh's file give way to those of the motors.
+        // Colours of motors replace the colours of a mesh file.
         const own = part.painted && !this.ghost && !colourOf;
         if (part.painted && part.material.vertexColors !== own) Object.assign(part.material, { vertexColors: own, needsUpdate: true });
       }
     });
   }
 
-  // Hubs of motors at their voltage limit have a colour of their own.
+  // Hubs of motors at their voltage limit have a special colour.
   mark(saturated) {
     const key = saturated.join();
     if (key === this.marked) return;

@@ -1,24 +1,24 @@
 "use strict";
-// Buttons, slider, keys, and what they do with the player. `app` is that of main.js.
+// Buttons, slider and keys that control the player `app` of main.js.
 
 const KEYS = [
-  ["space", "play, pause"], ["← →", "one frame back, ahead; with shift ten"], ["home end", "first, last instant"],
-  ["+ −", "faster, slower"], ["1 2 3 4", "from a corner, the side, the front, above"], ["f", "follow the hand"],
-  ["g", "side by side or laid over each other"], ["c", "next colouring of the links"], ["d", "dark or light"],
-  ["p", "screenshot"], ["?", "what is drawn, and these keys"],
+  ["space", "play, pause"], ["← →", "one frame back, forward; with shift ten"], ["home end", "start, end"],
+  ["+ −", "faster, slower"], ["1 2 3 4", "view from a corner, the side, the front, above"], ["f", "follow the hand"],
+  ["g", "side by side or overlaid"], ["c", "next colouring of the links"], ["d", "dark or light"],
+  ["p", "screenshot"], ["?", "legend and keys"],
 ];
-// What is drawn, by the layer or the part of a record that has it.
+// Legend entries, with the layer or the part of a record that they need.
 const SIGNS = [
-  ["forces", "push", "▲", "normal force: the surface pushes"], ["pulls", "pull", "▼", "the surface would have to pull"],
-  ["cones", "friction", "▲", "force with friction, and the cone that it cannot leave"],
+  ["forces", "push", "▲", "normal force: the surface pushes"], ["pulls", "pull", "▼", "the surface pulls"],
+  ["cones", "friction", "▲", "total force with friction, and the friction cone"],
   ["modes", "stick", "●", "contact sticks"], ["modes", "slip", "●", "contact slips"], ["modes", "open", "●", "contact open"],
-  ["depths", "sunk", "●", "joint or hand below a surface by more than its link's radius, ↓ by how much: a surface holds contact points only"],
-  ["trace", "hand", "━", "way of the hand"], ["target", "target", "╍", "target of the hand"],
-  ["support", "support", "■", "what the robot stands on"], ["support", "target", "◎", "centre of pressure or of mass; orange outside"],
-  ["wheels", "down", "●", "wheel on the ground; lifted ones are white"],
+  ["depths", "sunk", "●", "joint or hand below a surface by more than the link radius (↓ depth); surfaces act on declared contact points only"],
+  ["trace", "hand", "━", "path of the hand"], ["target", "target", "╍", "target of the hand"],
+  ["support", "support", "■", "support polygon"], ["support", "target", "◎", "centre of pressure or of mass; orange outside the support polygon"],
+  ["wheels", "down", "●", "wheel on the ground; lifted wheels are white"],
 ];
 const SPEEDS = [0.05, 0.1, 0.25, 0.5, 1, 2, 5, 10];
-const ABOUT = { depths: "joints and hand below a surface, and how deep (↓)" };
+const ABOUT = { depths: "joints and hand below a surface, with depth (↓)" };
 const EVENTS = { landing: "▼", lift_off: "▲", bounce: "●", slip_start: "▶", slip_stop: "■", stop_hit: "✚", stop_left: "✖", tip_over: "⚠" };
 
 function wire(app) {
@@ -36,7 +36,7 @@ function wire(app) {
   const switches = [["forces", "forces"], ["cones", "cones"], ["trace", "trace"], ["target", "target"], ["support", "support"], ["depths", "depths"], ["labels", "labels"]]
     .filter(([name]) => app.has(name)).map(([name, text]) =>
       [name, button("layers", text, `show or hide: ${ABOUT[name] ?? text}`, () => app.set(name, !app.layers[name]))]);
-  const layout = app.actors.length > 1 ? button("layers", "", "side by side or laid over each other (g)", () => app.set("ghost", !app.ghost)) : null;
+  const layout = app.actors.length > 1 ? button("layers", "", "side by side or overlaid (g)", () => app.set("ghost", !app.ghost)) : null;
 
   for (const value of SPEEDS) $("speed").append(D.element("option", { value, textContent: `${value}×` }));
   $("speed").onchange = () => app.set("speed", Number($("speed").value));
@@ -46,7 +46,7 @@ function wire(app) {
   $("colour").onchange = () => app.set("colouring", $("colour").value);
   $("play").onclick = () => app.set("playing", !app.playing);
   $("slider").oninput = () => {
-    // Read first: what is shown moves the slider too.
+    // Read first, because app.set moves the slider.
     const time = Number($("slider").value);
     app.set("playing", false);
     app.seek(time);
@@ -54,22 +54,22 @@ function wire(app) {
   $("theme").onclick = () => app.set("theme", app.theme === "dark" ? "light" : "dark");
   $("shot").onclick = () => app.screenshot();
   $("help").onclick = () => $("keys").open ? $("keys").close() : $("keys").showModal();
-  const signs = SIGNS.filter(([layer]) => app.has(layer)).map(([, colour, sign, what]) => {
+  const signs = SIGNS.filter(([layer]) => app.has(layer)).map(([, colour, sign, meaning]) => {
     const cell = D.element("th", { textContent: sign });
     cell.dataset.colour = colour;
-    return D.element("tr", {}, cell, D.element("td", { textContent: what }));
+    return D.element("tr", {}, cell, D.element("td", { textContent: meaning }));
   });
-  if (signs.length) $("keys").append(D.element("h2", { textContent: "What is drawn" }), D.element("table", { id: "signs" }, ...signs));
-  $("keys").append(D.element("h2", { textContent: "Keys" }), D.element("table", {}, ...KEYS.map(([key, what]) =>
-    D.element("tr", {}, D.element("th", { textContent: key }), D.element("td", { textContent: what })))),
-    D.element("p", { textContent: "Drag turns, right drag or two fingers move, wheel zooms. In plots: drag zooms, double click shows all, click goes there." }),
+  if (signs.length) $("keys").append(D.element("h2", { textContent: "Legend" }), D.element("table", { id: "signs" }, ...signs));
+  $("keys").append(D.element("h2", { textContent: "Keys" }), D.element("table", {}, ...KEYS.map(([key, action]) =>
+    D.element("tr", {}, D.element("th", { textContent: key }), D.element("td", { textContent: action })))),
+    D.element("p", { textContent: "Drag to rotate, right-drag or use two fingers to move, scroll to zoom. In plots: drag to zoom, double-click to show all, click to go to a time." }),
     D.element("button", { textContent: "close", onclick: () => $("keys").close() }));
 
   app.actors.forEach((actor) => {
     const chip = D.element("button", { className: "chip", title: "show or hide", onclick: () => app.toggle(actor) }, D.element("i"), actor.name);
     actor.chip = chip;
     if (actor.data.measured && actor.name !== "measured") chip.append(D.element("em", { textContent: "measured" }));
-    if (!actor.data.complete) chip.append(D.element("em", { textContent: "incomplete", title: `ends at ${D.number(actor.span[1])} s, before it was to` }));
+    if (!actor.data.complete) chip.append(D.element("em", { textContent: "incomplete", title: `ended early, at ${D.number(actor.span[1])} s` }));
     if (app.actors.length > 1 || chip.querySelector("em")) $("variants").append(chip);
   });
 
@@ -103,7 +103,7 @@ function wire(app) {
     act(event);
   });
 
-  // What the controls show, after anything has changed.
+  // Update the controls after a change.
   return () => {
     $("play").textContent = app.playing ? "❚❚" : "▶";
     $("play").setAttribute("aria-label", app.playing ? "pause" : "play");
@@ -122,7 +122,7 @@ function wire(app) {
   };
 }
 
-// What is under the pointer: name of a body, where it is, what its motor does.
+// Tooltip of the body under the pointer: name, position, signals of its motor.
 function hovering(app, canvas, box) {
   const ray = new THREE.Raycaster(), at = new THREE.Vector2();
   let last = 0;

@@ -1,10 +1,10 @@
 "use strict";
-// The data of the page: from base64 and gzip to a head and tables of numbers; see dynsim/draw/page/content.py.
+// Data of the page: from base64 and gzip to a head and tables of numbers; see dynsim/draw/page/content.py.
 const D = {};
 
 D.unpack = async function (text) {
   const packed = Uint8Array.from(atob(text.trim()), (c) => c.charCodeAt(0));
-  if (typeof DecompressionStream === "undefined") throw new Error("this browser is too old: it cannot decompress");
+  if (typeof DecompressionStream === "undefined") throw new Error("this browser is too old (no DecompressionStream); use a newer one");
   const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("gzip"));
   const bytes = new Uint8Array(await new Response(stream).arrayBuffer());
   const size = new DataView(bytes.buffer).getUint32(0, true);
@@ -12,7 +12,7 @@ D.unpack = async function (text) {
   return { head, bytes: bytes.subarray(4 + size) };
 };
 
-// A table: columns of numbers over rows, decoded when it is first asked for.
+// Table: columns of numbers over rows, decoded on first use.
 D.Table = class {
   constructor(bytes, block) {
     this.bytes = bytes;
@@ -43,7 +43,7 @@ D.Table = class {
   }
 };
 
-// The last index whose value is not beyond t, within [0, n - 2] so that there is a next one.
+// Last index whose value is not beyond t, within [0, n - 2] so that there is a next index.
 D.before = function (times, t) {
   let low = 0, high = times.length - 1;
   while (high - low > 1) {
@@ -74,7 +74,7 @@ D.element = function (tag, properties = {}, ...children) {
   return made;
 };
 
-// Okabe and Ito's colours; what is drawn on a dark ground is lighter.
+// Colours of Okabe and Ito; lighter on a dark background.
 D.palette = {
   light: { push: "#0072B2", pull: "#D55E00", friction: "#7A3E9D", target: "#000000", hand: "#0072B2", slip: "#E69F00",
     stick: "#009E73", open: "#7F7F7F", support: "#56B4E9", body: "#AEB7C4", hub: "#4A5260", wheel: "#3A4048", down: "#0072B2",

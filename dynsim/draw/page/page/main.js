@@ -1,9 +1,9 @@
 "use strict";
-// The program of the page begins here: the player. `dynsim` is what a test, a film or a live drive may use of the page:
-//   dynsim.ready           a promise that holds when everything is there
-//   dynsim.seek(t)         show an instant [s] and draw it
-//   dynsim.state()         what is shown: time, poses of all bodies, arrows, wheels, support
-//   dynsim.frame(f, k)     show a frame that comes from elsewhere with robot k:
+// Player: entry point of the page. `dynsim` is the interface for tests, films and live driving:
+//   dynsim.ready           promise that resolves when the page is ready
+//   dynsim.seek(t)         show and draw a time [s]
+//   dynsim.state()         displayed state: time, poses of all bodies, arrows, wheels, support
+//   dynsim.frame(f, k)     show an external frame with robot k:
 //                          {time, poses: [x, y, z, qw, qx, qy, qz of each body], contacts, wheels, pressure, gripper}
 //   dynsim.set(name, value) (playing, speed, theme, ghost, follow, colouring, or a layer), dynsim.camera(name), dynsim.image() (PNG as a data URL), dynsim.cost (ms of the last update)
 
@@ -13,7 +13,7 @@ class App {
     const meshes = head.meshes.map((mesh) => S.mesh(bytes, mesh));
     this.actors = head.records.map((record, k) => new Actor(record, bytes, meshes, k));
     this.span = [Math.min(...this.actors.map((a) => a.span[0])), Math.max(...this.actors.map((a) => a.span[1]))];
-    // A measured record may begin before the simulated one: first is shown when all have begun.
+    // A measured record may begin before the simulated one: start when all records have begun.
     const begun = Math.max(...this.actors.map((a) => a.span[0]));
     this.start = begun < this.span[1] ? begun : this.span[0];
     this.stage = new Stage(document.getElementById("scene"), head.azimuth);
@@ -48,11 +48,11 @@ class App {
     return wanted.filter((name) => this.actors.some((a) => a.signals.get(name))).slice(0, 3);
   }
 
-  // Surfaces once for all: the floor as the stage's own, others with each robot.
+  // Surfaces: the floor belongs to the stage, others to each robot.
   surfaces() {
     const flat = (s) => s.kind === "plane" && Math.abs(s.q[1]) < 1e-6 && Math.abs(s.q[2]) < 1e-6;
     const floors = this.actors.flatMap((a) => a.data.surfaces.filter(flat)).map((s) => s.p[2]);
-    // Without one a faint grid lies below everything, to see by where things are.
+    // Without a floor, a faint grid below everything helps to judge positions.
     const bare = this.actors.every((a) => !a.data.surfaces.length && !a.data.fixed.length);
     this.stage.real = floors.length > 0 || this.actors.every((a) => !a.data.surfaces.length);
     this.floor = floors.length ? floors[0] : bare ? this.head.box[0][2] : Math.min(0, this.head.box[0][2]);
@@ -71,11 +71,11 @@ class App {
     }
   }
 
-  // Variants beside each other, or all at one place.
+  // Variants side by side, or overlaid.
   arrange() {
     const [low, high] = this.head.box.map((corner) => new THREE.Vector3(...corner));
     const shown = this.actors.filter((a) => a.object.visible), first = shown[0];
-    const { along, apart } = this.ghost ? { along: "y", apart: 0 } : this.beside(shown, low, high);
+    const { along, apart } = this.ghost ? { along: "y", apart: 0 } : this.spacing(shown, low, high);
     shown.forEach((actor, k) => {
       actor.object.position.set(0, 0, 0)[along] = k * apart;
       this.stage.turned(actor.object.position);
@@ -87,21 +87,21 @@ class App {
     this.stage.dress(D.palette[this.theme]);
   }
 
-  // The direction in which they stand beside each other, and how far: behind each other as the reader sees them, but
-  // across what is long that way, a pipe or a beam, or the next one would stand on it too.
-  beside(shown, low, high) {
+  // Direction and distance of variants side by side: one behind the other for the viewer, but across a long surface such
+  // as a pipe or a beam, on which the next variant would otherwise stand too.
+  spacing(shown, low, high) {
     const ways = ["y", "x"].map((along) => {
       const way = this.stage.turned(new THREE.Vector3(along === "x" ? 1 : 0, along === "y" ? 1 : 0, 0));
       const span = high[along] - low[along], ends = shown.flatMap((a) => a.surfaces.flatMap((one) => S.extent(one, way)));
       return { along, span, apart: Math.max(span, Math.max(high[along], ...ends) - Math.min(low[along], ...ends)) };
     });
     const [y, x] = ways, best = x.apart / x.span < 0.7 * (y.apart / y.span) ? x : y;
-    // Ground that is larger than everything in both directions is not gone around.
+    // A ground that is larger than everything in both directions cannot be avoided.
     const apart = best.apart > 3 * best.span ? best.span : best.apart;
     return { along: best.along, apart: apart + 0.06 * Math.max(x.span, y.span) };
   }
 
-  // Whether a surface lies on the same one of the first variant: walls go on, and laid over each other all do.
+  // Whether a surface coincides with the same surface of the first variant: walls continue, and overlays share all surfaces.
   shared(one, first, offset) {
     const { surface, normal } = one.userData, same = JSON.stringify(surface);
     if (!first.surfaces.some((other) => JSON.stringify(other.userData.surface) === same)) return false;
@@ -137,13 +137,13 @@ class App {
       pulls: some((a) => a.contactTables.some((c) => c.force.column(0).some((f) => f < 0))) }[layer];
   }
 
-  // Heat of the windings R i²; where the resistance is not one for all motors, the squares of their currents.
+  // Heat of the windings R i²; squares of the currents if the motors have different resistances.
   heat() {
     const R = this.actors[0].data.resistance, one = R && this.actors.every((a) => a.data.resistance === R);
     return one ? ["current", "heat R i²", "W", (x) => R * x * x] : ["current", "heat ∝ i²", "A²", (x) => x * x];
   }
 
-  // Signals of the motors by which links may be painted.
+  // Signals of the motors for colouring the links.
   colourings() {
     const list = [["power", "power |u i|", "W", (x) => Math.abs(x)], this.heat(),
       ["torque", "|torque|", "", (x) => Math.abs(x)], ["voltage", "|voltage|", "V", (x) => Math.abs(x)], ["phi_dot", "|joint rate|", "rad/s", (x) => Math.abs(x)]];
@@ -194,7 +194,7 @@ class App {
     this.set("speed", SPEEDS[Math.min(Math.max(k + way, 0), SPEEDS.length - 1)]);
   }
 
-  // A frame from elsewhere: nothing of the record is shown but what the frame has.
+  // External frame: only its own content is shown.
   frame(frame, k = 0) {
     const actor = this.actors[k], sample = actor.emptySample();
     this.live = true;
@@ -231,7 +231,7 @@ class App {
     if (this.follow) this.chase(pairs[0][0]);
     document.getElementById("slider").value = this.time;
     document.getElementById("clock").textContent = `${this.time.toFixed(3)} s`;
-    this.tell(pairs);
+    this.showStatus(pairs);
     this.stage.touch();
   }
 
@@ -242,7 +242,7 @@ class App {
     else this.target = this.stage.controls.target.clone().sub(this.point);
   }
 
-  // Scale of the colouring: the 98th percentile, so that a spike at the start does not darken the rest.
+  // Scale of the colouring: the 98th percentile, so that a peak at the start does not darken the rest.
   rate() {
     const chosen = this.colourings().find((c) => c.name === this.colouring);
     this.rating = null;
@@ -277,20 +277,20 @@ class App {
     actor.paint(found);
   }
 
-  // From dark blue over grey to yellow (cividis), which colour-blind readers see as well.
+  // From dark blue over grey to yellow (cividis), which is suitable for colour-blind readers.
   static heat(share) {
     const stops = [[30, 62, 120], [58, 80, 122], [102, 105, 112], [149, 143, 120], [203, 186, 105], [255, 234, 70]];
     const x = Math.min(Math.max(share || 0, 0), 1) * 5, k = Math.min(Math.floor(x), 4), f = x - k;
     return new THREE.Color().setRGB(...[0, 1, 2].map((i) => (stops[k][i] + f * (stops[k + 1][i] - stops[k][i])) / 255));
   }
 
-  // Status in words: contacts, wheels, support, saturated motors.
-  tell(pairs) {
+  // Status line: contacts, wheels, support, saturated motors.
+  showStatus(pairs) {
     const lines = [];
     for (const [actor] of pairs) {
       const parts = actor.contacts.map(({ state }) => state.force === null || state.state === "open" ? `${state.name}: open`
         : `${state.name}: ${D.number(state.force, 3)} N, ${state.state}`);
-      // A live gripper is only known to be closed or open.
+      // For a live gripper, only open or closed is known.
       if (actor.data.states && !actor.live) parts.unshift(`gripper: ${actor.data.states[actor.shown.gripper]}`);
       actor.saturated = this.saturated(actor);
       actor.mark(actor.saturated);
@@ -330,7 +330,7 @@ class App {
     return found;
   }
 
-  // Names and forces beside the contacts.
+  // Labels with names and forces at the contacts.
   label() {
     for (const { actor, contact, box } of this.tags) {
       const state = contact.state, shown = this.layers.labels && actor.object.visible && state.shown && !(this.ghost && actor.ghost);
@@ -377,7 +377,7 @@ dynsim.ready = D.unpack(document.getElementById("data").textContent).then((data)
   document.documentElement.dataset.ready = "yes";
 }).catch((error) => {
   const box = document.getElementById("message");
-  box.textContent = `This page cannot be shown: ${error.message}`;
+  box.textContent = `Cannot show this page: ${error.message}`;
   box.hidden = false;
   console.error(error);
 });

@@ -1,11 +1,11 @@
 "use strict";
-// Marks in the scene: arrows of forces, cones of friction, contacts, paths, the support polygon. Drawn on top where they
-// would be hidden otherwise.
+// Marks in the scene: force arrows, friction cones, contacts, paths, the support polygon. Drawn on top if they would
+// otherwise be hidden.
 const M = {};
 
 M.above = { depthTest: false, depthWrite: false, transparent: true };
 
-// An arrow along z, of length 1 when it is set so: a shaft that is stretched, a head that is not.
+// Arrow along z: the shaft is scaled to the length, the head is not.
 M.Arrow = class {
   constructor(parent, radius, order) {
     this.radius = radius;
@@ -21,7 +21,7 @@ M.Arrow = class {
     parent.add(this.object);
   }
 
-  // From a point along a unit vector; length is at least that of the head.
+  // From a point along a unit vector, not shorter than the head.
   set(from, along, length, colour) {
     const long = Math.max(length, 8 * this.radius);
     this.object.visible = true;
@@ -39,7 +39,7 @@ M.Arrow = class {
 };
 M.z = new THREE.Vector3(0, 0, 1);
 
-// What one contact shows: its state, the normal force, and the force with friction within its cone.
+// One contact: its state, the normal force, and the total force within its friction cone.
 M.Contact = class {
   constructor(parent, contact, size) {
     this.name = contact.name;
@@ -61,8 +61,8 @@ M.Contact = class {
     parent.add(this.dot, this.cone);
   }
 
-  // force [N] along the normal, tangent (x, y, z) [N], mode 0 open, 1 slides, 2 sticks or null; at: where the force of a
-  // sphere or capsule acts, else it is at the point of its body.
+  // force [N] along the normal, tangent (x, y, z) [N], mode 0 open, 1 slides, 2 sticks or null; at: position of the force
+  // on a sphere or capsule; default: the point of the body.
   show(body, now, scale, layers, colours) {
     const { force, mode } = now;
     if (now.at) this.at.set(...now.at);
@@ -72,14 +72,14 @@ M.Contact = class {
     const slip = Math.hypot(...now.tangent), shown = layers.forces && !open && force !== 0;
     const long = this.size * Math.min(Math.sqrt(Math.abs(force) / scale), 1.6);
     const colour = pulls ? colours.pull : colours.push;
-    // A pull points into the surface, where it would not be seen: its arrow stands above, with the head at the contact.
+    // A pulling force points into the surface, where it would be hidden: its arrow is above, with the head at the contact.
     if (shown && pulls) {
       const high = Math.max(long, 8 * this.push.radius);
       this.foot.copy(this.normal).multiplyScalar(high).add(this.at);
       this.push.set(this.foot, this.along.copy(this.normal).negate(), high, colour);
     } else if (shown) this.push.set(this.at, this.normal, long, colour);
     else this.push.hide();
-    // With friction the whole force, within the cone: as the normal one, towards the contact where it pulls.
+    // The total force with friction, within the cone; like the normal force, it points to the contact if it pulls.
     if (shown && slip > 1e-3 * scale) {
       this.along.set(...now.tangent).addScaledVector(this.normal, force);
       const all = this.size * Math.min(Math.sqrt(this.along.length() / scale), 1.6), high = Math.max(all, 8 * this.slide.radius);
@@ -101,7 +101,7 @@ M.Contact = class {
   }
 };
 
-// A joint below a surface: a ball about it that bodies and floor do not hide.
+// A joint below a surface: a ball that is drawn on top of bodies and floor.
 M.Sunk = class {
   constructor(parent, point, size) {
     this.point = point;
@@ -112,7 +112,7 @@ M.Sunk = class {
     parent.add(this.mark);
   }
 
-  // depth [m]; not known: it is not below.
+  // depth [m]; undefined if it is not below.
   show(body, depth, layers, colours) {
     this.depth = depth > this.point.least ? depth : null;
     this.mark.visible = layers.depths && this.depth !== null;
@@ -123,8 +123,8 @@ M.Sunk = class {
   }
 };
 
-// Points of a path, no nearer to each other than a part of its length: fat lines of thousands of pieces take seconds
-// to draw without a graphics card.
+// Points of a path with a minimum distance relative to its length: without a graphics card, wide lines with thousands
+// of pieces take seconds to draw.
 M.thinned = function (times, table, most = 360) {
   const [x, y, z] = [0, 1, 2].map((k) => table.column(k)), rows = [];
   for (let i = 0; i < times.length; i++) if (Number.isFinite(x[i] + y[i] + z[i])) rows.push(i);
@@ -142,7 +142,7 @@ M.thinned = function (times, table, most = 360) {
   return { times: kept.map((i) => times[i]), points: kept.flatMap((i) => [x[i], y[i], z[i]]) };
 };
 
-// A path: all of it faint, what was passed so far bold.
+// A path: faint, and bold up to the current time.
 M.Path = class {
   constructor(parent, times, table, width, faint) {
     const path = M.thinned(times, table);
@@ -162,7 +162,7 @@ M.Path = class {
   }
 };
 
-// A path that grows with live frames; where it is full, every second of its points goes.
+// A path that grows with live frames; when it is full, every second point is removed.
 M.Growing = class {
   constructor(parent, most = 4000) {
     this.most = most;
@@ -186,7 +186,7 @@ M.Growing = class {
   }
 };
 
-// The convex hull of points on the ground, and what must lie within it.
+// The convex hull of points on the ground, and the point that must be inside.
 M.Support = class {
   constructor(parent, most, size) {
     this.positions = new Float32Array(3 * 3 * Math.max(most, 3));
@@ -221,7 +221,7 @@ M.Support = class {
   }
 };
 
-// Corners of the convex hull of points (x, y), turning to the left.
+// Corners of the convex hull of points (x, y), counterclockwise.
 M.hull = function (points) {
   const sorted = points.slice().sort((a, b) => a[0] - b[0] || a[1] - b[1]);
   const side = (list) => {

@@ -1,8 +1,8 @@
 "use strict";
-// Curves of signals over time on small canvases, with a cursor at the time of the scene. Drag to zoom, double click for
-// all, click to go there.
+// Curves of signals over time, with a cursor at the time of the scene. Drag to zoom, double-click to show all, click to
+// go to a time.
 
-// Curves that a plot names, at most; of more the largest.
+// Maximum number of curves that a plot names (the largest).
 const NAMED = 6;
 
 class Plots {
@@ -47,7 +47,7 @@ class Plots {
     plot.columns.hidden = !labels.length;
   }
 
-  // What people call a column: motors of wheels have names of their own.
+  // Display name of a column: motors of wheels have special names.
   called(label) {
     return this.actors.map((a) => a.data.names[label]).find(Boolean) ?? label;
   }
@@ -95,7 +95,7 @@ class Plots {
     }
     c.textAlign = "center";
     for (const t of Plots.ticks(t0, t1, area.w / 60)) {
-      // The last number ends where the canvas does.
+      // Keep the last number inside the canvas.
       const text = D.number(t), half = c.measureText(text).width / 2;
       c.fillText(text, Math.min(X(t), box.width - half), box.height - 4);
     }
@@ -142,7 +142,7 @@ class Plots {
     c.setLineDash([]);
   }
 
-  // The curves with the largest root mean square over what is shown, at most so many, in their order.
+  // At most `most` curves with the largest root mean square in the visible range, in their order.
   static largest(curves, t0, t1, most) {
     const effort = curves.map(({ times, values }) => {
       const first = D.before(times, t0), last = Math.min(times.length - 1, D.before(times, t1) + 1);
@@ -154,7 +154,7 @@ class Plots {
     return order.slice(0, most).sort((a, b) => a - b);
   }
 
-  // Range of the values shown; a spike at the start does not squeeze the rest.
+  // Range of the visible values, cutting off a peak that would compress the rest.
   static limits(curves, t0, t1) {
     let low = Infinity, high = -Infinity, all = [];
     for (const { times, values } of curves) {
@@ -178,7 +178,7 @@ class Plots {
   static ticks(low, high, count) {
     const step = Stage.round((high - low) / Math.max(count, 1)), found = [];
     for (let v = Math.ceil(low / step) * step; v <= high + 1e-9 * step; v += step) found.push(Math.abs(v) < 1e-9 * step ? 0 : v);
-    // One number alone says nothing of the scale.
+    // A scale needs at least two numbers.
     return found.length > 1 || count > 12 ? found : Plots.ticks(low, high, count + 1);
   }
 
@@ -204,7 +204,7 @@ class Plots {
       return item;
     });
     const more = plot.drawn.length - list.length;
-    if (more) list.push(D.element("span", { textContent: `… ${more} smaller`, title: "named are those with the largest rms over what is shown" }));
+    if (more) list.push(D.element("span", { textContent: `… ${more} smaller`, title: "the curves with the largest rms in the visible range are named" }));
     plot.values.replaceChildren(D.element("b", { textContent: `${plot.unit === "1" ? "" : plot.unit}` }), ...list);
   }
 

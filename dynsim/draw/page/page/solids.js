@@ -1,5 +1,5 @@
 "use strict";
-// Geometry of shapes, surfaces and marks; what is round lies along z.
+// Geometry of shapes, surfaces and marks; round shapes are along z.
 const S = {};
 
 S.geometry = function (shape, meshes) {
@@ -24,7 +24,7 @@ S.capsule = function (radius, length) {
   return new THREE.LatheGeometry(profile, 24).rotateX(Math.PI / 2);
 };
 
-// Triangles with 16-bit corners within a box: {vertices, triangles, low, step}. Edges of more than 40° stay sharp.
+// Triangles with 16-bit corners in a box: {vertices, triangles, low, step}. Edges of more than 40° remain sharp.
 S.mesh = function (bytes, mesh) {
   const codes = ({ at, count, bits }) => new (bits === 16 ? Uint16Array : Uint32Array)(bytes.slice(at, at + (bits / 8) * count).buffer);
   const raw = codes(mesh.vertices), corner = codes(mesh.triangles), faces = corner.length / 3;
@@ -49,7 +49,7 @@ S.mesh = function (bytes, mesh) {
   made.setAttribute("position", new THREE.BufferAttribute(positions, 3));
   made.setAttribute("normal", new THREE.BufferAttribute(smooth, 3));
   if (mesh.palette) {
-    // Colours of the file; what has none is grey.
+    // Colours of the file; grey if there is no colour.
     const paint = codes(mesh.paint), colours = new Float32Array(9 * faces);
     for (let f = 0; f < faces; f++) for (let j = 0; j < 9; j++) colours[9 * f + j] = (mesh.palette[paint[f]] ?? [0.68, 0.72, 0.77])[j % 3];
     made.setAttribute("color", new THREE.BufferAttribute(colours, 3));
@@ -57,7 +57,7 @@ S.mesh = function (bytes, mesh) {
   return made;
 };
 
-// A sheet with a grid, faint towards its edge.
+// A sheet with a grid that fades towards its edge.
 S.sheet = function (half, step, round) {
   const uniforms = { ground: { value: new THREE.Color() }, lines: { value: new THREE.Color() }, extent: { value: half },
     cell: { value: step }, disc: { value: round ? 1 : 0 }, strength: { value: 1 } };
@@ -95,7 +95,7 @@ S.grid = function (surface) {
   return made;
 };
 
-// A surface that is no floor: translucent, seen from both sides.
+// A surface other than the floor: translucent, visible from both sides.
 S.surface = function (surface, step) {
   if (surface.kind === "plane") {
     const sheet = S.sheet(surface.half, step, true);
@@ -115,7 +115,7 @@ S.surface = function (surface, step) {
   const material = new THREE.MeshLambertMaterial({ transparent: !solid, opacity: solid ? 1 : 0.45, side: THREE.DoubleSide,
     depthWrite: solid, polygonOffset: true, polygonOffsetFactor: 1, polygonOffsetUnits: 2 });
   const made = new THREE.Mesh(geometry, material);
-  // What is one colour in flat light is seen by its edges.
+  // Edges make a solid of one colour visible.
   if (solid) made.add(new THREE.LineSegments(surface.kind === "box" ? new THREE.EdgesGeometry(geometry) : S.ruled(surface),
     new THREE.LineBasicMaterial({ transparent: true, opacity: 0.55 })));
   if (surface.q) made.quaternion.set(...S.xyzw(surface.q));
@@ -124,7 +124,7 @@ S.surface = function (surface, step) {
   return made;
 };
 
-// Lines of a grid of points, some ten each way, and its rim.
+// Lines of a grid of points, about ten in each direction, and its border.
 S.ruled = function ({ rows, columns, points }) {
   const found = [], step = Math.max(1, Math.round(Math.max(rows, columns) / 20)), on = (k, n) => k % step === 0 || k === n - 1;
   const add = (a, b) => { if (points[3 * a] !== null && points[3 * b] !== null) found.push(...points.slice(3 * a, 3 * a + 3), ...points.slice(3 * b, 3 * b + 3)); };
@@ -144,7 +144,7 @@ S.paint = function (made, colours) {
   for (const edges of made.children) edges.material.color.set(colours.edge);
 };
 
-// From where to where a surface reaches along a horizontal unit vector; a plane has no end and takes no room.
+// Extent of a surface along a horizontal unit vector; a plane is infinite and has no extent.
 S.extent = function (made, way) {
   const { surface } = made.userData, at = made.position.dot(way);
   const across = (k) => Math.abs(new THREE.Vector3().setComponent(k, 1).applyQuaternion(made.quaternion).dot(way));
@@ -173,7 +173,7 @@ S.extent = function (made, way) {
 
 S.xyzw = (q) => [q[1], q[2], q[3], q[0]];
 
-// A fat line through points (flat array of numbers).
+// A wide line through points (flat array of numbers).
 S.line = function (points, width, dashed) {
   const geometry = new THREE.LineGeometry();
   geometry.setPositions(points);

@@ -1,12 +1,12 @@
 "use strict";
-// Renderer, camera, light and floor. Draws only when something has changed.
+// Renderer, camera, light and floor. Draws only after a change.
 
 class Stage {
-  // The box in which everything moves is turned by the azimuth about z.
+  // The box in which everything moves is rotated by the azimuth about z.
   constructor(canvas, azimuth) {
     this.azimuth = azimuth;
     this.canvas = canvas;
-    // view.html#fine is drawn well without a graphics card too, and slowly.
+    // view.html#fine forces full quality (slow) without a graphics card.
     const software = Stage.software() && location.hash !== "#fine";
     this.renderer = new THREE.WebGLRenderer({ canvas, powerPreference: "high-performance", antialias: !software });
     this.software = software;
@@ -28,10 +28,10 @@ class Stage {
     new ResizeObserver(() => this.resize()).observe(canvas.parentElement);
   }
 
-  // Whether the browser draws without a graphics card: then edges are not smoothed and shadows are left out.
+  // Whether the browser draws without a graphics card; smooth edges and shadows are then disabled.
   static software() {
     const gl = document.createElement("canvas").getContext("webgl");
-    if (!gl) throw new Error("this browser has no WebGL, which 3D needs");
+    if (!gl) throw new Error("this browser has no WebGL, which 3D requires");
     const known = gl.getExtension("WEBGL_debug_renderer_info");
     const name = known ? gl.getParameter(known.UNMASKED_RENDERER_WEBGL) : "";
     gl.getExtension("WEBGL_lose_context")?.loseContext();
@@ -44,7 +44,7 @@ class Stage {
     this.sun.castShadow = on;
   }
 
-  // The box in which everything moves has changed: lights, floor and camera follow.
+  // Adapt lights, floor and camera to the box in which everything moves.
   settle(low, high, floor) {
     this.low.copy(low);
     this.high.copy(high);
@@ -59,9 +59,9 @@ class Stage {
     if (this.floor) this.scene.remove(this.floor, this.shade);
     this.step = Stage.round(span / 12);
     this.floor = S.sheet(1.5 * span, this.step, true);
-    // What is no surface of the scenario is only there to see by.
+    // A grid that is not a surface of the scenario only helps to judge positions.
     this.floor.material.uniforms.strength.value = this.real ? 1 : 0.4;
-    // Lines of the grid are at multiples of its step in the world.
+    // Grid lines are at multiples of the step in the world.
     const at = (x) => Math.round(x / (5 * this.step)) * 5 * this.step;
     this.floor.position.set(at(centre.x), at(centre.y), floor);
     this.shade = new THREE.Mesh(new THREE.PlaneGeometry(3 * span, 3 * span), new THREE.ShadowMaterial({ opacity: 0.18 }));
@@ -99,11 +99,11 @@ class Stage {
     this.touch();
   }
 
-  // Look from a direction, as near as the whole box fits the window.
+  // View from a direction, as close as the whole box fits into the window.
   look(preset) {
     this.preset = preset;
-    // Seen with the robot's longest way from left to right: that is x before the turn by the azimuth.
-    // A row of variants is seen more from the front, or its end would be far away.
+    // The longest extent of the robot, x before the rotation by the azimuth, is horizontal.
+    // A row of variants is viewed more from the front; otherwise its end would be far away.
     const from = { iso: this.row ? [-0.22, -1, 0.42] : [-0.5, -1, 0.5], side: [0, -1, 0.06], front: [1, 0, 0.06], top: [0, -0.001, 1] }[preset];
     const back = this.turned(new THREE.Vector3(...from).normalize()), centre = this.centre();
     const right = new THREE.Vector3().crossVectors(this.camera.up, back).normalize();
@@ -123,7 +123,7 @@ class Stage {
     this.touch();
   }
 
-  // Move with a point; what was between camera and point stays.
+  // Move with a point at constant distance.
   follow(point) {
     const step = point.clone().sub(this.controls.target);
     this.controls.target.add(step);
@@ -148,7 +148,7 @@ class Stage {
     this.changed = true;
   }
 
-  // Where a point of the world is in the window, null behind the camera.
+  // Position of a world point in the window; null behind the camera.
   project(point, out) {
     out.copy(point).project(this.camera);
     return out.z > 1 ? null : [(0.5 + 0.5 * out.x) * this.size[0], (0.5 - 0.5 * out.y) * this.size[1]];
