@@ -277,8 +277,8 @@ def exact_kernel(function: F) -> F:
 class FixedSignature:
     """Kernel that is called repeatedly with arguments of the same types as in the first call.
 
-    Numba checks the types of all arguments in each call; for a hundred tables that takes as long as many kernels do. Here
-    nothing is checked: an array of another type would be misread.
+    Numba checks the types of all arguments in each call; for a hundred tables that takes as long as many kernels do.
+    Here nothing is checked: an array of another type would be misread.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
