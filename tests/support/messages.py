@@ -53,6 +53,10 @@ PHRASES = {
     "pulling": "surface pulls",
     "slides": "slides",
     "unloaded": "a wheel carries nothing",
+    # Signs of a page.
+    "at voltage limit": "voltage limit",
+    "sunk sign": "joint or hand below a surface",
+    "wheel sign": "wheel on the ground",
 }
 
 
