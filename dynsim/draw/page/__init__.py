@@ -5,6 +5,6 @@
 It depends on records alone: simulated and measured ones are shown in the same way.
 """
 
-from dynsim.draw.page.content import Inline, page, viewable, write
+from dynsim.draw.page.content import Inline, page, show, viewable, write
 
-__all__ = ["Inline", "page", "viewable", "write"]
+__all__ = ["Inline", "page", "show", "viewable", "write"]
