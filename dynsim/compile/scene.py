@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from dynsim.model.description import Array, Contact, Link, Robot
+from dynsim.model.drives import Motor
 from dynsim.model.mobile_base import SUPPORTS, MobileBase
 from dynsim.model.surfaces import Box, HeightField, Quadric, Surface
 from dynsim.record.quaternion import of_turn
@@ -60,14 +61,24 @@ def robot_scene(robot: Robot, contacts: Sequence[Contact], surfaces: Mapping[str
         supports = _supports(robot.base, index[robot.base.body])
     for contact in contacts:
         body, point = robot.attach(contact.body, contact.point)
-        points.append(Point(contact.name, "contact", body, vector3(point), contact.surface_name))
+        friction = float(contact.friction_at_rest)
+        points.append(Point(contact.name, "contact", body, vector3(point), contact.surface_name, friction))
     return Scene(
         tuple(bodies),
         tuple(drawn_surface(name, surface) for name, surface in surfaces.items()),
         tuple(points),
         robot.fixed_shapes,
         supports,
+        resistance=_shared(motor.resistance for motor in robot.motors if isinstance(motor, Motor)),
+        voltage_limit=_shared(motor.voltage_limit for motor in robot.motors if isinstance(motor, Motor)),
     )
+
+
+def _shared(values: Iterable[float]) -> float | None:
+    """Return the finite value that all have in common, or None."""
+    different = set(values)
+    value = different.pop() if len(different) == 1 else math.inf
+    return float(value) if math.isfinite(value) else None
 
 
 def drawn_surface(name: str, surface: Surface) -> SceneSurface:

@@ -31,7 +31,7 @@ from dynsim.engine.gripper import (
     state_text,
 )
 from dynsim.engine.outcome import check_size, interrupted, raise_stopped
-from dynsim.engine.recording import provenance
+from dynsim.engine.recording import pictured_parts, provenance
 from dynsim.engine.snake_control import OBSTACLES, SnakeControl, control_periods, copy_of
 from dynsim.errors import ModelError, SimulationStopped
 from dynsim.jit.kernel import reals
@@ -575,7 +575,8 @@ def make_record(run: SnakeRun, scenario: Scenario, wall: float, pictured: bool =
         run.objects.add_to(record, trace.w, np.rint(time / period).astype(np.int64))
     if pictured:
         scene = snake_scene(description)
-        record.scene = scene if run.objects is None else run.objects.scene_with_objects(scene)
+        scene = scene if run.objects is None else run.objects.scene_with_objects(scene)
+        record.scene = pictured_parts(scene, scenario)
         add_body_poses(record)
     summary = {
         "scenario": scenario.name,

@@ -45,7 +45,7 @@ from dynsim.record.measures import (
     sinks,
 )
 from dynsim.record.poses import TOUCHING, add_body_poses, point_positions
-from dynsim.record.scene import Point, vector3
+from dynsim.record.scene import Grip, Point, Scene, vector3
 from dynsim.scenario import Scenario, build, to_yaml
 from dynsim.system.files import discard, json_text, replace_together, write_text
 from dynsim.system.memo import recall
@@ -456,6 +456,17 @@ def commit() -> str:
 SAME_END = 1e-9
 
 
+def pictured_parts(scene: Scene, scenario: Scenario) -> Scene:
+    """Return the scene with the parts that only the scenario names: objects, mesh folders and the gripper."""
+    plant, grip, tip = scenario.plant, None, 0.0
+    if (law := getattr(plant, "gripper", None)) is not None:
+        grip = Grip(law.capture_m, law.bound_N, law.turning_bound_N_m)
+        tip = 0.0 if plant.controlled_point == "gripper" else plant.gripper_length_m
+    files = (getattr(part, "file", None) for part in (plant, getattr(plant, "arm", None)))
+    folders = tuple(str(Path(file).parent) for file in files if file is not None)
+    return replace(scene, objects=tuple(scenario.config.objects or ()), mesh_folders=folders, grip=grip, tip=tip)
+
+
 def make_record(
     scenario: Scenario,
     prepared: Prepared,
@@ -539,7 +550,8 @@ def make_record(
     for event in happened:
         record.add_event(event.time, event.kind, event.name)
     if pictured:
-        record.scene = robot_scene(robot, contacts, build.surfaces(scenario))
+        scene = robot_scene(robot, contacts, build.surfaces(scenario))
+        record.scene = None if scene is None else pictured_parts(scene, scenario)
         if add_body_poses(record):
             _add_touching_points(record, robot, contacts)
     end = _end(record, prepared, pushed, begun, within=lost)

@@ -8,7 +8,6 @@ from __future__ import annotations
 import bisect
 import difflib
 import html
-import importlib
 import math
 import os
 from collections.abc import Iterable, Iterator, KeysView, Mapping
@@ -286,44 +285,8 @@ class Record:
             (name, "×".join(map(str, signal.data.shape)), signal.unit, signal.description)
             for name, signal in self.signals.items()
         ]
-        hint = "" if self.scene is None else "<p><code>record.view()</code> shows it in 3D.</p>"
+        hint = "" if self.scene is None else "<p><code>dynsim.view.show(record)</code> shows it in 3D.</p>"
         return table(repr(self)[1:-1], rows, hint)
-
-    def view(self, *others: Record, ghost: bool = False, height: int = 640) -> Any:
-        """Show the run in 3D, with plots over time; notebooks display the page inline.
-
-        Parameters
-        ----------
-        *others : Record
-            Records to show next to this one.
-        ghost : bool, optional
-            Overlay the other records on this one instead.
-        height : int, optional
-            Height of the frame in a notebook [pixel].
-
-        Returns
-        -------
-        dynsim.draw.page.Inline
-            The page, as an object that notebooks display.
-
-        Raises
-        ------
-        RecordError
-            If a record cannot be shown; see :func:`dynsim.view.page`.
-
-        Examples
-        --------
-        >>> import dynsim
-        >>> scenario = dynsim.load_scenario("elbow_comparison", overrides={"duration_s": 0.1})
-        >>> page = dynsim.simulate(scenario).view(height=400)
-        """
-        # By name, because dynsim.draw imports records, not vice versa.
-        page = importlib.import_module("dynsim.draw.page")
-        named: dict[str, Record] = {}
-        for record in (self, *others):
-            name = str(record.summary.get("variant") or "record")
-            named[name if name not in named else f"{name} {len(named) + 1}"] = record
-        return page.Inline(page.page(named, ghost=ghost), height)
 
     def keys(self) -> KeysView[str]:
         """Return the names of the signals.
@@ -353,6 +316,24 @@ class Record:
         scenario, robot = self.provenance.get("scenario"), self.provenance.get("robot")
         names = [scenario.get("name"), scenario.get("variant")] if isinstance(scenario, Mapping) else []
         return " / ".join(str(name) for name in names if name) or (f"{robot}, measured" if robot else "")
+
+    @property
+    def scenario_name(self) -> str:
+        """Name of the scenario; "" if unknown."""
+        scenario = self.provenance.get("scenario")
+        return str(scenario.get("name") or "") if isinstance(scenario, Mapping) else ""
+
+    @property
+    def measured(self) -> bool:
+        """Whether the record was measured on servos."""
+        return "scenario" not in self.provenance or "q_goal" in self
+
+    @property
+    def settle_time(self) -> float:
+        """Time before which tracking errors do not count [s]; 0 if unknown."""
+        scenario = self.provenance.get("scenario")
+        metrics = scenario.get("metrics") if isinstance(scenario, Mapping) else None
+        return float(metrics.get("settle_s", 0.0)) if isinstance(metrics, Mapping) else 0.0
 
     @property
     def units(self) -> dict[str, str]:

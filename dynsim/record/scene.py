@@ -266,6 +266,8 @@ class Point:
         Position in the frame of the body [m].
     surface : str
         Name of the surface that a contact point touches.
+    friction : float
+        Coefficient of the friction cone of a contact point, 0 if unknown.
     """
 
     __pydantic_config__: ClassVar[Any] = _CHECKS
@@ -274,6 +276,25 @@ class Point:
     body: int
     position: Vector3
     surface: str = ""
+    friction: float = 0.0
+
+
+@dataclass(frozen=True)
+class Grip:
+    """Soft gripper of a snake.
+
+    Attributes
+    ----------
+    capture : float
+        Largest distance to a grasp frame at which the gripper captures an object [m].
+    force, torque : float
+        Bounds on the force [N] and torque [N m] on a grasped object.
+    """
+
+    __pydantic_config__: ClassVar[Any] = _CHECKS
+    capture: float
+    force: float
+    torque: float
 
 
 @dataclass(frozen=True)
@@ -293,6 +314,16 @@ class Scene:
     supports : tuple of Point
         Ground contacts of a mobile base: left wheel, right wheel, caster. They are not in ``points``, so that older
         versions, which do not know their role, skip them.
+    objects : tuple of str
+        Names of the bodies that are objects, not parts of the robot.
+    resistance, voltage_limit : float or None
+        Resistance [ohm] and voltage limit [V] of the DC motors, if all have the same.
+    mesh_folders : tuple of str
+        Folders in which mesh files are searched for.
+    grip : Grip or None
+        Gripper of a snake.
+    tip : float
+        Distance of the tip of a snake's gripper ahead of the controlled point [m].
 
     Raises
     ------
@@ -306,6 +337,12 @@ class Scene:
     points: tuple[Point, ...] = ()
     fixed: tuple[Shape, ...] = ()
     supports: tuple[Point, ...] = ()
+    objects: tuple[str, ...] = ()
+    resistance: float | None = None
+    voltage_limit: float | None = None
+    mesh_folders: tuple[str, ...] = ()
+    grip: Grip | None = None
+    tip: float = 0.0
 
     def __post_init__(self) -> None:
         for k, body in enumerate(self.bodies):

@@ -99,3 +99,9 @@ def test_no_dependency_is_capped_without_a_reason() -> None:
     capped = [line for line in lines if ("<" in line or "==1" in line) and line.strip().startswith('"')]
     of_names = [line for line in capped if "python_version" not in line.split("<")[0]]
     assert [line for line in of_names if "#" not in line and "dynamixel-sdk" not in line] == []
+
+
+def test_pictures_read_no_keys_of_scenarios() -> None:
+    package = Path(dynsim.__file__).parent
+    reading = [path for path in (package / "draw").rglob("*.py") if "provenance" in path.read_text(encoding="utf-8")]
+    assert reading == []

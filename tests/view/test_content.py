@@ -389,7 +389,7 @@ def test_commands_write_pages(
 
 
 def test_notebooks(braced: Record, tmp_path: Path) -> None:
-    shown = braced.view(braced, ghost=True, height=400)
+    shown = dynsim.view.show(braced, braced, ghost=True, height=400)
     frame = shown._repr_html_()
     match = re.search(r'srcdoc="([^"]*)"', frame)
     assert match is not None

@@ -601,7 +601,9 @@ def test_a_single_sample_and_a_stranger(opened: Opens) -> None:
 
 
 def test_a_notebook_shows_the_page(braced: Record, browser: Any, tmp_path: Path) -> None:
-    (tmp_path / "notebook.html").write_text(f"<!DOCTYPE html><body>{braced.view()._repr_html_()}</body>", "utf-8")
+    (tmp_path / "notebook.html").write_text(
+        f"<!DOCTYPE html><body>{dynsim.view.show(braced)._repr_html_()}</body>", "utf-8"
+    )
     context = browser.new_context(offline=True)
     page = context.new_page()
     complaints: list[str] = []

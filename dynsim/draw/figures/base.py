@@ -44,7 +44,7 @@ def overturning(record: Record) -> Figure | None:
     bare = np.asarray(np.isnan(traction).any(axis=1))
     demanded = np.minimum(traction, TRACTION_TOP)
     series = [loads, np.maximum(margin, MARGIN_LOW), demanded]
-    rows = style.time_rows(figure, [[(record.time, values)] for values in series], style.settle_time(record))
+    rows = style.time_rows(figure, [[(record.time, values)] for values in series], record.settle_time)
     for axes in rows[0]:
         _lines(axes, record, LOADS, "min {} N", np.nanmin)
         style.shade_below_zero(axes, "wheel pulls on the ground")
@@ -84,7 +84,7 @@ def margin_comparison(records: Mapping[str, Record]) -> Figure | None:
         style.comparison_title(some, "tip margin (1: safest, 0: tips over)"),
     )
     series = [(record.time, np.maximum(record[MARGIN], MARGIN_LOW)) for record in some]
-    (panels,) = style.time_rows(figure, [series], max(map(style.settle_time, some)))
+    (panels,) = style.time_rows(figure, [series], max(record.settle_time for record in some))
     styles = style.variant_styles(list(records))
     colours = {name: str(look["color"]) for name, look in styles.items()}
     for axes in panels:
@@ -118,7 +118,7 @@ def tracking(record: Record) -> Figure | None:
         parts = {"position [m]": np.hstack([target[:, :2], pose[:, :2]]), "heading [°]": heading, **parts}
     subject = "stationary base: actual − reference" if is_stationary else "base, reference and actual"
     figure = style.new_figure(0.6 + 1.5 * len(parts), style.title(record, subject))
-    grid = style.time_rows(figure, [[(record.time, values)] for values in parts.values()], style.settle_time(record))
+    grid = style.time_rows(figure, [[(record.time, values)] for values in parts.values()], record.settle_time)
     rows = dict(zip(parts, grid, strict=True))
     for name, panels in rows.items():
         for axes in panels:
@@ -176,7 +176,7 @@ def _verdict(record: Record) -> str:
     if not times:
         return "never tips over"
     more = f"{len(times)} times, first " if len(times) > 1 else ""
-    settle = style.settle_time(record)
+    settle = record.settle_time
     if record.time[-1] > settle and overturns_settled(record, settle) is None:
         return f"only the initial transient is below zero, {more}at {style.number(times[0], 3)} s"
     return f"tips over {more}at {style.number(times[0], 3)} s"
@@ -184,7 +184,7 @@ def _verdict(record: Record) -> str:
 
 def _margin_label(name: str, record: Record) -> str:
     """Return a label with the minimum margin after the start, and whether the base tips."""
-    settle = style.settle_time(record)
+    settle = record.settle_time
     late = record[MARGIN][record.time >= settle]
     least = f" min {style.number(float(np.nanmin(late)), 3)} from {settle:g} s on;" if np.isfinite(late).any() else ""
     return f"{name}:{least} {_verdict(record)}"

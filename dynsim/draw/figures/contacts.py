@@ -157,7 +157,7 @@ def _forces(records: Mapping[str, Record], title: str) -> Figure | None:
     figure = style.new_figure(1.0 + ROW * len(chosen) + more, title + note)
     series = [[values for r in having[name].values() for values in _series(r, name)] for name in chosen]
     styles = style.variant_styles(list(records))
-    rows = style.time_rows(figure, series, max(map(style.settle_time, runs)))
+    rows = style.time_rows(figure, series, max(run.settle_time for run in runs))
     for name, panels in zip(chosen, rows, strict=True):
         # Events of the transient panel would overlap each other in the panel of the whole run.
         begun = panels[0].get_xlim()[1] if len(panels) > 1 else -np.inf

@@ -247,13 +247,13 @@ def motors(record: Record) -> Figure | None:
     signals = (("current", "current [A]"), ("voltage", "voltage [V]"))
     count = record["current"].shape[1]
     # Selected by the current after the start, when all motors are active; the same motors in both panels.
-    settled = record.time >= style.settle_time(record)
+    settled = record.time >= record.settle_time
     late = settled if settled.any() else slice(None)
     effort = np.sqrt((record["current"][late] ** 2).mean(axis=0))
     shown = np.arange(count) if count <= LARGEST else np.sort(np.argsort(effort)[::-1][:LARGEST])
     figure = style.new_figure(4.4, style.title(record, "motor currents and voltages"))
     rows = style.time_rows(
-        figure, [[(record.time, record[name])] for name, _ in signals], style.settle_time(record), compress=True
+        figure, [[(record.time, record[name])] for name, _ in signals], record.settle_time, compress=True
     )
     looks = style.variant_styles(shown.tolist())
     for (name, label), panels in zip(signals, rows, strict=True):
@@ -332,7 +332,7 @@ def error(record: Record) -> Figure | None:
     norm = np.linalg.norm(deviation, axis=1)
     figure = style.new_figure(4.1, style.title(record, "tracking error"))
     series = [[(record.time, deviation)], [(record.time, norm)]]
-    rows = style.time_rows(figure, series, style.settle_time(record))
+    rows = style.time_rows(figure, series, record.settle_time)
     looks = style.variant_styles("xyz")
     for axes in rows[0]:
         for k, name in enumerate("xyz"):
@@ -360,7 +360,7 @@ def error_comparison(records: Mapping[str, Record]) -> Figure | None:
     deviations = {name: MILLI * (record["hand_position"] - hand_target(record)) for name, record in shown.items()}
     norms = {name: np.linalg.norm(deviation, axis=1) for name, deviation in deviations.items()}
     styles = style.variant_styles(list(records))
-    settle = max(map(style.settle_time, shown.values()))
+    settle = max(record.settle_time for record in shown.values())
     series = [[(r.time, norms[name]) for name, r in shown.items()]]
     series += [[(r.time, deviations[name][:, 2]) for name, r in shown.items()]]
     rows = style.time_rows(figure, series, settle)
@@ -457,14 +457,14 @@ def _legend_below(figure: Figure, axes: Axes) -> None:
 
 
 def _error_label(name: str, record: Record) -> str:
-    settle = style.settle_time(record)
+    settle = record.settle_time
     rms = hand_error(record, settle)["hand_error_rms_m"]
     return name if rms is None or not np.isfinite(rms) else f"{name}: rms {MILLI * rms:.3g} mm from {settle:g} s on"
 
 
 def _mark_settle(panels: Sequence[Axes], record: Record) -> None:
     """Draw a line at the settling time in every panel; only the first has a legend entry, away from the curves."""
-    settle = style.settle_time(record)
+    settle = record.settle_time
     if max(0.0, record.time[0]) < settle < min(float(record.time[-1]), panels[0].get_xlim()[1]):
         for axes in panels:
             label = f"settled from {settle:g} s on" if axes is panels[0] else None

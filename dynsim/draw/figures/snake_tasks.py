@@ -79,7 +79,7 @@ def servos(record: Record) -> Figure:
 
 def gripper(record: Record) -> Figure:
     """Draw the distance to the grasp frame, and forces and torques on the grasped object with their bounds."""
-    config = record.provenance["scenario"]["plant"].get("gripper", {})
+    grip = None if record.scene is None else record.scene.grip
     forces = _held_forces(record)
     rows = 1 if forces is None else 3
     figure = style.new_figure(1.3 + 1.7 * rows, style.title(record, "the gripper"))
@@ -87,15 +87,17 @@ def gripper(record: Record) -> Figure:
     axes[0].plot(record.time, np.maximum(1e3 * record["grasp_distance"], LEAST), color=BODY, label="distance")
     style.log_axis(axes[0])
     axes[0].set_ylabel("to the nearest\ngrasp frame [mm]")
-    if (capture := config.get("capture_m")) is not None:
-        axes[0].axhline(1e3 * capture, color=HEAD, ls="--", lw=0.9, label=f"captures within {1e3 * capture:g} mm")
+    if grip is not None:
+        label = f"captures within {1e3 * grip.capture:g} mm"
+        axes[0].axhline(1e3 * grip.capture, color=HEAD, ls="--", lw=0.9, label=label)
     if forces is not None:
-        parts = (("force [N]", "N", "bound_N", ""), ("torque [N m]", "N m", "turning_bound_N_m", "about "))
-        for axis, values, (label, unit, key, about) in zip(axes[1:], np.split(forces, 2, axis=1), parts, strict=True):
+        bounds = (None, None) if grip is None else (grip.force, grip.torque)
+        parts = (("force [N]", "N", bounds[0], ""), ("torque [N m]", "N m", bounds[1], "about "))
+        for axis, values, (label, unit, bound, about) in zip(axes[1:], np.split(forces, 2, axis=1), parts, strict=True):
             for name, column in zip("xyz", values.T, strict=True):
                 axis.plot(record.time, column, color=style.AXIS_COLOURS[name], label=f"{about}{name}")
             style.at_least(axis, 1e-3)
-            if (bound := config.get(key)) is not None:
+            if bound is not None:
                 _both(axis, bound, f"bound {bound:g} {unit}", color=HEAD, ls="--", lw=0.9)
             axis.set_ylabel(label)
     _finish(axes, record)
@@ -159,10 +161,8 @@ def _followed(record: Record, w: Array, body: int) -> Array:
     assert record.scene is not None
     joint = record.scene.bodies[body].joint
     axis = rotated(record[ORIENTATION][0, body].astype(float), np.array(joint.axis))
-    plant = record.provenance["scenario"]["plant"]
     turn = product(product(of_turn([0, 0, 1], w[:, 5]), of_turn([0, 1, 0], w[:, 4])), of_turn([1, 0, 0], w[:, 3]))
-    ahead = 0.0 if plant.get("controlled_point") == "gripper" else plant.get("gripper_length_m", 0.0)
-    tip = w[:, :3] + ahead * rotated(turn, np.array([1.0, 0.0, 0.0])).T
+    tip = w[:, :3] + record.scene.tip * rotated(turn, np.array([1.0, 0.0, 0.0])).T
     if joint.kind == "prismatic":
         return np.asarray((tip - tip[0]) @ axis)
     arm = tip - record[POSITION][0, body]
@@ -184,7 +184,8 @@ def _joint_loads(record: Record, name: str) -> dict[str, Array]:
 
 
 def _loaded(axis: Axes, record: Record, name: str, loads: dict[str, Array]) -> None:
-    hinge = record.provenance["scenario"]["objects"][name].get("hinge")
+    assert record.scene is not None
+    hinge = record.scene.bodies[object_bodies(record)[name]].joint.kind == "revolute"
     for (text, values), colour in zip(loads.items(), (style.ORANGE, style.PURPLE), strict=False):
         axis.plot(record.time, values, color=colour, label=text)
     style.at_least(axis, 1e-3)

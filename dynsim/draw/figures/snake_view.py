@@ -39,9 +39,9 @@ SMALL = 6.5
 
 def object_bodies(record: Record) -> dict[str, int]:
     """Return names and bodies of the objects whose poses are in the record."""
-    names = record.provenance.get("scenario", {}).get("objects") or {}
-    bodies = () if record.scene is None or POSITION not in record else record.scene.bodies
-    return {body.name: k for k, body in enumerate(bodies) if body.name in names}
+    if record.scene is None or POSITION not in record:
+        return {}
+    return {body.name: k for k, body in enumerate(record.scene.bodies) if body.name in record.scene.objects}
 
 
 class View:

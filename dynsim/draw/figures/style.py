@@ -143,7 +143,7 @@ def title(record: Record, subject: str) -> str:
 
 def comparison_title(records: Sequence[Record], subject: str) -> str:
     """Return a title with the scenario of the variants."""
-    return f"{records[0].provenance.get('scenario', {}).get('name', '') or 'comparison'}: {subject}"
+    return f"{records[0].scenario_name or 'comparison'}: {subject}"
 
 
 def variant_styles(names: Sequence[T]) -> dict[T, dict[str, Any]]:
@@ -212,11 +212,6 @@ def legend_below(figure: Figure, panels: Sequence[Axes], columns: int) -> None:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             named.setdefault(label, handle)
     figure.legend(named.values(), named.keys(), loc="outside lower center", ncols=min(len(named), columns))
-
-
-def settle_time(record: Record) -> float:
-    """Return ``metrics.settle_s`` of the scenario of a record [s]."""
-    return float(record.provenance.get("scenario", {}).get("metrics", {}).get("settle_s", 0.0))
 
 
 def sparse(points: Array) -> Array:

@@ -399,9 +399,8 @@ class Film:
             for k, (name, robot) in enumerate(shown.items())
         }
         first = next(iter(kept.values()))
-        name = first.provenance.get("scenario", {}).get("name", "")
         title = titled(first, "").replace(":  (", " (").rstrip(": ")
-        self._title = plain(str(name) if len(some) > 1 else title)
+        self._title = plain(first.scenario_name if len(some) > 1 else title)
 
     def frame(self, time: float) -> Image.Image:
         """Return the frame at a time.

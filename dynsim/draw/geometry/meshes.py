@@ -6,7 +6,7 @@ import io
 import itertools
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -163,9 +163,7 @@ class Meshes:
 
     def of_robot(self, record: Record) -> None:
         """Search for further meshes in the folders of the robot of this record."""
-        scenario = record.provenance.get("scenario", {})
-        files = named(scenario.get("plant", {}) if isinstance(scenario, Mapping) else {}, "file")
-        self._folders = tuple(Path(file).parent for file in files if isinstance(file, str))
+        self._folders = () if record.scene is None else tuple(map(Path, record.scene.mesh_folders))
 
     def index(self, file: str) -> int | None:
         """Return the index of a mesh on the page, or None if it is not found or cannot be read."""
@@ -307,15 +305,3 @@ def _joined(parts: Sequence[Mesh]) -> Mesh:
         np.concatenate([part.triangles + start for part, start in zip(parts, starts, strict=False)]),
         np.concatenate(colours) if colours else None,
     )
-
-
-def named(tree: Any, key: str) -> Iterator[Any]:
-    """Yield the values of a key anywhere in a tree."""
-    if isinstance(tree, Mapping):
-        for name, value in tree.items():
-            if name == key:
-                yield value
-            yield from named(value, key)
-    elif isinstance(tree, (list, tuple)):
-        for value in tree:
-            yield from named(value, key)

@@ -229,8 +229,7 @@ def contacts(robot: DrawnRobot, rows: NDArray[np.intp] | slice = slice(None)) ->
         if "contact_force" in record:
             tangent = record["contact_force"][rows, k] - force[:, None] * normal
         shaped = TOUCHING in record and point.name in record.labels[TOUCHING]
-        friction = _friction(record, point.name)
-        result.append(DrawnContact(point, friction, normal, force, tangent, mode, at if shaped else None))
+        result.append(DrawnContact(point, point.friction, normal, force, tangent, mode, at if shaped else None))
     return result
 
 
@@ -284,14 +283,3 @@ def largest_force(contacts: Sequence[DrawnContact]) -> float:
     sizes = np.abs(np.concatenate([contact.force for contact in contacts])) if contacts else np.zeros(0)
     sizes = sizes[np.isfinite(sizes)]
     return max(float(np.percentile(sizes, 98.0)) if len(sizes) else 1.0, 1e-6)
-
-
-def _friction(record: Record, name: str) -> float:
-    """Return the coefficient of the friction cone of a contact, 0 if unknown."""
-    contacts = record.provenance.get("scenario", {}).get("contacts", {})
-    points = contacts.get("points") or {}
-    point = points.get(name, {}) if isinstance(points, Mapping) else {}
-    kinetic = [entry.get("friction") for entry in (point, contacts)]
-    static = [entry.get("static_friction") for entry in (point, contacts)]
-    known = [next((float(value) for value in both if value is not None), 0.0) for both in (kinetic, static)]
-    return max(known)

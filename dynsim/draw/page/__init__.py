@@ -4,6 +4,6 @@ The page contains scene, data and program, and works in any browser without a ne
 simulated and measured records are shown in the same way. See :mod:`dynsim.draw.page.content`.
 """
 
-from dynsim.draw.page.content import Inline, page, viewable, write
+from dynsim.draw.page.content import Inline, page, show, viewable, write
 
-__all__ = ["Inline", "page", "viewable", "write"]
+__all__ = ["Inline", "page", "show", "viewable", "write"]

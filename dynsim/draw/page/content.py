@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from dynsim._version import __version__
 from dynsim.draw.film.painter import view_axes
-from dynsim.draw.geometry.meshes import Mesh, Meshes, named, simplified
+from dynsim.draw.geometry.meshes import Mesh, Meshes, simplified
 from dynsim.draw.geometry.robot import (
     POSE_ERROR,
     DrawnRobot,
@@ -197,7 +197,7 @@ def _record(name: str, robot: DrawnRobot, blocks: Blocks, meshes: Meshes, low: A
     part: dict[str, Any] = {
         "name": name,
         "title": record.title or "record",
-        "measured": "scenario" not in record.provenance or "q_goal" in record,
+        "measured": record.measured,
         "complete": bool(record.complete),
         "radius": thinnest(shapes),
         "reach": robot.reach,
@@ -218,7 +218,7 @@ def _record(name: str, robot: DrawnRobot, blocks: Blocks, meshes: Meshes, low: A
         "supports": supports(scene, groups),
         "motors": _motors(record, scene),
         "names": scene.wheel_names,
-        "limit": shared(record, "voltage_limit_V"),
+        "limit": scene.voltage_limit,
         "resistance": resistance(record),
         "events": [[event.time, event.kind, event.name, _finite(event.value)] for event in record.events],
     }
@@ -270,16 +270,9 @@ def _motors(record: Record, scene: Scene) -> list[list[Any]]:
     return [[name, body] for name, body in places if body is not None]
 
 
-def shared(record: Record, key: str) -> float | None:
-    """Return the value of a key that all motors of the scenario share, or None."""
-    values = named(record.provenance.get("scenario", {}).get("plant", {}), key)
-    numbers = {float(value) for value in values if isinstance(value, (int, float))}
-    return _finite(numbers.pop()) if len(numbers) == 1 else None
-
-
 def resistance(record: Record) -> float | None:
     """Return the resistance R that all motors share [Ω] if R ∫ Σ i² dt equals the recorded heat, or None."""
-    R = shared(record, "resistance_ohm")
+    R = None if record.scene is None else record.scene.resistance
     if R is None or not {"current", "heat_joule"} <= set(record) or len(record) < 2:
         return None
     heat = float(record["heat_joule"][-1] - record["heat_joule"][0])
@@ -530,3 +523,38 @@ class Inline:
         with replacing(Path(path)) as stream:
             stream.write(self.page.encode("utf-8", errors="replace"))
         return Path(path)
+
+
+def show(*records: Record, ghost: bool = False, height: int = 640) -> Inline:
+    """Show records in 3D, with plots over time; notebooks display the page inline.
+
+    Parameters
+    ----------
+    *records : Record
+        Records to show, side by side.
+    ghost : bool, optional
+        Overlay the records after the first one on it instead.
+    height : int, optional
+        Height of the frame in a notebook [pixel].
+
+    Returns
+    -------
+    Inline
+        The page, as an object that notebooks display.
+
+    Raises
+    ------
+    RecordError
+        If a record cannot be shown, see :func:`page`.
+
+    Examples
+    --------
+    >>> import dynsim
+    >>> scenario = dynsim.load_scenario("elbow_comparison", overrides={"duration_s": 0.1})
+    >>> shown = dynsim.view.show(dynsim.simulate(scenario), height=400)
+    """
+    named: dict[str, Record] = {}
+    for record in records:
+        name = str(record.summary.get("variant") or "record")
+        named[name if name not in named else f"{name} {len(named) + 1}"] = record
+    return Inline(page(named, ghost=ghost), height)
