@@ -15,7 +15,7 @@ NAMES = [name for name in dynsim.__all__ if not name.startswith("_")]
 
 
 def public_parts(name: str) -> Iterator[tuple[str, Any]]:
-    """Yield a public object, and the public methods of a class or the public functions of a module, with dotted names."""
+    """Yield a public object, then methods of a class or functions of a module, with dotted names."""
     thing = getattr(dynsim, name)
     yield name, thing
     if inspect.isclass(thing):
