@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from combinations.running import Run
-from combinations.sampled_loop import UNSTABLE
+from combinations.sentences import GROWTH_PER_PERIOD, NOT_UNIQUE, SHARED, UNSTABLE
 from dynsim import simulate
 from dynsim.errors import DynsimError, SimulationStopped
 from dynsim.record import Record
@@ -41,17 +41,8 @@ SURE = 10.0
 # Samples by which an impact may be early or late.
 JUMPS = 3
 ENERGIES = ("energy_electrical", "heat_joule", "heat_friction", "loss_impact", "energy_kinetic", "energy_potential")
-# Parts of warnings that report a motion which is not unique.
-NOT_UNIQUE = (
-    "leave the motion open",
-    "the motion is not unique",
-    "other choices may move otherwise",
-    "chatter",
-    "turns its own force against it",
-)
-# Part of warnings about shared forces, which methods may split differently; if elbows slide, or bodies
-# land on several points, the split of forces changes the motion slightly.
-NOT_UNIQUE_FORCES, SPLIT_SHARE = "shared forces", 0.03
+# The split of forces changes the motion a little if elbows slide, or bodies land on several points.
+SPLIT_SHARE = 0.03
 
 
 @dataclass(frozen=True)
@@ -124,7 +115,7 @@ def _steps(run: Run) -> tuple[int, int]:
 
 def _of_rounding(run: Run, time: Array) -> Array:
     """Return the share by which rounding changes a run with a sampled loop that is unstable, until each time, (T,)."""
-    match = re.search(rf"{UNSTABLE}.*?deviations grow (\S+) times per period", " ".join(run.warnings))
+    match = re.search(GROWTH_PER_PERIOD, " ".join(run.warnings))
     if match is None or run.resolved is None:
         return np.zeros(len(time))
     ticks = time / run.resolved.resolved["controller"]["sample_time_s"]
@@ -249,7 +240,7 @@ def _promised(run: Run, other: Run) -> Any:
         else:
             share += ADAPTIVE_SHARE * options.rtol
 
-    if any(NOT_UNIQUE_FORCES in warning for own in (run, other) for warning in own.warnings):
+    if any(SHARED in warning for own in (run, other) for warning in own.warnings):
         share += SPLIT_SHARE
 
     def allowed(measure: Measure, time: Array) -> Array:

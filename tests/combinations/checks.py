@@ -21,8 +21,8 @@ from combinations.energy import ledger, losses, powers
 from combinations.newton import circuit, equation, momentum, motion, support
 from combinations.observed import Observed, warned
 from combinations.running import Run
-from combinations.sampled_loop import UNSTABLE
-from combinations.verdicts import WEDGED, untrue, untrue_start
+from combinations.sentences import JUMPS, MOVED, OTHER_FORCES, SLIPS_AT_START, UNSTABLE, WEDGED
+from combinations.verdicts import untrue, untrue_start
 from dynsim.errors import SimulationStopped
 from dynsim.model.drives import Motor, Servo
 from dynsim.scenario import build
@@ -126,7 +126,7 @@ def start(seen: Observed) -> Finding:
         allowed += _pressed_by(seen)
     warned_of = np.zeros_like(free)
     for warning in seen.run.warnings:
-        if (moved := re.match("initial.equilibrium: moves (.+) from the requested posture", warning)) is not None:
+        if (moved := re.match(MOVED, warning)) is not None:
             for joint, index in places.items():
                 warned_of[index] = warned_of[index] or f"{joint} by " in moved[1]
     free |= warned_of
@@ -197,10 +197,10 @@ def equilibrium(seen: Observed) -> Finding:
     if planned and (controller.get("joints") or controller.get("hand")):
         return
     # References and torques that jump at the start are reported by a warning.
-    if warned(seen, "that jumps at the start all the same") or warned(seen, "the start slips at"):
+    if warned(seen, JUMPS) or warned(seen, SLIPS_AT_START):
         return
     # Wedged points may rest or leave: in the run they leave, and a warning reports it.
-    if warned(seen, "contacts with other forces than at rest"):
+    if warned(seen, OTHER_FORCES):
         return
     size = np.abs(seen.vdot[0])
     # The limit is far below the acceleration of a falling joint.

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from combinations.observed import OPEN, SLIDING, STICKING, Observed, Touch, warned
+from combinations.sentences import DRIFTED, IMMOBILE
 from dynsim.model.surfaces import HeightField
 
 Array = NDArray[np.float64]
@@ -273,14 +274,14 @@ def gaps(seen: Observed) -> Finding:
         name, contact = touch.contact.name, touch.contact
         if not seen.real:
             worst = int(np.abs(touch.gap).argmax())
-            if abs(touch.gap[worst]) > DRIFT and not warned(seen, "contacts drifted"):
+            if abs(touch.gap[worst]) > DRIFT and not warned(seen, DRIFTED):
                 yield (
                     f"{name} at t = {seen.time[worst]:.6g} s is {touch.gap[worst]:+.3g} m off the surface that it is "
                     f"glued to"
                 )
             continue
-        # A point that no joint moves along the normal is excluded from the contacts, with a warning.
-        if f"{name}: no joint moves this point along the normal" in " ".join(seen.run.warnings):
+        # A point that no joint moves along the normal is left out of the contacts, with a warning.
+        if f"{name}{IMMOBILE}" in " ".join(seen.run.warnings):
             continue
         deepest = int(touch.gap.argmin())
         sag = 2.0 * np.abs(touch.normal_force).max() / contact.stiffness if contact.stiffness > 0.0 else 0.0

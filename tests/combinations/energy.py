@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from combinations.newton import integral_error, jumps_at_ticks
 from combinations.observed import OPEN, STICKING, Observed, warned, whole_steps
+from combinations.sentences import FRICTION_GIVES, LEDGER
 from dynsim.model.drives import Motor, Servo, TorqueSource
 
 Array = NDArray[np.float64]
@@ -46,7 +47,7 @@ def ledger(seen: Observed) -> Finding:
     reported = float(record.summary["energy_residual_relative"])
     if abs(relative - reported) > 0.01 * max(relative, reported) + 1e-12:
         yield f"the residual is {relative:.3e} of the turnover by the signals, {reported:.3e} in the summary"
-    if relative > RESIDUAL and not warned(seen, "the energy ledger does not close"):
+    if relative > RESIDUAL and not warned(seen, LEDGER):
         yield f"the ledger does not close: {relative:.3e} of the turnover, without a warning"
 
 
@@ -68,7 +69,7 @@ def losses(seen: Observed) -> Finding:
         fall = -np.diff(loss)
         # Rates of sticking points are solved to 1e-8 m/s only; dense output within a step is as accurate as the step.
         allowed = (1e-7 if seen.stepped else seen.scenario.integrator.rtol) * turnover + 1e-12
-        if fall.size and fall.max() > allowed and not warned(seen, "friction has put"):
+        if fall.size and fall.max() > allowed and not warned(seen, FRICTION_GIVES):
             yield f"{name} falls by {fall.max():.3g} J at t = {seen.time[int(fall.argmax()) + 1]:.6g} s"
 
 

@@ -6,6 +6,16 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from combinations.sentences import (
+    CANNOT_DRIVE,
+    COUPLED,
+    DO_NOT_BRING,
+    NO_WAYPOINTS,
+    NOTHING_HOLDS,
+    OFF_SURFACE,
+    REFERENCES_OFF,
+)
+
 Levels = Mapping[str, str]
 
 # The method is not a factor: each scene is run by all methods that support it, see :func:`methods`.
@@ -92,52 +102,52 @@ STEPPED = "only time stepping has it"
 
 REFUSALS: tuple[Refusal, ...] = (
     # Feature × law.
-    _refuse("under the glued law joints do not rest", r"dry friction of joints \(.*\) requires contacts.law",
+    _refuse("under the glued law joints do not rest", r"contacts\.law: unilateral",
             contact=GLUED, rubbing=("bearing", "gear", "both")),
-    _refuse("a glued point has one coefficient", r"requires contacts.law: unilateral",
+    _refuse("a glued point has one coefficient", r"contacts\.law: unilateral",
             contact=GLUED, friction=("static", "stribeck", "viscous", "grip")),
-    _refuse("what is glued does not bounce or give way", r"requires contacts.law: unilateral",
+    _refuse("what is glued does not bounce or give way", r"contacts\.law: unilateral",
             contact=GLUED, give=("restitution", "compliant")),
     # Feature × method.
-    _refuse(STEPPED, r"grip: requires integrator.method: time_stepping",
+    _refuse(STEPPED, r"grip: .*integrator\.method: time_stepping",
             friction="grip", method=("auto", "dopri5", "radau5")),
-    _refuse(STEPPED, r"stiffness_N_per_m.*: requires integrator.method: time_stepping",
+    _refuse(STEPPED, r"stiffness_N_per_m.*: .*integrator\.method: time_stepping",
             give="compliant", method=("auto", "dopri5", "radau5")),
-    _refuse(STEPPED, r"ties.*requires (contacts.law: unilateral|integrator.method: time_stepping)",
+    _refuse(STEPPED, r"ties.*(contacts\.law: unilateral|integrator\.method: time_stepping)",
             ties=("linear", "torsion", "bounded"), method=("auto", "dopri5", "radau5")),
-    _refuse("time stepping solves with articulated sweeps", r"integrator.solver.*requires integrator.method: auto",
+    _refuse("time stepping solves with articulated sweeps", r"integrator\.solver.*integrator\.method: auto",
             solver="m_star", method="time_stepping"),
     # Law or plant × method.
-    _refuse("time stepping has the unilateral law alone", r"requires contacts.law: unilateral",
+    _refuse("time stepping has the unilateral law alone", r"contacts\.law: unilateral",
             contact=GLUED, method="time_stepping"),
-    _refuse("time stepping locates no overturning", r"mobile base",
+    _refuse("time stepping locates no overturning", r"integrator\.method: .*integrator\.method: auto",
             plant="mobile", method="time_stepping"),
     # These scenes would run slowly without tyres, until contacts contradict each other.
     _refuse("how the rigid wheels of a snake share its weight is not determined", "",
             plant="snake", method=("auto", "dopri5", "radau5")),
     # Plant × feature.
     _refuse("a snake stands on its wheels", "", plant="snake", contact=GLUED),
-    _refuse("a snake has a controller of its own", r"cannot drive a 'snake'",
+    _refuse("a snake has a controller of its own", r"'snake'",
             plant="snake", controller=("hold", "waypoints", "hand_path", "torques", "gravity", "pressing")),
     _refuse("a snake starts raised from below", r"", plant="snake",
             start=("on_surface", "on_references", "equilibrium")),
     _refuse("the joints of a snake are servos on position", r"", plant="snake",
             motor=("none", "partly", "published", "dc", "velocity", "torque")),
-    _refuse("the postures of coupled joints are those of their file", r"not for robots with coupled joints",
+    _refuse("the postures of coupled joints are those of their file", COUPLED,
             plant="mimic", start=("on_surface", "equilibrium")),
-    _refuse("nothing holds what floats", r"nothing holds this posture",
+    _refuse("nothing holds what floats", NOTHING_HOLDS,
             plant="floating", start="equilibrium", contact=("nothing", "free", "glued")),
-    _refuse("nothing holds a free body", r"nothing holds this posture",
+    _refuse("nothing holds a free body", NOTHING_HOLDS,
             objects=("box", "sphere", "cart"), start="equilibrium", contact=GLUED),
     # The refusal does not apply if friction or braces hold all joints.
     _refuse("such motors hold no posture", "", motor=("none", "velocity"), start="equilibrium"),
     _refuse("such motors hold no posture", "", controller="none", start="equilibrium"),
     # Motor × controller.
-    _refuse("a plan of voltages needs a DC motor at each joint", r"DC motor", motor=(
+    _refuse("a plan of voltages needs a DC motor at each joint", r"\bDC\b", motor=(
         "none", "partly", "servo", "velocity", "torque"), controller=PLANNED),
-    _refuse("a plan of voltages needs a DC motor at each joint", r"DC motor",
+    _refuse("a plan of voltages needs a DC motor at each joint", r"\bDC\b",
             plant=("floating", "planar", "mimic"), controller=PLANNED),
-    _refuse("a plan of voltages needs a DC motor at each joint, those of objects too", r"DC motor",
+    _refuse("a plan of voltages needs a DC motor at each joint, those of objects too", r"\bDC\b",
             objects=("box", "sphere", "hinge", "cart"), controller=PLANNED),
     _refuse("torques are of motors of that type", r"torque", motor=(
         "none", "partly", "published", "dc", "servo", "velocity"), controller="torques"),
@@ -147,24 +157,24 @@ REFUSALS: tuple[Refusal, ...] = (
             controller=("waypoints", "hand_path", "operator")),
     # Motor × friction of the gear.
     _refuse("there is no gear", "", motor=("none", "torque"), rubbing=("gear", "both")),
-    _refuse("what presses starts on its surface", r"the references take .* off surface",
+    _refuse("what presses starts on its surface", REFERENCES_OFF,
             controller="pressing", start="above"),
     # Start × others.
-    _refuse("no joint has waypoints", r"no joint has waypoints|cannot drive", start="on_references",
+    _refuse("no joint has waypoints", f"{NO_WAYPOINTS}|{CANNOT_DRIVE}", start="on_references",
             controller=("none", "operator", "torques")),
-    _refuse("no joint follows waypoints", r"no joint has waypoints|motor", start="on_references",
+    _refuse("no joint follows waypoints", f"{NO_WAYPOINTS}|motor", start="on_references",
             motor=("none", "torque")),
-    _refuse("a glued point starts on its surface", r"from surface", start="above", contact="glued"),
+    _refuse("a glued point starts on its surface", OFF_SURFACE, start="above", contact="glued"),
     _refuse("no declared point", r"brace|contact", controller="pressing", contact=("nothing", "free")),
 )  # fmt: skip
 
 
 # Errors of a start that depend on the numbers of a scene, so that only dynsim can find them.
 STARTS = {
-    "equilibrium": r"initial\.equilibrium: nothing holds this posture",
-    "on_surface": r"the joints that may move do not bring",
+    "equilibrium": rf"initial\.equilibrium: {NOTHING_HOLDS}",
+    "on_surface": DO_NOT_BRING,
     # A hand path may use all joints that have motors.
-    "on_references": r"the joints that may move do not bring|no joint has waypoints",
+    "on_references": f"{DO_NOT_BRING}|{NO_WAYPOINTS}",
 }
 
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from combinations.bodies import position_rates
 from combinations.observed import OPEN, STICKING, Observed, balance, warned, whole_steps
+from combinations.sentences import STEPS_MADE
 from dynsim.model.drives import Motor
 
 Array = NDArray[np.float64]
@@ -57,7 +58,7 @@ def momentum(seen: Observed) -> Finding:
         moment, force, size = _acting_on(seen, set(chosen))
         both, rate = np.hstack([angular, linear]), np.hstack([moment, force])
         name = seen.robot.links[chosen[-1]].name
-        if warned(seen, "the steps themselves made"):
+        if warned(seen, STEPS_MADE):
             # Bodies turn too far in a step for an expansion about its midpoint; :func:`equation` checks the steps.
             continue
         if seen.stepped:

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from combinations.bodies import Bodies, Motion, position_rates, times
 from combinations.running import Run
+from combinations.sentences import SHARED
 from combinations.surfaces import Shape, nearest, shape
 from dynsim.model.description import WORLD, Contact, Load, Robot
 from dynsim.model.drives import Motor, Servo, TorqueSource
@@ -578,7 +579,7 @@ def _balanced(seen: Observed, rows: NDArray[np.int64], terms: list[Array], slack
     scale = np.sum([np.abs(term) for term in terms], axis=0)
     if seen.robot.couplings:
         left, scale, slack = left @ basis, scale @ np.abs(basis), slack @ np.abs(basis)
-    by_events = SHARED_BALANCE if warned(seen, "shared forces") else BALANCE
+    by_events = SHARED_BALANCE if warned(seen, SHARED) else BALANCE
     return Balance(rows, left, scale, slack, STEPPED_BALANCE if seen.stepped else by_events)
 
 

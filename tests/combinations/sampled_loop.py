@@ -13,9 +13,6 @@ from dynsim.model.drives import Motor, Servo, TorqueSource
 
 Array = NDArray[np.float64]
 
-# Part of warnings and stops that name an unstable loop.
-UNSTABLE = "the sampled loop is unstable"
-
 
 def loop_growth(seen: Observed, q: Array | None = None, *, most: bool = False) -> float | None:
     """Return the growth rate [1/s] of the slower of two loops (or of the faster one); None if no command is sampled.

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from combinations import drives, plants
 from combinations.factors import FACTORS, GLUED, SAMPLED, Levels, methods
+from combinations.sentences import OFF_SURFACE
 from dynsim import Model, check
 from dynsim.errors import DynsimError
 from dynsim.scenario import Scenario, build_model, load_scenario
@@ -128,7 +129,7 @@ def _in_a_surface(drawn: Scene) -> bool:
     try:
         check(drawn.load(drawn.methods[-1]))
     except DynsimError as error:
-        return "from surface" in str(error)
+        return OFF_SURFACE in str(error)
     return False
 
 

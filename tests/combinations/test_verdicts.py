@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 import dynsim
-from combinations.verdicts import STOPS, UNVERIFIED, VERIFIERS
+from combinations.sentences import PARTS, UNVERIFIED
+from combinations.verdicts import STOPS, VERIFIERS
 from dynsim.engine.stopping import KINDS
 
 PACKAGE = Path(dynsim.__file__).parent
@@ -21,22 +22,6 @@ SOURCES = {
     "engine/equilibrium.py": "",
     "scenario/build.py": "left_out_warnings",
 }
-# Sentences there that become part of an error, of a stop, or of another sentence.
-PARTS = (
-    r"^joint .* moves no inertia in this posture",
-    r"^plant: ",
-    r"; until then they could grow by a factor|; from t = 1 s on deviations have had the time to grow",
-    r"^use .*, which is stable, or smaller gains",
-    r"^the .* of .* begins with|^the reference of .* begins|^the planned voltages count on",
-    r"^the motion does not determine|^in the samples",
-    r"^; (?:while|where) .*, other choices may move otherwise",
-    r"^f_t = |^friction has put ",
-    r"^, and contacts with other forces than at rest",
-    r"^of the start|^stops are enforced",
-    r"; a shorter integrator.step_s lets it pass less$|^it is still .* beyond its stop at the end$",
-    r"^k_[pv] = ",
-    r"^\S+ against \S+ from a coefficient of",
-)
 LEAST_WORDS = 5
 
 

@@ -1,7 +1,7 @@
 """Truth of the warnings and stops of a run, each verified by a separate computation.
 
 A warning without an entry in :data:`VERIFIERS` is a finding, so that each new warning needs a check. Warnings that
-only the engine can verify are in :data:`UNVERIFIED`, with the reason.
+only the engine can verify are in ``sentences.UNVERIFIED``, with the reason.
 """
 
 from __future__ import annotations
@@ -17,7 +17,24 @@ from scipy.linalg import null_space
 from combinations.accelerations import critical, exists, glued_forces, leaves, state_of
 from combinations.observed import AT_STEP, OPEN, SLIDING, STICKING, Observed, Touch
 from combinations.running import Run
-from combinations.sampled_loop import UNSTABLE, loop_growth
+from combinations.sampled_loop import loop_growth
+from combinations.sentences import (
+    AT_TIME,
+    BY_AMOUNT,
+    FROM_THEN_ON,
+    HOLDS_UP,
+    INCOMPLETE,
+    INSTEAD_OF,
+    LAST_STEP,
+    OVERLOAD,
+    SENTENCES,
+    SHARE_OF_RUN,
+    STEP_FELL,
+    UNSTABLE,
+    UNVERIFIED,
+    WEDGE,
+    WEDGED,
+)
 from combinations.surfaces import nearest
 from dynsim.compile.clearance import POINTS
 from dynsim.errors import SimulationStopped
@@ -30,16 +47,13 @@ Match = re.Match[str]
 DIGITS = 0.006
 # Fraction of the turnover above which steps must not create energy without a warning if contacts are compliant.
 GAIN = 1e-3
-NUMBER = r"([-+]?[0-9.]+(?:e[-+]?[0-9]+)?|inf|-inf|nan)"
 # Slip and rates below this count as rest in the sentences of the engine [m/s, rad/s].
 AT_REST = 1e-9
 # Dependent rows have a singular value below this fraction of the largest.
 DEPENDENT = 1e-6
 # Fraction of a contact's force by which the engine may see it differently inside its cone, for lack of digits.
 UNDECIDED = 1e-3
-# Part of the warning about contacts that wedge.
-WEDGED = "friction can wedge"
-# Above this the rounding of an angle is 1e-3 rad: with the digits of a sentence it has no direction [rad].
+# The rounding of an angle above this is 1e-3 rad: it has no direction with the digits of a sentence [rad].
 LOST = 1e13
 # Number of samples in which a contact is checked for wedging, and number of directions of its cone.
 LOOKED, ROUND = 41, 7201
@@ -52,8 +66,8 @@ def untrue(scenario: Mapping[str, Any], run: Run, seen: Observed) -> Iterator[st
     """Yield a sentence for each wrong warning or stop, and for a warning that is missing."""
     lost = len(seen) > 0 and np.abs(seen.q).max() > LOST
     for warning in run.warnings:
-        # The stop itself, with the text of its error.
-        if warning.startswith("incomplete: "):
+        # The stop itself, in the words of its error.
+        if warning.startswith(INCOMPLETE):
             if run.error is None or str(run.error) not in warning:
                 yield f"{warning!r}, but it ended with {run.error!r}"
             continue
@@ -129,7 +143,7 @@ def _crawls(stop: SimulationStopped, seen: Observed) -> str:
     """
     if (match := re.search(HOLDS_UP, str(stop))) is not None:
         return _not_changing(match, stop, seen)
-    step = re.search(rf"the last step of {NUMBER} s", str(stop))
+    step = re.search(LAST_STEP, str(stop))
     if step is None:
         return _unproved(stop, seen)
     taken, left = float(seen.record.summary["steps"]), float(seen.run.scenario["duration_s"]) - stop.time
@@ -143,12 +157,8 @@ def _stands(stop: SimulationStopped, seen: Observed) -> str:
     return _unproved(stop, seen) if match is None else _not_changing(match, stop, seen)
 
 
-HOLDS_UP = (
-    rf"steps are as short as {NUMBER} s because (\S+) slips at {NUMBER} m/s and its friction changes within {NUMBER} "
-    rf"s; integrator.method: radau5"
-)
-# Explicit steps limited by stiff friction, in its time constants: the stability limit of DOPRI5 is 3.3, and steps grow
-# up to it, are rejected, and grow again.
+# Explicit steps that stiff friction holds up, in its time constants: the limit of stability of DOPRI5 is 3.3,
+# and steps go up to it, are rejected, and go up again.
 HELD_UP = (1.0, 5.0)
 # Slip below 1000 atol, or this [m/s], turns friction as fast as at this speed (docs/physics.md).
 SLOWEST = 1e-7
@@ -258,7 +268,7 @@ def _does_not_run_away(stop: SimulationStopped, seen: Observed) -> str:
         return reason
     state = state_of(seen, stop.state)
     motion = seen.bodies.motion(state.q[None], state.v[None], np.zeros((1, len(state.v))))
-    frictions, step = _glued(stop, seen), re.search(rf"the step size fell to {NUMBER} s", str(stop))
+    frictions, step = _glued(stop, seen), re.search(STEP_FELL, str(stop))
     power = sum(float(frictions[touch.contact.name][0] @ touch.slip[0]) for touch in seen.touches(motion))
     energy = 0.5 * float(state.v @ state.mass @ state.v)
     share = float(step[1]) * power / (2.0 * energy) if step is not None and energy > 0.0 else 0.0
@@ -586,7 +596,7 @@ def _reference_beyond(match: Match, seen: Observed) -> str:
 def _overloaded(match: Match, seen: Observed) -> str:
     names = {motor.joint: a for a, motor in enumerate(seen.robot.motors)}
     quantity = {"current": "current", "torque": "torque", "force": "torque"}[match[2]]
-    for joint, said in re.findall(r"(?:^|, )(\S+) " + NUMBER + " of ", match[1]):
+    for joint, said in re.findall(OVERLOAD, match[1]):
         if joint not in names:
             return f"no motor {joint}"
         a = names[joint]
@@ -642,15 +652,15 @@ def _unstable(match: Match, seen: Observed) -> str:
     if seen.config.get("sensors"):
         # There is no separate model of encoders with delay; with true positions it is the slower loop.
         return ""
-    from_then_on = re.search(rf"from t = {NUMBER} s on", match.string)
+    from_then_on = re.search(FROM_THEN_ON, match.string)
     q = None if from_then_on is None else seen.q[np.abs(seen.time - float(from_then_on[1])).argmin()]
     rate = loop_growth(seen, q, most=True)
     return "" if rate is not None and rate > 0.9 * GROWTH else f"it grows with {rate} 1/s"
 
 
 def _unpressed(match: Match, seen: Observed) -> str:
-    """Check that each contact sticks at some time, and would leave then if it had no force."""
-    for name, share in re.findall(rf"(\S+) \({NUMBER} % of the run\)", match[1]):
+    """Each contact sticks somewhere, and would leave there if it had no force."""
+    for name, share in re.findall(SHARE_OF_RUN, match[1]):
         touch = _touch(seen, name)
         if touch is None:
             return f"no contact {name}"
@@ -662,8 +672,8 @@ def _unpressed(match: Match, seen: Observed) -> str:
 
 
 def _leaves_in_impact(match: Match, seen: Observed) -> str:
-    """Check that each contact lifts off at the reported time."""
-    for name, time in re.findall(rf"(\S+) \({NUMBER} s\)", match[1]):
+    """Each contact lifts off at the reported time."""
+    for name, time in re.findall(AT_TIME, match[1]):
         lifts = [event.time for event in seen.record.events if event.kind == "lift_off" and event.name == name]
         if not any(abs(own - float(time)) <= 1e-5 * own for own in lifts):
             return f"{name} does not lift off at t = {time} s"
@@ -671,9 +681,8 @@ def _leaves_in_impact(match: Match, seen: Observed) -> str:
 
 
 def _wedged(match: Match, seen: Observed) -> str:
-    """Check that each contact is closed at its time, can wedge from the coefficient on, and nothing else decides."""
-    said = rf"(\S+) against \S+ from a coefficient of {NUMBER} on \(it has {NUMBER}, t = {NUMBER} s\)"
-    entries = re.findall(said, match[1])
+    """Each contact is closed at its time, can wedge itself from the coefficient on, and nothing else decides there."""
+    entries = re.findall(WEDGE, match[1])
     for name, least, friction, time in entries:
         touch = _touch(seen, name)
         if touch is None or not seen.real:
@@ -743,7 +752,7 @@ def _moves_at_once(match: Match, seen: Observed) -> str:
     j = seen.joints.index(match[1])
     if abs(seen.vdot[0, j] - float(match[2])) > DIGITS * abs(seen.vdot[0, j]):
         return f"{match[1]} starts with {seen.vdot[0, j]:.4g}"
-    for name, now in re.findall(rf"(\S+) {NUMBER} N instead of", match[0]):
+    for name, now in re.findall(INSTEAD_OF, match[0]):
         touch = _touch(seen, name)
         if touch is None or abs(touch.normal_force[0] - float(now)) > DIGITS * abs(float(now)) + 1e-9:
             return f"{name} does not carry {now} N"
@@ -751,8 +760,8 @@ def _moves_at_once(match: Match, seen: Observed) -> str:
 
 
 def _moved_at_the_start(match: Match, seen: Observed) -> str:
-    """Check that the first sample differs from the scenario's posture by the reported amounts."""
-    for name, angle in re.findall(rf"(\S+) by {NUMBER}", match[1]):
+    """The first sample differs from the scenario's posture by the reported amounts."""
+    for name, angle in re.findall(BY_AMOUNT, match[1]):
         joint = _joint(seen, name)
         if joint is None:
             return f"no joint {name}"
@@ -791,53 +800,40 @@ def _not_carried_out(match: Match, seen: Observed) -> str:
 
 
 VERIFIERS: dict[str, Callable[[Match, Observed], str]] = {
-    rf"^(.+): chatter, more than {NUMBER} contact events within {NUMBER} s": _chatters,
-    rf"^(.+): chatter, more than {NUMBER} events of its stop within {NUMBER} s": _chatters,
-    rf"^(.+): the (.+) pulls on this brace for {NUMBER}(?: %)? of the run, with up to {NUMBER} N": _pulls,
-    rf"^(.+): pulls with up to {NUMBER} N within a step": _pulls_between,
-    rf"^(.+): this brace never touches the (.+): it carries nothing; nearest {NUMBER} mm": _never_touches,
-    r"^(.+): this brace is on the (.+) at (.+), but never pressed": _never_pressed,
-    rf"^(.+): from t = {NUMBER} s on, its friction turns its own force against it": _reversed,
-    rf"^friction has put {NUMBER} J into the arm": _friction_gives,
-    rf"^(.+): (\S+) at its limit of {NUMBER} \S+(?: m)? for {NUMBER} % of the run": _at_limit,
-    rf"^(.+): passes its (.+) limit of .*first at t = {NUMBER} s": _passes_limit,
-    r"^the energy ledger does not close": _does_not_close,
-    rf"^contacts drifted by {NUMBER} m": _drifted,
-    rf"^time stepping: the steps themselves \S+ up to {NUMBER} J": _scheme,
-    rf"^time stepping: contacts or ties that give way get {NUMBER} J from the steps": _gains,
-    rf"^time stepping: points sink up to {NUMBER} mm": _sinks,
-    r"^(.*): shared forces with the dry friction of (.+), which keeps? these joints": _shared,
-    r"^(.+): shared forces of the dry friction which keeps these coupled joints at rest": _shared_by_joints,
-    r"^(.*): shared forces which the motion does not determine()": _shared,
-    rf" below (.+?)(?: by more than the link's radius)?: (\S+?),?(?: of .*)? by up to {NUMBER} mm in the": _below,
-    r"^(.+): its reference goes beyond its stop": _reference_beyond,
-    r"^(.+): the (\S+), rms over the run, is more than nominal": _overloaded,
-    rf"^a jolt of the start takes the tip margin below zero.*? in {NUMBER}(?: % of the samples)?[,;]": _tips,
-    rf"^the base (?:tips over|is tipped over|1) at t = .*below zero in {NUMBER}(?: % of the samples)?[,;]": _tips,
-    rf"^the base is lifted: no load on its wheels and caster in {NUMBER}(?: %)? of the samples": _lifted,
-    rf"^the (\S+) wheel would slip: it needs up to {NUMBER} times the traction": _would_slip,
-    r"^(?:contacts\.points\.)?(.+): no joint moves this point along the normal of": _left_out,
-    r"^initial.equilibrium: .*that jumps at the start": _jumps,
-    rf"^controller.sample_time_s = {NUMBER} s: the sampled loop is unstable": _unstable,
-    r"^the motion is not unique: nothing presses (.+), held by": _unpressed,
-    r"^the motion is not unique: impacts of other points or joint stops, .+?, lift (.+) off, while": _leaves_in_impact,
-    r"^the motion is not unique: friction can wedge (.+) by itself, without a load": _wedged,
-    r"^initial.equilibrium: moves (.+) from the requested posture": _moved_at_the_start,
-    rf"^initial.equilibrium: (\S+) starts with {NUMBER} \S+ all the same.*": _moves_at_once,
-    rf"^initial.equilibrium: the start slips at t = {NUMBER} s": _slips_at_once,
-    rf"^operator: {NUMBER} m of the {NUMBER} m that the hand was commanded to go were not": _not_carried_out,
+    SENTENCES["chatter of a contact"]: _chatters,
+    SENTENCES["chatter of a stop"]: _chatters,
+    SENTENCES["pulls"]: _pulls,
+    SENTENCES["pulls between"]: _pulls_between,
+    SENTENCES["never touches"]: _never_touches,
+    SENTENCES["never pressed"]: _never_pressed,
+    SENTENCES["reversed"]: _reversed,
+    SENTENCES["friction gives"]: _friction_gives,
+    SENTENCES["at limit"]: _at_limit,
+    SENTENCES["passes limit"]: _passes_limit,
+    SENTENCES["does not close"]: _does_not_close,
+    SENTENCES["drifted"]: _drifted,
+    SENTENCES["scheme"]: _scheme,
+    SENTENCES["gains"]: _gains,
+    SENTENCES["sinks"]: _sinks,
+    SENTENCES["shared with dry friction"]: _shared,
+    SENTENCES["shared by joints"]: _shared_by_joints,
+    SENTENCES["shared"]: _shared,
+    SENTENCES["below"]: _below,
+    SENTENCES["reference beyond"]: _reference_beyond,
+    SENTENCES["overloaded"]: _overloaded,
+    SENTENCES["tips at the start"]: _tips,
+    SENTENCES["tips"]: _tips,
+    SENTENCES["lifted"]: _lifted,
+    SENTENCES["would slip"]: _would_slip,
+    SENTENCES["left out"]: _left_out,
+    SENTENCES["jumps"]: _jumps,
+    SENTENCES["unstable"]: _unstable,
+    SENTENCES["unpressed"]: _unpressed,
+    SENTENCES["leaves in impact"]: _leaves_in_impact,
+    SENTENCES["wedged"]: _wedged,
+    SENTENCES["moved at the start"]: _moved_at_the_start,
+    SENTENCES["moves at once"]: _moves_at_once,
+    SENTENCES["slips at once"]: _slips_at_once,
+    SENTENCES["not carried out"]: _not_carried_out,
 }
-"""Pattern of each warning and its check: groups and run → the reason why it is wrong, or an empty string."""
-
-UNVERIFIED: dict[str, str] = {
-    r"contact problems were given up above": "the solver's count; forces and cones are checked",
-    r"^contact rows depended on each other in": "the solver's count of evaluations",
-    r"with friction, dependent contact rows leave the motion open too": "a range over splits, of which the run has one",
-    r"^time stepping: the power changes so fast": "a sum over all steps, of which samples show some",
-    r"no joint without a closed brake moves this point": "of brakes, which these scenes do not close",
-    r"has no effect: ": "said of a key of the scenario, not of the run",
-    r"^the target waited|^the path is|^feedback and shape points|^the null-space|^joints were clamped|^the robot tips|"
-    r"^the support margin|^mode \d+ was|passes its limit by|"
-    r"^the head is up to": "for the kinematic snake, which these scenes do not have",
-}
-"""Warnings that only the engine can verify, each with the reason."""
+"""Pattern of each warning and its check: the groups and what the run shows → why it is not so, empty if it is."""

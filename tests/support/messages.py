@@ -39,6 +39,13 @@ PHRASES = {
     "last browser": "the last browser was closed",
     "pilot silent": "the pilot is silent",
     "release key": "let the key go once",
+    # Warnings of a run.
+    "behind brakes": "no joint without a closed brake moves this point",
+    "ledger": "the energy ledger does not close",
+    "never": "never",
+    "shared": "shared forces",
+    "sinks": "pass below",
+    "steps gain": "give way get",
     # Rows of tables.
     "energy row": "electrical energy [J]",
     "impact row": "impact loss",

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
+from support.messages import raises
 
 import dynsim
 from dynsim.compile.bracing import Brace, BracePlanner, BraceStatics, PreparedBraces, brace_rows
@@ -387,21 +388,21 @@ def test_a_motion_in_one_call_is_its_instants(arm, seed):
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "names"),
     [
-        ({"normal_force": -1.0}, "cannot pull"),
-        ({"normal": np.zeros(3)}, "direction"),
-        ({"friction": -0.1}, "friction"),
-        ({"min_N": math.nan}, "min_N"),
-        ({"sliding": UP}, "no direction along"),
-        ({"body": "link_99"}, "no body"),
-        ({"point": np.zeros(2)}, "point must be three finite numbers"),
+        ({"normal_force": -1.0}, ["link_4", "normal_force -1.0"]),
+        ({"normal": np.zeros(3)}, ["link_4", "normal [0.0, 0.0, 0.0]"]),
+        ({"friction": -0.1}, ["link_4", "friction -0.1"]),
+        ({"min_N": math.nan}, ["link_4", "min_N nan"]),
+        ({"sliding": UP}, ["link_4", "sliding [0.0, 0.0, 1.0]"]),
+        ({"body": "link_99"}, ["link_99", "link_9"]),
+        ({"point": np.zeros(2)}, ["point", "array([0., 0.])"]),
     ],
 )
-def test_refused(arm, changes, said):
+def test_refused(arm, changes, names):
     def ask():
         braces = {"elbow": replace(elbows()["elbow_4"], **changes)}
         return arm.brace_statics(arm.robot.initial, np.zeros(10), np.zeros(10), braces)
 
-    with pytest.raises(ModelError, match=said):
+    with raises(ModelError, *names):
         ask()

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
+from support.messages import check_message, lines_with, raises
 from support.random_robots import CompiledSystem, assemble
 from support.stepping_systems import plane, stepped
 
@@ -298,23 +300,23 @@ def test_scenarios_say_what_gives_way(tmp_path: Path):
     assert record["energy_elastic"][-1] == pytest.approx(0.5 * 2e4 * record["contact_gap"][-1, 0] ** 2, rel=1e-6)
     assert record.summary["damper_loss_J"] == pytest.approx(record["loss_damper"][-1])
     assert record.summary["energy_residual_relative"] < 1e-9
-    for key, value, words in (
-        ("integrator.method", "radau5", "contacts of the event-driven methods are rigid"),
-        ("contacts.points.foot.restitution", 0.5, "what gives way has no restitution"),
-        ("contacts.points.foot.stiffness_N_per_m", None, "is that of what gives way"),
+    for key, value, names in (
+        ("integrator.method", "radau5", ["stiffness_N_per_m = 20000", "integrator.method: time_stepping"]),
+        ("contacts.points.foot.restitution", 0.5, ["contacts.points.foot.restitution = 0.5"]),
+        ("contacts.points.foot.stiffness_N_per_m", None, ["damping_N_s_per_m = 200", "stiffness_N_per_m"]),
     ):
-        with pytest.raises(ScenarioError, match=words):
+        with raises(ScenarioError, *names):
             load_scenario(file, overrides={key: value})
 
 
 def test_ties_that_cannot_be_are_refused():
-    for tie, words in (
-        (Tie("t", "one", "two", Z, 0.0), "stiffness or a damping"),
-        (Tie("t", "one", "one", Z, 1.0), "both ends"),
-        (Tie("t", "one", "two", 0 * Z, 1.0), "no direction"),
-        (Tie("t", "one", "three", Z, 1.0), "three"),
+    for tie, names in (
+        (Tie("t", "one", "two", Z, 0.0), ["t"]),
+        (Tie("t", "one", "one", Z, 1.0), ["t", "one"]),
+        (Tie("t", "one", "two", 0 * Z, 1.0), ["t"]),
+        (Tie("t", "one", "three", Z, 1.0), ["three", "one, two"]),
     ):
-        with pytest.raises(ModelError, match=words):
+        with raises(ModelError, *names):
             pair((tie,))
 
 
@@ -337,11 +339,11 @@ def test_energy_that_steps_make_at_landings_is_warned_of_with_a_step_that_is_eno
         return simulate(scenario_from_resolved(config | {"integrator": {"method": "time_stepping", "step_s": step}}))
 
     record = drop(1e-3)
-    (warning,) = [text for text in record.summary["warnings"] if "give way get" in text]
+    (warning,) = lines_with(record.summary["warnings"], phrase="steps gain")
     made = record.summary["time_stepping"]["scheme_gain_J"]
-    assert f"get {made:.3g} J from the steps themselves" in warning
+    check_message(warning, f"{made:.3g} J", "integrator.step_s")
     turnover = record.summary["energy_turnover_J"]
     assert GAIN_LIMIT * turnover < made < 0.25 * turnover
-    finer = drop(float(warning.rsplit(" ", 1)[1]))
+    finer = drop(float(re.findall(r"\d[\d.]*(?:e-?\d+)?", warning)[-1]))
     assert finer.summary["time_stepping"]["scheme_gain_J"] <= GAIN_LIMIT * finer.summary["energy_turnover_J"]
-    assert not [text for text in finer.summary["warnings"] if "give way get" in text]
+    assert not lines_with(finer.summary["warnings"], phrase="steps gain")

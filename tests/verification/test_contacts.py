@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
+from support.messages import raises
 from support.random_robots import assemble, random_contacts, random_robot, surface_through
 
 from dynsim.compile.model import Model
@@ -204,9 +206,6 @@ def test_more_contacts_than_a_machine_can_carry_are_refused_with_an_estimate():
     points = {f"c{k}": {"body": "link_1"} for k in range(1000)}
     size = {"plant.chain.0.initial_deg": 90, "plant.chain.0.axis": "y", "duration_s": 100, "contacts.points": points}
     overrides = {**size, "surfaces.floor.type": "plane", "integrator.wall_limit_s": 3600}
-    with pytest.raises(
-        ScenarioError,
-        match=r"1 joints with 1000 contacts: .* about [\d.e+]+ s, the limit .* is 3600 s;",
-    ):
+    with raises(ScenarioError, "1", "1000", re.compile(r"[\d.]+e\+\d+ s"), "3600 s", "integrator.wall_limit_s"):
         check(load_scenario("single_pendulum", overrides=overrides))
     check(load_scenario("single_pendulum", overrides={**overrides, "integrator.wall_limit_s": 1e5}))

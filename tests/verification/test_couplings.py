@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.messages import raises
 from support.random_robots import assemble, random_robot
 
 from dynsim.compile.model import Model
@@ -111,40 +112,40 @@ def test_written_and_read_again_it_is_the_same(gripper: Path):
 
 
 def test_an_initial_position_that_breaks_the_coupling_is_refused(gripper: Path):
-    with pytest.raises(ModelError, match=r"coupling of right_finger: it starts at 0\.2, but left_finger at 0\.1 leads"):
+    with raises(ModelError, "right_finger", "0.2", "left_finger", "0.1", "0.16"):
         build_model(load_scenario(gripper, overrides={"plant.initial_m": {"left_finger": 0.1, "right_finger": 0.2}}))
     exact = {"plant.initial_m": {"left_finger": 0.1, "right_finger": 0.16}}
     np.testing.assert_allclose(build_model(load_scenario(gripper, overrides=exact)).robot.initial[1:], [0.1, 0.16])
 
 
 @pytest.mark.parametrize(
-    ("couplings", "message"),
+    ("couplings", "names"),
     [
-        ([Coupling("joint_9", "joint_0")], "coupling of joint_9: no joint 'joint_9'"),
-        ([Coupling("joint_1", "elbow")], "coupling of joint_1: no joint 'elbow'"),
-        ([Coupling("joint_1", "joint_0"), Coupling("joint_1", "joint_2")], "the joint follows 'joint_0' already"),
-        ([Coupling("joint_1", "joint_1")], "in a circle: joint_1 → joint_1"),
-        ([Coupling("joint_1", "joint_2"), Coupling("joint_2", "joint_1")], "in a circle: joint_1 → joint_2 → joint_1"),
-        ([Coupling("joint_1", "joint_0", np.nan)], "ratio nan must be a finite number"),
+        ([Coupling("joint_9", "joint_0")], ["joint_9", "joint_0, joint_1, joint_2"]),
+        ([Coupling("joint_1", "elbow")], ["joint_1", "'elbow'", "joint_0, joint_1, joint_2"]),
+        ([Coupling("joint_1", "joint_0"), Coupling("joint_1", "joint_2")], ["joint_1", "'joint_0'"]),
+        ([Coupling("joint_1", "joint_1")], ["joint_1 → joint_1"]),
+        ([Coupling("joint_1", "joint_2"), Coupling("joint_2", "joint_1")], ["joint_1 → joint_2 → joint_1"]),
+        ([Coupling("joint_1", "joint_0", np.nan)], ["joint_1", "ratio nan"]),
     ],
 )
-def test_couplings_that_cannot_be_are_refused(couplings: list[Coupling], message: str):
+def test_couplings_that_cannot_be_are_refused(couplings: list[Coupling], names: list[str]):
     robot = random_robot(np.random.default_rng(0), 3)
-    with pytest.raises(ModelError, match=message):
+    with raises(ModelError, *names):
         Model(replace(robot, couplings=tuple(couplings)))
 
 
 @pytest.mark.parametrize(
-    ("mimic", "message"),
+    ("mimic", "names"),
     [
-        ('joint="thumb"', r"gripper.urdf:\d+: joint 'right_finger' mimics joint 'thumb', which is not in the file"),
-        ('joint="right_finger"', r"gripper.urdf:\d+: joint 'right_finger' mimics itself"),
+        ('joint="thumb"', ["gripper.urdf:8", "'right_finger'", "'thumb'"]),
+        ('joint="right_finger"', ["gripper.urdf:8", "'right_finger'"]),
     ],
 )
-def test_mimic_joints_without_a_leader_are_refused(gripper: Path, mimic: str, message: str):
+def test_mimic_joints_without_a_leader_are_refused(gripper: Path, mimic: str, names: list[str]):
     path = gripper.parent / "gripper.urdf"
     path.write_text(GRIPPER.replace('joint="left_finger"', mimic))
-    with pytest.raises(ModelError, match=message):
+    with raises(ModelError, *names):
         read_urdf(path)
 
 
