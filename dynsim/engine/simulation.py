@@ -1713,7 +1713,6 @@ def simulate(scenario: Scenario, progress: Progress | None = None, *, pictured: 
 
 def _stepped(scenario: Scenario, progress: Progress | None, pictured: bool) -> Record:
     """Simulate with ticks of an operator, a snake's script or encoders, bit-identical to the public stepper."""
-    from dynsim.engine.simulation import Simulation
 
     # No end, as in a session: a step that ends at a tick and one at the end of a run may differ.
     simulation = Simulation(scenario, duration=math.inf)
