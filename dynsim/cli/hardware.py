@@ -8,10 +8,9 @@ from collections.abc import Sequence
 from contextlib import nullcontext
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
 from rich.table import Table
 
 from dynsim.cli.app import QuietOption, ScenarioArgument, SetOption, TrustOption, parsed_overrides
@@ -32,17 +31,19 @@ from dynsim.cli.teleop import (
     require_websockets,
 )
 from dynsim.errors import DynsimError
-from dynsim.hardware.bus.protocol import Bus, Clock
-from dynsim.hardware.errors import ReplayInterrupted
-from dynsim.hardware.nudge import ANGLE, Nudge, nudge, swapped
-from dynsim.hardware.ports import VIRTUAL, bus_on
-from dynsim.hardware.replay.output import StopRequest, stop_on_signals
-from dynsim.hardware.replay.trajectory import MotionTask
-from dynsim.hardware.replay.verify import QUANTITIES, LimitRow, differences, way_to_start
-from dynsim.hardware.servo_map import MappedServo, ServoMap
+from dynsim.hardware.errors import ReplayInterrupted, ServoMapError, VerificationFailed
 from dynsim.system import interruption
 from dynsim.system.files import file_name, json_text, write_json
 from dynsim.system.terminal import Terminal, escaped, plain
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from dynsim.hardware.bus.protocol import Bus, Clock
+    from dynsim.hardware.nudge import Nudge
+    from dynsim.hardware.replay.trajectory import MotionTask
+    from dynsim.hardware.replay.verify import LimitRow
+    from dynsim.hardware.servo_map import MappedServo, ServoMap
 
 hw = typer.Typer(
     no_args_is_help=True,
@@ -99,7 +100,6 @@ def scan(
     require_client_library()
     from dynsim.hardware.bus import scan as survey
     from dynsim.hardware.bus.control_table import RETURN_DELAY_SECONDS_PER_UNIT, VOLT_PER_UNIT
-    from dynsim.hardware.errors import VerificationFailed
     from dynsim.hardware.servo_map import load_servo_map
 
     servo_map = load_servo_map(map_file) if map_file else None
@@ -129,7 +129,6 @@ def scan(
 
 
 def _compare_with_map(answers: list[Any], servo_map: Any) -> None:
-    from dynsim.hardware.errors import VerificationFailed
 
     seen = {servo.id: servo for servo in answers}
     wrong = [f"{servo} did not answer" for servo in servo_map.servos if servo.id not in seen]
@@ -205,8 +204,6 @@ def replay(
     Ctrl-C once: controlled stop. Twice: torque off.
     """
     require_client_library()
-    from dynsim.cli.hardware import confirm_replay
-    from dynsim.hardware.errors import ServoMapError
     from dynsim.hardware.ports import VIRTUAL, bus_on
     from dynsim.hardware.replay.session import shown_by
     from dynsim.hardware.virtual.faults import load_fault_script
@@ -265,7 +262,6 @@ def replayed(
 
 def print_dry_run(result: Any) -> None:
     """Print the result of a replay without motion."""
-    from dynsim.cli.hardware import print_limits
 
     print_limits(console, result.limits)
     console.print("dry run: servos verified and bus timed, nothing was moved; use --live to move")
@@ -415,7 +411,6 @@ def stop_servos(
     """
     require_client_library()
     from dynsim.hardware.bus import scan as survey
-    from dynsim.hardware.errors import VerificationFailed
     from dynsim.hardware.servo_map import load_servo_map
 
     servo_map = load_servo_map(map_file) if map_file else None
@@ -456,8 +451,6 @@ def calibrate(
     With --nudge: find joints with the wrong direction instead, one by one.
     """
     require_client_library()
-    from dynsim.cli.hardware import find_directions, may_write
-    from dynsim.hardware.errors import ServoMapError, VerificationFailed
     from dynsim.hardware.ports import bus_on
     from dynsim.hardware.servo_map import SHIPPED, load_servo_map, read_zero_ticks, write_into_map
 
@@ -529,9 +522,7 @@ def hw_drive(
     """
     require_websockets()
     require_client_library()
-    from dynsim.cli.hardware import confirm_replay
     from dynsim.engine.recording import RUN_FILES
-    from dynsim.hardware.errors import ServoMapError
     from dynsim.hardware.ports import VIRTUAL, bus_on
     from dynsim.hardware.replay.drive import check_drive
     from dynsim.hardware.replay.session import shown_by
@@ -662,6 +653,9 @@ def confirm_replay(
     PortError, VerificationFailed
         If the posture cannot be read.
     """
+    from dynsim.hardware.ports import bus_on
+    from dynsim.hardware.replay.verify import way_to_start
+
     with bus_on(port, servo_map) as (bus, _):
         approach = way_to_start(bus, servo_map, motion.start)
     console.print(
@@ -686,6 +680,8 @@ def confirm_replay(
 
 def print_limits(console: Console, rows: Sequence[LimitRow]) -> None:
     """Print the limits stored in the servos next to those of the map."""
+    from dynsim.hardware.replay.verify import QUANTITIES, differences
+
     table = Table("joint", "ID", *QUANTITIES, title="limits: servo | map")
     for row in rows:
         table.add_row(row.joint, str(row.id), *(" | ".join(cell) for cell in row.cells))
@@ -728,6 +724,9 @@ def find_directions(
     VerificationFailed, ReplayAborted
         If a servo is not ready to move, or an abort rule ended a nudge; torque is off.
     """
+    from dynsim.hardware.nudge import ANGLE, swapped
+    from dynsim.hardware.ports import VIRTUAL, bus_on
+
     real = port != VIRTUAL
     angle = f"{math.degrees(ANGLE):g}°"
     if real and live and asked:
@@ -765,6 +764,9 @@ def may_write(console: Console, joints: Sequence[str], target: object) -> bool:
 
 
 def _nudge(bus: Bus, clock: Clock, servo_map: ServoMap, servo: MappedServo, *, live: bool) -> Nudge | None:
+    from dynsim.hardware.nudge import nudge
+    from dynsim.hardware.replay.output import StopRequest, stop_on_signals
+
     stop = StopRequest()
     with stop_on_signals(stop):
         return nudge(servo_map, servo, bus, clock, live=live, stop=stop)

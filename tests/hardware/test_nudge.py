@@ -14,6 +14,7 @@ from support.messages import check_message, lines_with, mentions, raises
 
 from dynsim import cli
 from dynsim.cli import hardware
+from dynsim.hardware import ports
 from dynsim.hardware.bus.control_table import RAD_PER_TICK
 from dynsim.hardware.errors import ReplayAborted, ReplayInterrupted, ServoMapError, VerificationFailed
 from dynsim.hardware.nudge import ANGLE, PAUSE, SPEED, nudge, swapped
@@ -186,7 +187,7 @@ def on_the_rig(rig, monkeypatch) -> Run:
     def bus_on(port, servo_map):
         yield run.replay.bus, run.clock
 
-    monkeypatch.setattr(hardware, "bus_on", bus_on)
+    monkeypatch.setattr(ports, "bus_on", bus_on)
     return run
 
 
@@ -233,7 +234,7 @@ def test_a_replay_asks_with_the_way_to_its_start_and_again_where_it_is_far(
     now, start = (0.9 if far else 0.1), motion.path.position[0][0]
     assert lines_with(out, "shoulder", f"{abs(now - start):.3f} rad")
     assert mentions(out, f"{1.875 * abs(now - start) / 0.3:.1f} s")
-    assert mentions(out, "safety.start_distance, 0.5 rad") is (far and (not asked or answers[0] == "y"))
+    assert mentions(out, "safety.start_distance = 0.5 rad") is (far and (not asked or answers[0] == "y"))
     assert ("--yes" in out) is (far and not asked)
 
 
