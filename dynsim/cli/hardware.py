@@ -37,12 +37,9 @@ from dynsim.system.files import file_name, json_text, write_json
 from dynsim.system.terminal import Terminal, escaped, plain
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from dynsim.hardware.bus.protocol import Bus, Clock
     from dynsim.hardware.nudge import Nudge
     from dynsim.hardware.replay.trajectory import MotionTask
-    from dynsim.hardware.replay.verify import LimitRow
     from dynsim.hardware.servo_map import MappedServo, ServoMap
 
 hw = typer.Typer(
@@ -75,6 +72,8 @@ Yes = Annotated[
 ]
 Configure = Annotated[bool, typer.Option("--configure", help="Write EEPROM settings that differ from the map.")]
 Faults = Annotated[Path | None, typer.Option("--faults", help="Fault script for virtual servos.")]
+Plant = Annotated[str | None, typer.Option("--plant", help="Scenario that provides the load for the virtual servos.")]
+PlantVariant = Annotated[str | None, typer.Option("--variant", help="Variant of that scenario.")]
 
 
 class MissingClientLibrary(DynsimError):
@@ -100,10 +99,8 @@ def scan(
     require_client_library()
     from dynsim.hardware.bus import scan as survey
     from dynsim.hardware.bus.control_table import RETURN_DELAY_SECONDS_PER_UNIT, VOLT_PER_UNIT
-    from dynsim.hardware.servo_map import load_servo_map
 
-    servo_map = load_servo_map(map_file) if map_file else None
-    bauds = (baud,) if baud else (servo_map.bus.baud,) if servo_map else survey.SCAN_BAUD_RATES
+    servo_map, bauds = _map_and_bauds(map_file, baud, survey.SCAN_BAUD_RATES)
     answers = survey.scan(port, bauds)
     if not answers:
         raise VerificationFailed(
@@ -114,10 +111,8 @@ def scan(
     table = Table("ID", "model", "fw", "bit/s", "mode", "delay µs", "V", "°C", "torque", "error", "joint")
     for servo in answers:
         registers = servo.registers
-        delay, volts = (
-            registers["return_delay"] * RETURN_DELAY_SECONDS_PER_UNIT,
-            registers["present_voltage"] * VOLT_PER_UNIT,
-        )
+        delay = registers["return_delay"] * RETURN_DELAY_SECONDS_PER_UNIT
+        volts = registers["present_voltage"] * VOLT_PER_UNIT
         numbers = [f"{delay * 1e6:.0f}", f"{volts:.1f}", f"{registers['present_temperature']:.0f}"]
         error = f"0x{registers['hardware_error']:02x}" if registers["hardware_error"] else "-"
         joint = owners[servo.id].joint if servo.id in owners else "-"
@@ -126,6 +121,13 @@ def scan(
     console.print(table)
     if servo_map:
         _compare_with_map(answers, servo_map)
+
+
+def _map_and_bauds(map_file: Path | None, baud: int | None, common: tuple[int, ...]) -> tuple[Any, tuple[int, ...]]:
+    from dynsim.hardware.servo_map import load_servo_map
+
+    servo_map = load_servo_map(map_file) if map_file else None
+    return servo_map, (baud,) if baud else (servo_map.bus.baud,) if servo_map else common
 
 
 def _compare_with_map(answers: list[Any], servo_map: Any) -> None:
@@ -192,10 +194,8 @@ def replay(
     yes: Yes = False,
     configure: Configure = False,
     faults: Faults = None,
-    plant: Annotated[
-        str | None, typer.Option("--plant", help="Scenario that provides the load for the virtual servos.")
-    ] = None,
-    variant: Annotated[str | None, typer.Option("--variant", help="Variant of that scenario.")] = None,
+    plant: Plant = None,
+    variant: PlantVariant = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="Do not show a progress bar.")] = False,
     trust: TrustOption = False,
 ) -> None:
@@ -206,19 +206,18 @@ def replay(
     require_client_library()
     from dynsim.hardware.ports import VIRTUAL, bus_on
     from dynsim.hardware.replay.session import shown_by
-    from dynsim.hardware.virtual.faults import load_fault_script
 
     if (faults or plant) and port != VIRTUAL:
         raise ServoMapError("--faults and --plant require virtual servos; use --port virtual")
     simulated, servo_map, motion = _checked(record, map_file, rate, speed, trust)
-    script = load_fault_script(faults, servo_map.ids) if faults else None
-    robot = _plant(plant, variant, servo_map, motion) if plant else None
+    script = _fault_script(faults, servo_map)
+    robot = _plant(plant, variant, servo_map, motion.start)
     folder = out or Path("results") / file_name(f"{servo_map.robot}_replay")
     for warning in motion.warnings:
         console.print(f"warning: {warning}")
     moves = live or port == VIRTUAL
     if live and port != VIRTUAL:
-        confirm_replay(console, servo_map, motion, port, asked=not yes)
+        confirm_replay(servo_map, motion, port, asked=not yes)
     with shown_by({"standard output": sys.stdout}, folder) as lost:
         result = replayed(
             motion,
@@ -263,7 +262,14 @@ def replayed(
 def print_dry_run(result: Any) -> None:
     """Print the result of a replay without motion."""
 
-    print_limits(console, result.limits)
+    from dynsim.hardware.replay.verify import QUANTITIES, differences
+
+    table = Table("joint", "ID", *QUANTITIES, title="limits: servo | map")
+    for row in result.limits:
+        table.add_row(row.joint, str(row.id), *(" | ".join(cell) for cell in row.cells))
+    console.print(table)
+    for line in differences(result.limits):
+        console.print(line)
     console.print("dry run: servos verified and bus timed, nothing was moved; use --live to move")
 
 
@@ -274,11 +280,17 @@ def print_replay(result: Any, done: str, folder: Path, record: Path) -> None:
     console.print(f"compare: dynsim hw compare {record} {folder / 'measured.h5'}")
 
 
-def _plant(scenario: str, variant: str | None, servo_map: Any, motion: Any) -> Any:
+def _fault_script(path: Path | None, servo_map: Any) -> Any:
+    from dynsim.hardware.virtual.faults import load_fault_script
+
+    return load_fault_script(path, servo_map.ids) if path else None
+
+
+def _plant(scenario: str | None, variant: str | None, servo_map: Any, start: Sequence[float] | None = None) -> Any:
     from dynsim.hardware.virtual.simulated_plant import simulated_arm
 
-    posture = dict(zip((servo.label for servo in servo_map.servos), motion.start, strict=True))
-    return simulated_arm(scenario, variant, servo_map, posture)
+    posture = {} if start is None else dict(zip((servo.label for servo in servo_map.servos), start, strict=True))
+    return simulated_arm(scenario, variant, servo_map, posture) if scenario else None
 
 
 def print_timing(result: Any) -> None:
@@ -365,24 +377,20 @@ def compare(
 @hw.command(epilog="Example: dynsim hw virtual --map arm --link /tmp/ttyDXL")
 def virtual(
     map_file: MapFile,
-    faults: Annotated[Path | None, typer.Option("--faults", help="Fault script.")] = None,
+    faults: Faults = None,
     link: Annotated[Path | None, typer.Option("--link", help="Create this symbolic link to the device.")] = None,
-    plant: Annotated[
-        str | None, typer.Option("--plant", help="Scenario that provides the load for the servos.")
-    ] = None,
-    variant: Annotated[str | None, typer.Option("--variant", help="Variant of that scenario.")] = None,
+    plant: Plant = None,
+    variant: PlantVariant = None,
 ) -> None:
     """Run virtual servos on a pseudo-terminal for any Dynamixel tool; stop with Ctrl-C."""
     require_client_library()
     from dynsim.hardware.replay.output import StopRequest, stop_on_signals
     from dynsim.hardware.servo_map import load_servo_map
-    from dynsim.hardware.virtual.faults import load_fault_script
     from dynsim.hardware.virtual.line import PseudoTerminal, line_for_map
-    from dynsim.hardware.virtual.simulated_plant import simulated_arm
 
     servo_map = load_servo_map(map_file)
-    script = load_fault_script(faults, servo_map.ids) if faults else None
-    robot = simulated_arm(plant, variant, servo_map, {}) if plant else None
+    script = _fault_script(faults, servo_map)
+    robot = _plant(plant, variant, servo_map)
     terminal = PseudoTerminal(line_for_map(servo_map, script=script, plant=robot), link)
     stop = StopRequest()
     # A plain line, because other programs wait for it.
@@ -411,10 +419,8 @@ def stop_servos(
     """
     require_client_library()
     from dynsim.hardware.bus import scan as survey
-    from dynsim.hardware.servo_map import load_servo_map
 
-    servo_map = load_servo_map(map_file) if map_file else None
-    bauds = (baud,) if baud else (servo_map.bus.baud,) if servo_map else survey.STOP_BAUD_RATES
+    servo_map, bauds = _map_and_bauds(map_file, baud, survey.STOP_BAUD_RATES)
     asked = survey.stop_all(port, bauds, servo_map.ids if servo_map else ())
     on = [id_ for id_, still_on in asked.torque.items() if still_on]
     # Without a map, servos at a bit rate at which the port failed are unknown.
@@ -464,8 +470,9 @@ def calibrate(
         raise ServoMapError(f"{map_file} has no joint {', '.join(unknown)}; it has {', '.join(servo_map.joints)}")
     if nudge:
         chosen = [servo for servo in servo_map.servos if servo.joint in (joint or servo_map.joints)]
-        signs, blocked = find_directions(console, servo_map, chosen, port, live=live, asked=not yes)
-        if signs and (write or (not shipped and may_write(console, list(signs), target))):
+        signs, blocked = find_directions(servo_map, chosen, port, live=live, asked=not yes)
+        text = f"The sign of {', '.join(signs)} is wrong in {target}."
+        if signs and (write or (not shipped and _agreed(text, "write it?"))):
             write_into_map(servo_map, "sign", signs, target)
             console.print(f"written to {target}")
         if blocked:
@@ -527,7 +534,6 @@ def hw_drive(
     from dynsim.hardware.replay.drive import check_drive
     from dynsim.hardware.replay.session import shown_by
     from dynsim.hardware.servo_map import load_servo_map
-    from dynsim.hardware.virtual.faults import load_fault_script
     from dynsim.scenario import load_scenario
     from dynsim.system.files import check_writable
     from dynsim.teleop.snake import SpeedLimits
@@ -537,7 +543,7 @@ def hw_drive(
         raise ServoMapError("--faults requires virtual servos; use --port virtual")
     loaded = load_scenario(scenario, variant, parsed_overrides(overrides))
     servo_map = load_servo_map(map_file)
-    script = load_fault_script(faults, servo_map.ids) if faults else None
+    script = _fault_script(faults, servo_map)
     folder = out or new_folder(Path("results", loaded.name))
     check_writable(folder, RUN_FILES)
     limits = SpeedLimits(speed, turn, base_speed)
@@ -557,7 +563,7 @@ def hw_drive(
             scene=ready.still.scene,
         )
         if live and port != VIRTUAL:
-            confirm_replay(console, servo_map, motion, port, asked=not yes, at_most=True)
+            confirm_replay(servo_map, motion, port, asked=not yes, at_most=True)
         if moves:
             print_address(ready.address, "Ctrl-C stops the robot, a second one releases it", open_=open_)
         posture = dict(zip(servo_map.joints, motion.start.tolist(), strict=True))
@@ -626,15 +632,11 @@ ANSWERS = ("y", "n", "again")
 CLEAR = "Is everyone clear of the robot, and is the power cut within reach?"
 
 
-def confirm_replay(
-    console: Console, servo_map: ServoMap, motion: MotionTask, port: str, *, asked: bool, at_most: bool = False
-) -> None:
+def confirm_replay(servo_map: ServoMap, motion: MotionTask, port: str, *, asked: bool, at_most: bool = False) -> None:
     """Show the distance to the start and ask for confirmation.
 
     Parameters
     ----------
-    console : Console
-        Output.
     servo_map : ServoMap
         Map of the servos.
     motion : MotionTask
@@ -664,41 +666,25 @@ def confirm_replay(
     )
     for distance in approach.distances[:1]:
         console.print(f"largest distance to the start: {distance}")
-    agreed = not asked or _agreed(console, CLEAR, "move?")
+    agreed = not asked or _agreed(CLEAR, "move?")
     if agreed and approach.far:
         still = "" if asked else " (asked even with --yes)"
         bound = servo_map.safety.start_distance
         console.print(f"more than safety.start_distance = {bound:g} rad from the start{still}:")
         for distance in approach.far:
             console.print(f"  {distance}")
-        agreed = _agreed(
-            console, "All joints move to the start together. Is the whole path free?", "move to the start?"
-        )
+        agreed = _agreed("All joints move to the start together. Is the whole path free?", "move to the start?")
     if not agreed:
         raise ReplayInterrupted("not confirmed; nothing was moved")
 
 
-def print_limits(console: Console, rows: Sequence[LimitRow]) -> None:
-    """Print the limits stored in the servos next to those of the map."""
-    from dynsim.hardware.replay.verify import QUANTITIES, differences
-
-    table = Table("joint", "ID", *QUANTITIES, title="limits: servo | map")
-    for row in rows:
-        table.add_row(row.joint, str(row.id), *(" | ".join(cell) for cell in row.cells))
-    console.print(table)
-    for line in differences(rows):
-        console.print(line)
-
-
 def find_directions(
-    console: Console, servo_map: ServoMap, chosen: Sequence[MappedServo], port: str, *, live: bool, asked: bool
+    servo_map: ServoMap, chosen: Sequence[MappedServo], port: str, *, live: bool, asked: bool
 ) -> tuple[dict[str, int], list[str]]:
     """Nudge one joint after the other, and ask whether it moved in the direction of the map.
 
     Parameters
     ----------
-    console : Console
-        Output.
     servo_map : ServoMap
         Map of the servos.
     chosen : sequence of MappedServo
@@ -733,7 +719,7 @@ def find_directions(
         console.print(
             f"{servo_map.robot}: {len(chosen)} joint(s) will turn {angle} and back, one by one; torque off elsewhere."
         )
-        if not _agreed(console, CLEAR, "move?"):
+        if not _agreed(CLEAR, "move?"):
             raise ReplayInterrupted("not confirmed; nothing was moved")
     agrees: dict[str, bool] = {}
     blocked: list[str] = []
@@ -743,10 +729,10 @@ def find_directions(
             if moved is None:
                 console.print(f"{servo}: ready to move")
                 continue
-            answer = _ask_direction(console, moved, asked=asked)
+            answer = _ask_direction(moved, asked=asked)
             while answer == "again":
                 moved = _nudge(bus, clock, servo_map, servo, live=True) or moved
-                answer = _ask_direction(console, moved, asked=asked)
+                answer = _ask_direction(moved, asked=asked)
             if not moved.followed:
                 blocked.append(servo.joint)
             agrees[servo.joint] = answer == "y"
@@ -758,11 +744,6 @@ def find_directions(
     return signs, blocked
 
 
-def may_write(console: Console, joints: Sequence[str], target: object) -> bool:
-    """Ask whether to change the map."""
-    return _agreed(console, f"The sign of {', '.join(joints)} is wrong in {target}.", "write it?")
-
-
 def _nudge(bus: Bus, clock: Clock, servo_map: ServoMap, servo: MappedServo, *, live: bool) -> Nudge | None:
     from dynsim.hardware.nudge import nudge
     from dynsim.hardware.replay.output import StopRequest, stop_on_signals
@@ -772,7 +753,7 @@ def _nudge(bus: Bus, clock: Clock, servo_map: ServoMap, servo: MappedServo, *, l
         return nudge(servo_map, servo, bus, clock, live=live, stop=stop)
 
 
-def _ask_direction(console: Console, moved: Nudge, *, asked: bool) -> str:
+def _ask_direction(moved: Nudge, *, asked: bool) -> str:
     """Print the motion of a joint and ask for its direction; returns "y", "n" or "again"."""
     console.print(
         f"{moved.joint} (ID {moved.id}): {math.degrees(moved.moved):+.1f}° (map), {moved.ticks:+d} ticks, and back"
@@ -790,7 +771,7 @@ def _ask_direction(console: Console, moved: Nudge, *, asked: bool) -> str:
         raise ReplayInterrupted(f"no answer about {moved.joint}; torque is off, nothing was written") from None
 
 
-def _agreed(console: Console, text: str, question: str) -> bool:
+def _agreed(text: str, question: str) -> bool:
     console.print(text)
     try:
         return typer.confirm(question)
