@@ -8,10 +8,9 @@ from collections.abc import Sequence
 from contextlib import nullcontext
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
 from rich.table import Table
 
 from dynsim.cli.app import QuietOption, ScenarioArgument, SetOption, TrustOption, parsed_overrides
@@ -32,17 +31,16 @@ from dynsim.cli.teleop import (
     require_websockets,
 )
 from dynsim.errors import DynsimError
-from dynsim.hardware.bus.protocol import Bus, Clock
-from dynsim.hardware.errors import ReplayInterrupted
-from dynsim.hardware.nudge import ANGLE, Nudge, nudge, swapped
-from dynsim.hardware.ports import VIRTUAL, bus_on
-from dynsim.hardware.replay.output import StopRequest, stop_on_signals
-from dynsim.hardware.replay.trajectory import MotionTask
-from dynsim.hardware.replay.verify import QUANTITIES, LimitRow, differences, way_to_start
-from dynsim.hardware.servo_map import MappedServo, ServoMap
+from dynsim.hardware.errors import ReplayInterrupted, ServoMapError, VerificationFailed
 from dynsim.system import interruption
 from dynsim.system.files import file_name, json_text, write_json
 from dynsim.system.terminal import Terminal, escaped, plain
+
+if TYPE_CHECKING:
+    from dynsim.hardware.bus.protocol import Bus, Clock
+    from dynsim.hardware.nudge import Nudge
+    from dynsim.hardware.replay.trajectory import MotionTask
+    from dynsim.hardware.servo_map import MappedServo, ServoMap
 
 hw = typer.Typer(
     no_args_is_help=True,
@@ -74,6 +72,8 @@ Yes = Annotated[
 ]
 Configure = Annotated[bool, typer.Option("--configure", help="Write EEPROM settings that differ from the map.")]
 Faults = Annotated[Path | None, typer.Option("--faults", help="Fault script for virtual servos.")]
+Plant = Annotated[str | None, typer.Option("--plant", help="Scenario that provides the load for the virtual servos.")]
+PlantVariant = Annotated[str | None, typer.Option("--variant", help="Variant of that scenario.")]
 
 
 class MissingClientLibrary(DynsimError):
@@ -99,11 +99,8 @@ def scan(
     require_client_library()
     from dynsim.hardware.bus import scan as survey
     from dynsim.hardware.bus.control_table import RETURN_DELAY_SECONDS_PER_UNIT, VOLT_PER_UNIT
-    from dynsim.hardware.errors import VerificationFailed
-    from dynsim.hardware.servo_map import load_servo_map
 
-    servo_map = load_servo_map(map_file) if map_file else None
-    bauds = (baud,) if baud else (servo_map.bus.baud,) if servo_map else survey.SCAN_BAUD_RATES
+    servo_map, bauds = _map_and_bauds(map_file, baud, survey.SCAN_BAUD_RATES)
     answers = survey.scan(port, bauds)
     if not answers:
         raise VerificationFailed(
@@ -114,10 +111,8 @@ def scan(
     table = Table("ID", "model", "fw", "bit/s", "mode", "delay µs", "V", "°C", "torque", "error", "joint")
     for servo in answers:
         registers = servo.registers
-        delay, volts = (
-            registers["return_delay"] * RETURN_DELAY_SECONDS_PER_UNIT,
-            registers["present_voltage"] * VOLT_PER_UNIT,
-        )
+        delay = registers["return_delay"] * RETURN_DELAY_SECONDS_PER_UNIT
+        volts = registers["present_voltage"] * VOLT_PER_UNIT
         numbers = [f"{delay * 1e6:.0f}", f"{volts:.1f}", f"{registers['present_temperature']:.0f}"]
         error = f"0x{registers['hardware_error']:02x}" if registers["hardware_error"] else "-"
         joint = owners[servo.id].joint if servo.id in owners else "-"
@@ -128,8 +123,14 @@ def scan(
         _compare_with_map(answers, servo_map)
 
 
+def _map_and_bauds(map_file: Path | None, baud: int | None, common: tuple[int, ...]) -> tuple[Any, tuple[int, ...]]:
+    from dynsim.hardware.servo_map import load_servo_map
+
+    servo_map = load_servo_map(map_file) if map_file else None
+    return servo_map, (baud,) if baud else (servo_map.bus.baud,) if servo_map else common
+
+
 def _compare_with_map(answers: list[Any], servo_map: Any) -> None:
-    from dynsim.hardware.errors import VerificationFailed
 
     seen = {servo.id: servo for servo in answers}
     wrong = [f"{servo} did not answer" for servo in servo_map.servos if servo.id not in seen]
@@ -193,10 +194,8 @@ def replay(
     yes: Yes = False,
     configure: Configure = False,
     faults: Faults = None,
-    plant: Annotated[
-        str | None, typer.Option("--plant", help="Scenario that provides the load for the virtual servos.")
-    ] = None,
-    variant: Annotated[str | None, typer.Option("--variant", help="Variant of that scenario.")] = None,
+    plant: Plant = None,
+    variant: PlantVariant = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="Do not show a progress bar.")] = False,
     trust: TrustOption = False,
 ) -> None:
@@ -205,23 +204,20 @@ def replay(
     Ctrl-C once: controlled stop. Twice: torque off.
     """
     require_client_library()
-    from dynsim.cli.hardware import confirm_replay
-    from dynsim.hardware.errors import ServoMapError
     from dynsim.hardware.ports import VIRTUAL, bus_on
     from dynsim.hardware.replay.session import shown_by
-    from dynsim.hardware.virtual.faults import load_fault_script
 
     if (faults or plant) and port != VIRTUAL:
         raise ServoMapError("--faults and --plant require virtual servos; use --port virtual")
     simulated, servo_map, motion = _checked(record, map_file, rate, speed, trust)
-    script = load_fault_script(faults, servo_map.ids) if faults else None
-    robot = _plant(plant, variant, servo_map, motion) if plant else None
+    script = _fault_script(faults, servo_map)
+    robot = _plant(plant, variant, servo_map, motion.start)
     folder = out or Path("results") / file_name(f"{servo_map.robot}_replay")
     for warning in motion.warnings:
         console.print(f"warning: {warning}")
     moves = live or port == VIRTUAL
     if live and port != VIRTUAL:
-        confirm_replay(console, servo_map, motion, port, asked=not yes)
+        confirm_replay(servo_map, motion, port, asked=not yes)
     with shown_by({"standard output": sys.stdout}, folder) as lost:
         result = replayed(
             motion,
@@ -265,9 +261,15 @@ def replayed(
 
 def print_dry_run(result: Any) -> None:
     """Print the result of a replay without motion."""
-    from dynsim.cli.hardware import print_limits
 
-    print_limits(console, result.limits)
+    from dynsim.hardware.replay.verify import QUANTITIES, differences
+
+    table = Table("joint", "ID", *QUANTITIES, title="limits: servo | map")
+    for row in result.limits:
+        table.add_row(row.joint, str(row.id), *(" | ".join(cell) for cell in row.cells))
+    console.print(table)
+    for line in differences(result.limits):
+        console.print(line)
     console.print("dry run: servos verified and bus timed, nothing was moved; use --live to move")
 
 
@@ -278,11 +280,17 @@ def print_replay(result: Any, done: str, folder: Path, record: Path) -> None:
     console.print(f"compare: dynsim hw compare {record} {folder / 'measured.h5'}")
 
 
-def _plant(scenario: str, variant: str | None, servo_map: Any, motion: Any) -> Any:
+def _fault_script(path: Path | None, servo_map: Any) -> Any:
+    from dynsim.hardware.virtual.faults import load_fault_script
+
+    return load_fault_script(path, servo_map.ids) if path else None
+
+
+def _plant(scenario: str | None, variant: str | None, servo_map: Any, start: Sequence[float] | None = None) -> Any:
     from dynsim.hardware.virtual.simulated_plant import simulated_arm
 
-    posture = dict(zip((servo.label for servo in servo_map.servos), motion.start, strict=True))
-    return simulated_arm(scenario, variant, servo_map, posture)
+    posture = {} if start is None else dict(zip((servo.label for servo in servo_map.servos), start, strict=True))
+    return simulated_arm(scenario, variant, servo_map, posture) if scenario else None
 
 
 def print_timing(result: Any) -> None:
@@ -369,24 +377,20 @@ def compare(
 @hw.command(epilog="Example: dynsim hw virtual --map arm --link /tmp/ttyDXL")
 def virtual(
     map_file: MapFile,
-    faults: Annotated[Path | None, typer.Option("--faults", help="Fault script.")] = None,
+    faults: Faults = None,
     link: Annotated[Path | None, typer.Option("--link", help="Create this symbolic link to the device.")] = None,
-    plant: Annotated[
-        str | None, typer.Option("--plant", help="Scenario that provides the load for the servos.")
-    ] = None,
-    variant: Annotated[str | None, typer.Option("--variant", help="Variant of that scenario.")] = None,
+    plant: Plant = None,
+    variant: PlantVariant = None,
 ) -> None:
     """Run virtual servos on a pseudo-terminal for any Dynamixel tool; stop with Ctrl-C."""
     require_client_library()
     from dynsim.hardware.replay.output import StopRequest, stop_on_signals
     from dynsim.hardware.servo_map import load_servo_map
-    from dynsim.hardware.virtual.faults import load_fault_script
     from dynsim.hardware.virtual.line import PseudoTerminal, line_for_map
-    from dynsim.hardware.virtual.simulated_plant import simulated_arm
 
     servo_map = load_servo_map(map_file)
-    script = load_fault_script(faults, servo_map.ids) if faults else None
-    robot = simulated_arm(plant, variant, servo_map, {}) if plant else None
+    script = _fault_script(faults, servo_map)
+    robot = _plant(plant, variant, servo_map)
     terminal = PseudoTerminal(line_for_map(servo_map, script=script, plant=robot), link)
     stop = StopRequest()
     # A plain line, because other programs wait for it.
@@ -415,11 +419,8 @@ def stop_servos(
     """
     require_client_library()
     from dynsim.hardware.bus import scan as survey
-    from dynsim.hardware.errors import VerificationFailed
-    from dynsim.hardware.servo_map import load_servo_map
 
-    servo_map = load_servo_map(map_file) if map_file else None
-    bauds = (baud,) if baud else (servo_map.bus.baud,) if servo_map else survey.STOP_BAUD_RATES
+    servo_map, bauds = _map_and_bauds(map_file, baud, survey.STOP_BAUD_RATES)
     asked = survey.stop_all(port, bauds, servo_map.ids if servo_map else ())
     on = [id_ for id_, still_on in asked.torque.items() if still_on]
     # Without a map, servos at a bit rate at which the port failed are unknown.
@@ -456,8 +457,6 @@ def calibrate(
     With --nudge: find joints with the wrong direction instead, one by one.
     """
     require_client_library()
-    from dynsim.cli.hardware import find_directions, may_write
-    from dynsim.hardware.errors import ServoMapError, VerificationFailed
     from dynsim.hardware.ports import bus_on
     from dynsim.hardware.servo_map import SHIPPED, load_servo_map, read_zero_ticks, write_into_map
 
@@ -471,8 +470,9 @@ def calibrate(
         raise ServoMapError(f"{map_file} has no joint {', '.join(unknown)}; it has {', '.join(servo_map.joints)}")
     if nudge:
         chosen = [servo for servo in servo_map.servos if servo.joint in (joint or servo_map.joints)]
-        signs, blocked = find_directions(console, servo_map, chosen, port, live=live, asked=not yes)
-        if signs and (write or (not shipped and may_write(console, list(signs), target))):
+        signs, blocked = find_directions(servo_map, chosen, port, live=live, asked=not yes)
+        text = f"The sign of {', '.join(signs)} is wrong in {target}."
+        if signs and (write or (not shipped and _agreed(text, "write it?"))):
             write_into_map(servo_map, "sign", signs, target)
             console.print(f"written to {target}")
         if blocked:
@@ -529,14 +529,11 @@ def hw_drive(
     """
     require_websockets()
     require_client_library()
-    from dynsim.cli.hardware import confirm_replay
     from dynsim.engine.recording import RUN_FILES
-    from dynsim.hardware.errors import ServoMapError
     from dynsim.hardware.ports import VIRTUAL, bus_on
     from dynsim.hardware.replay.drive import check_drive
     from dynsim.hardware.replay.session import shown_by
     from dynsim.hardware.servo_map import load_servo_map
-    from dynsim.hardware.virtual.faults import load_fault_script
     from dynsim.scenario import load_scenario
     from dynsim.system.files import check_writable
     from dynsim.teleop.snake import SpeedLimits
@@ -546,7 +543,7 @@ def hw_drive(
         raise ServoMapError("--faults requires virtual servos; use --port virtual")
     loaded = load_scenario(scenario, variant, parsed_overrides(overrides))
     servo_map = load_servo_map(map_file)
-    script = load_fault_script(faults, servo_map.ids) if faults else None
+    script = _fault_script(faults, servo_map)
     folder = out or new_folder(Path("results", loaded.name))
     check_writable(folder, RUN_FILES)
     limits = SpeedLimits(speed, turn, base_speed)
@@ -566,7 +563,7 @@ def hw_drive(
             scene=ready.still.scene,
         )
         if live and port != VIRTUAL:
-            confirm_replay(console, servo_map, motion, port, asked=not yes, at_most=True)
+            confirm_replay(servo_map, motion, port, asked=not yes, at_most=True)
         if moves:
             print_address(ready.address, "Ctrl-C stops the robot, a second one releases it", open_=open_)
         posture = dict(zip(servo_map.joints, motion.start.tolist(), strict=True))
@@ -635,15 +632,11 @@ ANSWERS = ("y", "n", "again")
 CLEAR = "Is everyone clear of the robot, and is the power cut within reach?"
 
 
-def confirm_replay(
-    console: Console, servo_map: ServoMap, motion: MotionTask, port: str, *, asked: bool, at_most: bool = False
-) -> None:
+def confirm_replay(servo_map: ServoMap, motion: MotionTask, port: str, *, asked: bool, at_most: bool = False) -> None:
     """Show the distance to the start and ask for confirmation.
 
     Parameters
     ----------
-    console : Console
-        Output.
     servo_map : ServoMap
         Map of the servos.
     motion : MotionTask
@@ -662,6 +655,9 @@ def confirm_replay(
     PortError, VerificationFailed
         If the posture cannot be read.
     """
+    from dynsim.hardware.ports import bus_on
+    from dynsim.hardware.replay.verify import way_to_start
+
     with bus_on(port, servo_map) as (bus, _):
         approach = way_to_start(bus, servo_map, motion.start)
     console.print(
@@ -670,39 +666,25 @@ def confirm_replay(
     )
     for distance in approach.distances[:1]:
         console.print(f"largest distance to the start: {distance}")
-    agreed = not asked or _agreed(console, CLEAR, "move?")
+    agreed = not asked or _agreed(CLEAR, "move?")
     if agreed and approach.far:
         still = "" if asked else " (asked even with --yes)"
         bound = servo_map.safety.start_distance
         console.print(f"more than safety.start_distance = {bound:g} rad from the start{still}:")
         for distance in approach.far:
             console.print(f"  {distance}")
-        agreed = _agreed(
-            console, "All joints move to the start together. Is the whole path free?", "move to the start?"
-        )
+        agreed = _agreed("All joints move to the start together. Is the whole path free?", "move to the start?")
     if not agreed:
         raise ReplayInterrupted("not confirmed; nothing was moved")
 
 
-def print_limits(console: Console, rows: Sequence[LimitRow]) -> None:
-    """Print the limits stored in the servos next to those of the map."""
-    table = Table("joint", "ID", *QUANTITIES, title="limits: servo | map")
-    for row in rows:
-        table.add_row(row.joint, str(row.id), *(" | ".join(cell) for cell in row.cells))
-    console.print(table)
-    for line in differences(rows):
-        console.print(line)
-
-
 def find_directions(
-    console: Console, servo_map: ServoMap, chosen: Sequence[MappedServo], port: str, *, live: bool, asked: bool
+    servo_map: ServoMap, chosen: Sequence[MappedServo], port: str, *, live: bool, asked: bool
 ) -> tuple[dict[str, int], list[str]]:
     """Nudge one joint after the other, and ask whether it moved in the direction of the map.
 
     Parameters
     ----------
-    console : Console
-        Output.
     servo_map : ServoMap
         Map of the servos.
     chosen : sequence of MappedServo
@@ -728,13 +710,16 @@ def find_directions(
     VerificationFailed, ReplayAborted
         If a servo is not ready to move, or an abort rule ended a nudge; torque is off.
     """
+    from dynsim.hardware.nudge import ANGLE, swapped
+    from dynsim.hardware.ports import VIRTUAL, bus_on
+
     real = port != VIRTUAL
     angle = f"{math.degrees(ANGLE):g}°"
     if real and live and asked:
         console.print(
             f"{servo_map.robot}: {len(chosen)} joint(s) will turn {angle} and back, one by one; torque off elsewhere."
         )
-        if not _agreed(console, CLEAR, "move?"):
+        if not _agreed(CLEAR, "move?"):
             raise ReplayInterrupted("not confirmed; nothing was moved")
     agrees: dict[str, bool] = {}
     blocked: list[str] = []
@@ -744,10 +729,10 @@ def find_directions(
             if moved is None:
                 console.print(f"{servo}: ready to move")
                 continue
-            answer = _ask_direction(console, moved, asked=asked)
+            answer = _ask_direction(moved, asked=asked)
             while answer == "again":
                 moved = _nudge(bus, clock, servo_map, servo, live=True) or moved
-                answer = _ask_direction(console, moved, asked=asked)
+                answer = _ask_direction(moved, asked=asked)
             if not moved.followed:
                 blocked.append(servo.joint)
             agrees[servo.joint] = answer == "y"
@@ -759,18 +744,16 @@ def find_directions(
     return signs, blocked
 
 
-def may_write(console: Console, joints: Sequence[str], target: object) -> bool:
-    """Ask whether to change the map."""
-    return _agreed(console, f"The sign of {', '.join(joints)} is wrong in {target}.", "write it?")
-
-
 def _nudge(bus: Bus, clock: Clock, servo_map: ServoMap, servo: MappedServo, *, live: bool) -> Nudge | None:
+    from dynsim.hardware.nudge import nudge
+    from dynsim.hardware.replay.output import StopRequest, stop_on_signals
+
     stop = StopRequest()
     with stop_on_signals(stop):
         return nudge(servo_map, servo, bus, clock, live=live, stop=stop)
 
 
-def _ask_direction(console: Console, moved: Nudge, *, asked: bool) -> str:
+def _ask_direction(moved: Nudge, *, asked: bool) -> str:
     """Print the motion of a joint and ask for its direction; returns "y", "n" or "again"."""
     console.print(
         f"{moved.joint} (ID {moved.id}): {math.degrees(moved.moved):+.1f}° (map), {moved.ticks:+d} ticks, and back"
@@ -788,7 +771,7 @@ def _ask_direction(console: Console, moved: Nudge, *, asked: bool) -> str:
         raise ReplayInterrupted(f"no answer about {moved.joint}; torque is off, nothing was written") from None
 
 
-def _agreed(console: Console, text: str, question: str) -> bool:
+def _agreed(text: str, question: str) -> bool:
     console.print(text)
     try:
         return typer.confirm(question)

@@ -16,7 +16,6 @@ from rich.console import Console
 from rich.table import Table
 
 from dynsim.errors import RecordError
-from dynsim.planner.answer import BracePlan, Size
 from dynsim.system.terminal import Terminal, escaped, escaped_line, plain
 
 if TYPE_CHECKING:
@@ -27,6 +26,7 @@ if TYPE_CHECKING:
 
     from dynsim.engine import Start
     from dynsim.engine.compilation import Compilation
+    from dynsim.planner.answer import BracePlan, Size
     from dynsim.record import Record
     from dynsim.scenario import Scenario
     from dynsim.studies.compare import VariantProgress

@@ -647,7 +647,8 @@ def read_zero_ticks(bus: Bus, servos: Iterable[MappedServo]) -> dict[str, int]:
         replies = bus.sync_read([servo.id for servo in chosen], *STATE_BLOCK).replies
         for servo in chosen:
             if servo.id in replies:
-                ticks[servo.joint].append(int.from_bytes(replies[servo.id].data[6:10], "little", signed=True))
+                registers = servo.model.registers_in(STATE_BLOCK[0], replies[servo.id].data)
+                ticks[servo.joint].append(registers["present_position"])
     for servo in chosen:
         seen = ticks[servo.joint]
         if len(seen) < READS // 2:

@@ -14,12 +14,12 @@ from support.messages import check_message, lines_with, mentions, raises
 
 from dynsim import cli
 from dynsim.cli import hardware
+from dynsim.hardware import ports
 from dynsim.hardware.bus.control_table import RAD_PER_TICK
 from dynsim.hardware.errors import ReplayAborted, ReplayInterrupted, ServoMapError, VerificationFailed
 from dynsim.hardware.nudge import ANGLE, PAUSE, SPEED, nudge, swapped
 from dynsim.hardware.replay.output import StopRequest
 from dynsim.hardware.servo_map import load_servo_map, write_into_map
-from dynsim.system.terminal import Terminal
 
 from .conftest import Run
 
@@ -186,7 +186,7 @@ def on_the_rig(rig, monkeypatch) -> Run:
     def bus_on(port, servo_map):
         yield run.replay.bus, run.clock
 
-    monkeypatch.setattr(hardware, "bus_on", bus_on)
+    monkeypatch.setattr(ports, "bus_on", bus_on)
     return run
 
 
@@ -228,16 +228,16 @@ def test_a_replay_asks_with_the_way_to_its_start_and_again_where_it_is_far(
     monkeypatch.setattr(sys, "stdin", io.StringIO(answers))
     motion = rig.motion()
     with nullcontext() if agreed else raises(ReplayInterrupted):
-        hardware.confirm_replay(Terminal(soft_wrap=True), rig.map, motion, "/dev/ttyRobot", asked=asked)
+        hardware.confirm_replay(rig.map, motion, "/dev/ttyRobot", asked=asked)
     out = capsys.readouterr().out
     now, start = (0.9 if far else 0.1), motion.path.position[0][0]
     assert lines_with(out, "shoulder", f"{abs(now - start):.3f} rad")
     assert mentions(out, f"{1.875 * abs(now - start) / 0.3:.1f} s")
-    assert mentions(out, "safety.start_distance, 0.5 rad") is (far and (not asked or answers[0] == "y"))
+    assert mentions(out, "safety.start_distance = 0.5 rad") is (far and (not asked or answers[0] == "y"))
     assert ("--yes" in out) is (far and not asked)
 
 
 def test_who_does_not_answer_is_named_before_anything_is_asked(on_the_rig, rig) -> None:
     on_the_rig.line.servos.dead.add(2)
     with raises(VerificationFailed, "elbow (ID 2)"):
-        hardware.confirm_replay(Terminal(), rig.map, rig.motion(), "/dev/ttyRobot", asked=True)
+        hardware.confirm_replay(rig.map, rig.motion(), "/dev/ttyRobot", asked=True)

@@ -300,18 +300,6 @@ def test_every_model_follows_a_goal_and_tells_its_effort(model: ServoModel) -> N
     ), "the factory's limit is about the no-load speed"
 
 
-def test_servos_obey_their_secondary_id_and_do_not_answer_to_it(three: Line) -> None:
-    for id_ in (2, 3):
-        three.write(id_, "shadow_id", 50)
-    assert three.write(50, "led", 1)[0] == COMM_RX_TIMEOUT
-    assert [three.servos.registers[id_]["led"] for id_ in (1, 2, 3)] == [0, 1, 1]
-    assert three.write(50, "return_delay", 7)[0] == COMM_RX_TIMEOUT
-    assert [three.servos.registers[id_]["return_delay"] for id_ in (2, 3)] == [250, 250], "RAM only"
-    LIBRARY.syncWriteTxOnly(three.port, F["led"].address, 1, [50, 0], 2)
-    assert [three.servos.registers[id_]["led"] for id_ in (1, 2, 3)] == [0, 0, 0]
-    assert not three.answers(50)
-
-
 def test_the_profile_is_told_to_those_who_read_it(three: Line) -> None:
     three.write(1, "torque_enable", 1)
     start = three.read(1, "present_position")

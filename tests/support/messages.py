@@ -17,7 +17,7 @@ Name = str | re.Pattern[str]
 PHRASES = {
     # Warnings and errors.
     "all silent": "is the supply or the line lost?",
-    "busy": "too busy",
+    "busy": "the operating system delayed this program",
     "fails": "does not survive",
     "incomplete": "incomplete",
     "interrupted": "interrupted at t",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass
 
 from dynsim.hardware.bus.control_table import MODEL_BY_NUMBER, MX_106
@@ -58,13 +58,10 @@ def scan(port: str, bauds: tuple[int, ...] = SCAN_BAUD_RATES) -> list[ScannedSer
     """
     servos = []
     for baud in bauds:
-        bus = DynamixelBus(open_serial_port(port, baud))
-        try:
+        with closing(DynamixelBus(open_serial_port(port, baud))) as bus:
             for id_, (model, firmware) in sorted(bus.ping_all().items()):
                 registers = {name: _register(bus, id_, name) for name in SCANNED_REGISTERS}
                 servos.append(ScannedServo(id_, model, firmware, baud, registers))
-        finally:
-            bus.close()
     return servos
 
 
@@ -128,23 +125,18 @@ def stop_all(port: str, bauds: tuple[int, ...] = STOP_BAUD_RATES, ids: tuple[int
 
 
 def _torque_off(port: str, baud: int) -> None:
-    bus = DynamixelBus(open_serial_port(port, baud, exclusive=False))
-    try:
-        bus.torque_off_all()
-        # Closing discards bytes that the driver has not sent yet.
-        bus.port.ser.flush()
-    except (OSError, TerminalError) as error:
-        raise PortError(f"{port}: the port died ({error})") from error
-    finally:
-        bus.close()
+    with closing(DynamixelBus(open_serial_port(port, baud, exclusive=False))) as bus:
+        try:
+            bus.torque_off_all()
+            # Closing discards bytes that the driver has not sent yet.
+            bus.port.ser.flush()
+        except (OSError, TerminalError) as error:
+            raise PortError(f"{port}: the port died ({error})") from error
 
 
 def _read_torque(port: str, baud: int, ids: tuple[int, ...], torque: dict[int, bool]) -> None:
-    bus = DynamixelBus(open_serial_port(port, baud, exclusive=False))
-    try:
+    with closing(DynamixelBus(open_serial_port(port, baud, exclusive=False))) as bus:
         for id_ in ids or bus.ping_all():
             torque.setdefault(id_, True)
             with suppress(NoAnswer, RequestRefused):
                 torque[id_] = bool(bus.read(id_, MX_106.fields["torque_enable"]))
-    finally:
-        bus.close()

@@ -54,9 +54,9 @@ from dynsim.hardware.replay.output import (
     StopRequest,
     robot_state,
 )
-from dynsim.hardware.replay.rules import AbortRules, Cause, Cycle, Fault, decode_health, watchdog_units
+from dynsim.hardware.replay.rules import AbortRules, Cause, Cycle, Fault, watchdog_units
 from dynsim.hardware.replay.trajectory import QUINTIC_PEAK, Approach, GoalCourse, MotionTask, PlannedCourse
-from dynsim.hardware.replay.verify import Registers, all_registers, configure, difference_lines, verify
+from dynsim.hardware.replay.verify import Registers, all_registers, configure, difference_lines, read_registers, verify
 from dynsim.hardware.servo_map import FaultPolicy, MappedServo, ServoMap
 from dynsim.system.files import write_json
 
@@ -269,7 +269,7 @@ class Loop:
             # A sync read of one servo: a silent servo costs one time-out and no retry.
             answer = self.bus.sync_read((servo.id,), *HEALTH_BLOCK).replies.get(servo.id)
             if answer is not None:
-                cycle.health[servo.id] = decode_health(servo, answer.data)
+                cycle.health[servo.id] = servo.model.registers_in(HEALTH_BLOCK[0], answer.data)
         now = self._clock.now()
         if self._last_contact < math.inf:
             cycle.silence, self._last_contact = max(began - self._last_contact, now - began), now
@@ -319,8 +319,6 @@ REST_TIME = 1.0
 REST_CYCLES = 10
 AT_REST = 0.1
 """Speed below which joints and wheels are at rest [rad/s]; a few units of the velocity register."""
-READS = 3
-"""Number of reads after which a servo without answer counts as silent."""
 
 
 class Ending:
@@ -571,16 +569,9 @@ class Ending:
         self._journal.add_line(f"torque off{confirmed}")
 
 
-def read_health(bus: Bus, servos: Sequence[MappedServo]) -> dict[int, dict[str, int]]:
+def read_health(bus: Bus, servos: Sequence[MappedServo]) -> dict[int, Registers]:
     """Read registers 64 to 146 of all servos that answer, by ID and name. Raises PortError."""
-    health: dict[int, dict[str, int]] = {}
-    for _ in range(READS):
-        silent = [servo for servo in servos if servo.id not in health]
-        if not silent:
-            break
-        replies = bus.sync_read([servo.id for servo in silent], *HEALTH_BLOCK).replies
-        health |= {servo.id: decode_health(servo, replies[servo.id].data) for servo in silent if servo.id in replies}
-    return health
+    return read_registers(bus, servos, HEALTH_BLOCK)
 
 
 def read_back(bus: Bus, servos: Sequence[MappedServo]) -> tuple[ServoEnd, ...]:

@@ -18,7 +18,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from enum import IntEnum
 from pathlib import Path
-from typing import Any, ParamSpec, Protocol, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -636,7 +636,36 @@ class GrowingFile:
             self.path.unlink()
 
 
-class RunLog:
+class Outlet:
+    """Output that writes data of the control loop from memory to a file, or to a display.
+
+    Attributes
+    ----------
+    name : str
+    failure : Exception or None
+        Error after which no more data were written.
+    """
+
+    name: str
+    failure: Exception | None = None
+    _file: GrowingFile | None = None
+
+    def pump(self) -> None:
+        """Write the data since the last call. After an exception it is not called again."""
+        raise NotImplementedError
+
+    def close(self) -> None:
+        """Close the output after the last call of ``pump``, even if that failed."""
+        if self._file:
+            self._file.close()
+
+    def discard(self) -> None:
+        """Close and remove the file, if its run does not start."""
+        if self._file:
+            self._file.discard()
+
+
+class RunLog(Outlet):
     """Log with lines "time [s]  state  text". Another thread writes them to the file by :meth:`pump`.
 
     Parameters
@@ -647,8 +676,6 @@ class RunLog:
     Attributes
     ----------
     lines : list of str
-    failure : Exception or None
-        Error after which no more lines were written to the file.
     wake : callable
         Called after each line, to wake the thread that calls :meth:`pump`.
 
@@ -662,7 +689,6 @@ class RunLog:
 
     def __init__(self, path: Path | None) -> None:
         self.lines: list[str] = []
-        self.failure: Exception | None = None
         self.wake: Callable[[], None] = lambda: None
         self._file = GrowingFile(path) if path else None
         self._written = 0
@@ -672,22 +698,13 @@ class RunLog:
         self.wake()
 
     def pump(self) -> None:
-        count = len(self.lines)
-        if self._file and count > self._written:
-            text = "\n".join([*self.lines[self._written : count], ""])
-            self._written = count
-            self._file.append(text.encode("utf-8", errors="backslashreplace"))
-
-    def close(self) -> None:
-        if self._file:
-            self._file.close()
-
-    def discard(self) -> None:
-        if self._file:
-            self._file.discard()
+        lines = self.lines[self._written :]
+        if self._file and lines:
+            self._written += len(lines)
+            self._file.append("".join(f"{line}\n" for line in lines).encode("utf-8", errors="backslashreplace"))
 
 
-class RowStream:
+class RowStream(Outlet):
     """Stream the rows of a replay to ``measured.part``: one line of JSON, then binary rows.
 
     Parameters
@@ -707,9 +724,9 @@ class RowStream:
     """
 
     name = "streamed record"
+    _file: GrowingFile
 
     def __init__(self, path: Path, recorder: Recorder, layout: Layout, scene: Scene | None) -> None:
-        self.failure: Exception | None = None
         self._recorder = recorder
         self._written = 0
         header = {
@@ -725,33 +742,12 @@ class RowStream:
             self._file.discard()
             raise
 
-    def discard(self) -> None:
-        self._file.discard()
-
     def pump(self) -> None:
         rows = self._recorder.since(self._written)
         if rows:
             self._written += len(rows) // self._recorder.type.itemsize
             self._file.append(rows)
             self._file.sync()
-
-    def close(self) -> None:
-        self._file.close()
-
-
-class Outlet(Protocol):
-    """Interface of an output that writes data of the control loop from memory to a file or display."""
-
-    name: str
-    failure: Exception | None
-
-    def pump(self) -> None:
-        """Write the data since the last call. After an exception it is not called again."""
-        ...
-
-    def close(self) -> None:
-        """Close the output after the last call of ``pump``, even if that failed."""
-        ...
 
 
 class Background:
@@ -884,19 +880,12 @@ DISPLAY_PATIENCE = 1.0
 """Maximum wait for a blocked terminal after the run [s]."""
 
 
-class Display:
-    """Progress bar with state, following error and temperature; an observer that shows the latest ReplayProgress.
-
-    Attributes
-    ----------
-    failure : Exception or None
-        Error after which nothing is drawn.
-    """
+class Display(Outlet):
+    """Progress bar with state, following error and temperature; an observer that shows the latest ReplayProgress."""
 
     name = "progress bar"
 
     def __init__(self, console: Console) -> None:
-        self.failure: Exception | None = None
         self._latest: ReplayProgress | None = None
         self._bar = Bar(
             TextColumn("{task.description:<13}"),

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.hardware.bus.control_table import (
-    HEALTH_BLOCK,
     VOLT_PER_UNIT,
     WATCHDOG_SECONDS_PER_UNIT,
     describe_hardware_error,
@@ -165,7 +164,7 @@ class AbortRules:
         safety = self._safety
         return [
             *([self.stall(cycle.silence)] if self.stalled(cycle.silence) else ()),
-            *(self._alert(cycle) if cycle.alert.any() else ()),
+            *self._alert(cycle),
             *(fault for id_, registers in cycle.health.items() for fault in self._health(self._by_id[id_], registers)),
             *self._silent(np.flatnonzero(self._missed >= safety.missed_cycles), cycle),
             *self._beyond(
@@ -198,19 +197,14 @@ class AbortRules:
         self._declared.add((cause, id_))
         return not known
 
+    def _newly(self, cause: Cause, indices: NDArray[np.intp]) -> list[MappedServo]:
+        """Mark a fault of some servos as declared and return the servos for which it was not declared before."""
+        return [self._servos[k] for k in indices if self._new(cause, self._servos[k].id)]
+
     def _alert(self, cycle: Cycle) -> list[Fault]:
-        hit = [
-            servo
-            for servo, alert in zip(self._servos, cycle.alert, strict=True)
-            if alert and self._new(Cause.ALERT, servo.id)
-        ]
-        if not hit:
-            return []
-        return [
-            Fault(
-                Cause.ALERT, f"hardware error reported by {', '.join(map(str, hit))}", tuple(servo.id for servo in hit)
-            )
-        ]
+        hit = self._newly(Cause.ALERT, np.flatnonzero(cycle.alert))
+        text = f"hardware error reported by {', '.join(map(str, hit))}"
+        return [Fault(Cause.ALERT, text, tuple(servo.id for servo in hit))] if hit else []
 
     def _health(self, servo: MappedServo, registers: dict[str, int]) -> list[Fault]:
         faults: list[Fault] = []
@@ -236,7 +230,7 @@ class AbortRules:
         return faults
 
     def _silent(self, indices: NDArray[np.intp], cycle: Cycle) -> list[Fault]:
-        hit = [self._servos[k] for k in indices if self._new(Cause.MISSED_STATUS, self._servos[k].id)]
+        hit = self._newly(Cause.MISSED_STATUS, indices)
         if not hit:
             return []
         text = f"no status for {self._safety.missed_cycles} cycles: {', '.join(map(str, hit))}"
@@ -273,8 +267,3 @@ class AbortRules:
 
 def _count(counters: NDArray[np.int64], hit: NDArray[np.bool_], unknown: NDArray[np.bool_]) -> NDArray[np.int64]:
     return np.where(unknown, counters, np.where(hit, counters + 1, 0))
-
-
-def decode_health(servo: MappedServo, data: bytes) -> dict[str, int]:
-    """Decode the registers of a health block; the keys are names of registers."""
-    return servo.model.registers_in(HEALTH_BLOCK[0], data)

@@ -42,6 +42,7 @@ NO_ANSWER_HINT = (
 QUANTITIES = ("position °", "velocity rad/s", "torque N m", "temperature °C", "supply V")
 VOLTAGE_SHUTDOWN = 1 << next(bit for bit, name in HARDWARE_ERRORS.items() if name == "input voltage")
 ATTEMPTS = 3
+"""Number of reads after which a servo without answer counts as silent."""
 
 Registers = dict[str, int]
 
@@ -352,8 +353,12 @@ class Distance:
     now: float
     start: float
 
+    @property
+    def size(self) -> float:
+        return abs(self.start - self.now)
+
     def __str__(self) -> str:
-        return f"{self.joint} {abs(self.start - self.now):.3f} rad (from {self.now:.3f} to {self.start:.3f})"
+        return f"{self.joint} {self.size:.3f} rad (from {self.now:.3f} to {self.start:.3f})"
 
 
 @dataclass(frozen=True)
@@ -396,22 +401,28 @@ def way_to_start(bus: Bus, servo_map: ServoMap, start: NDArray[np.float64]) -> W
         for servo, target in zip(servo_map.servos, start, strict=True)
         if servo.in_position_mode
     ]
-    distances.sort(key=lambda distance: -abs(distance.start - distance.now))
-    furthest = abs(distances[0].start - distances[0].now) if distances else 0.0
-    far = [distance for distance in distances if abs(distance.start - distance.now) > servo_map.safety.start_distance]
-    duration = QUINTIC_PEAK * furthest / servo_map.safety.approach_velocity
-    return WayToStart(tuple(distances), duration, tuple(far))
+    distances.sort(key=lambda distance: -distance.size)
+    far = tuple(distance for distance in distances if distance.size > servo_map.safety.start_distance)
+    duration = QUINTIC_PEAK * max((distance.size for distance in distances), default=0.0)
+    return WayToStart(tuple(distances), duration / servo_map.safety.approach_velocity, far)
 
 
-def read_ticks(bus: Bus, servos: list[MappedServo]) -> dict[int, int]:
-    """Return the position of each servo [ticks], by ID. Raises VerificationFailed if a servo does not answer."""
-    ticks: dict[int, int] = {}
+def read_registers(bus: Bus, servos: Sequence[MappedServo], block: tuple[int, int]) -> dict[int, Registers]:
+    """Read a block of registers of all servos that answer one of ATTEMPTS reads, by ID. Raises PortError."""
+    registers: dict[int, Registers] = {}
     for _ in range(ATTEMPTS):
-        missing = [servo.id for servo in servos if servo.id not in ticks]
+        missing = {servo.id: servo for servo in servos if servo.id not in registers}
         if not missing:
             break
-        for id_, reply in bus.sync_read(missing, *STATE_BLOCK).replies.items():
-            ticks[id_] = int.from_bytes(reply.data[6:10], "little", signed=True)
+        replies = bus.sync_read([*missing], *block).replies
+        registers |= {id_: missing[id_].model.registers_in(block[0], reply.data) for id_, reply in replies.items()}
+    return registers
+
+
+def read_ticks(bus: Bus, servos: Sequence[MappedServo]) -> dict[int, int]:
+    """Return the position of each servo [ticks], by ID. Raises VerificationFailed if a servo does not answer."""
+    registers = read_registers(bus, servos, STATE_BLOCK)
+    ticks = {id_: values["present_position"] for id_, values in registers.items()}
     silent = [str(servo) for servo in servos if servo.id not in ticks]
     if silent:
         busy = too_busy(bus)

@@ -192,23 +192,17 @@ class VirtualPort(PortHandler):
         self.line = line
         self.clock = clock
         self.baudrate = baud
-        self.is_open = True
+        self.setupPort(baud)
         self.longest_pause = 0.0
-        self.tx_time_per_byte = 1e3 / baud * 10.0
         self._arriving: deque[tuple[float, bytes]] = deque()
         self._input = bytearray()
-
-    def openPort(self) -> bool:
-        return True
 
     def closePort(self) -> None:
         self.is_open = False
 
-    def setBaudRate(self, baudrate: int) -> bool:
-        if self.getCFlagBaud(baudrate) <= 0:
-            return False
-        self.baudrate = baudrate
-        self.tx_time_per_byte = 1e3 / baudrate * 10.0
+    def setupPort(self, cflag_baud: int) -> bool:
+        self.is_open = True
+        self.tx_time_per_byte = 1e3 / self.baudrate * 10.0
         return True
 
     def getCurrentTime(self) -> float:

@@ -13,9 +13,7 @@ from numpy.typing import NDArray
 from dynsim.hardware.bus.control_table import (
     BAUD_RATES,
     BROADCAST_ID,
-    EEPROM_END,
     INDIRECT_BLOCKS,
-    MAX_ID,
     RAD_PER_TICK,
     RAD_S2_PER_UNIT,
     RAD_S_PER_UNIT,
@@ -114,13 +112,11 @@ class ServoRegisters:
         position = 0
         while position < len(targets):
             start = targets[position]
-            if not direct and self._is_pointer(start):
-                if self["torque_enable"]:
+            pointer = any(pointers <= start < pointers + 2 * count for pointers, _, count in INDIRECT_BLOCKS)
+            unused = any(first <= start < first + count for _, first, count in INDIRECT_BLOCKS)
+            if pointer or (unused and start == address + position):
+                if pointer and self["torque_enable"]:
                     return StatusError.ACCESS
-                self._table[start] = data[position]
-                position += 1
-                continue
-            if not direct and start == address + position and self._is_indirect_data(start):
                 self._table[start] = data[position]
                 position += 1
                 continue
@@ -142,9 +138,7 @@ class ServoRegisters:
         return StatusError.NONE
 
     def _objection(self, name: str, field: Field, value: int) -> StatusError:
-        if not field.writable:
-            return StatusError.ACCESS
-        if field.in_eeprom and self["torque_enable"]:
+        if not field.writable or (field.in_eeprom and self["torque_enable"]):
             return StatusError.ACCESS
         if field.low is not None and not field.low <= value <= (field.high or 0):
             return StatusError.DATA_RANGE
@@ -180,14 +174,6 @@ class ServoRegisters:
                 return target if target < TABLE_SIZE else address
         return address
 
-    @staticmethod
-    def _is_pointer(address: int) -> bool:
-        return any(pointers <= address < pointers + 2 * count for pointers, _, count in INDIRECT_BLOCKS)
-
-    @staticmethod
-    def _is_indirect_data(address: int) -> bool:
-        return any(data <= address < data + count for _, data, count in INDIRECT_BLOCKS)
-
 
 PROTOCOL = 2
 """Protocol of the line. A servo with another protocol never answers."""
@@ -221,14 +207,11 @@ class BaudGroup:
     ----------
     by_id : dict of int to list of int
         Servos by present ID; several servos may have the same ID.
-    by_shadow : dict of int to list of int
-        Servos by secondary ID: they execute writes to this ID but do not answer.
     members : int array
         Indices of the servos in the order of the line.
     """
 
     by_id: dict[int, list[int]] = field(default_factory=dict)
-    by_shadow: dict[int, list[int]] = field(default_factory=dict)
     members: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
 
@@ -241,8 +224,6 @@ def group_by_baud(servos: Mapping[int, ServoRegisters]) -> dict[int, BaudGroup]:
         group = groups.setdefault(registers.baud, BaudGroup())
         group.members = np.append(group.members, index)
         group.by_id.setdefault(registers["id"], []).append(first_id)
-        if registers["shadow_id"] <= MAX_ID and registers["shadow_id"] != registers["id"]:
-            group.by_shadow.setdefault(registers["shadow_id"], []).append(first_id)
     return groups
 
 
@@ -373,8 +354,7 @@ class VirtualServos:
                 self._load_goals(index)
             return error
         torque, mode = registers["torque_enable"], registers["operating_mode"]
-        error = registers.write(address, data)
-        if error:
+        if error := registers.write(address, data):
             return error
         if registers["operating_mode"] != mode:
             self.reload(index)
@@ -581,9 +561,6 @@ RESET_ALL = 0xFF
 KEPT_BY_RESET: dict[int, tuple[str, ...]] = {RESET_ALL: (), 0x01: ("id",), 0x02: ("id", "baud")}
 """Registers that a factory reset does not change, by the parameter of the reset."""
 
-SHADOW_INSTRUCTIONS = (Instruction.WRITE, Instruction.REG_WRITE)
-"""Instructions to a secondary ID that a servo executes without an answer, for registers in RAM."""
-
 
 class Answer(NamedTuple):
     """Frame that one or several servos send at the same time.
@@ -604,14 +581,15 @@ class Answer(NamedTuple):
 
 def merge_frames(frames: Sequence[tuple[int, bytes]]) -> Answer:
     """Merge the frames of servos that answer at the same time: all drive the line, and a zero bit wins (unverified)."""
-    if len(frames) == 1:
-        servo, frame = frames[0]
-        return Answer((servo,), frame)
     line = bytearray(max((frame for _, frame in frames), key=len))
     for _, frame in frames:
         for k, byte in enumerate(frame):
             line[k] &= byte
     return Answer(tuple(servo for servo, _ in frames), bytes(line))
+
+
+def _word(parameters: bytes, at: int) -> int:
+    return int.from_bytes(parameters[at : at + 2], "little")
 
 
 class Firmware:
@@ -626,47 +604,34 @@ class Firmware:
         p = packet.parameters
         match packet.instruction:
             case Instruction.SYNC_READ | Instruction.FAST_SYNC_READ if len(p) >= 5:
-                address, length = int.from_bytes(p[0:2], "little"), int.from_bytes(p[2:4], "little")
-                entries = [(id_, address, length) for id_ in p[4:]]
-                read = self._fast_read if packet.instruction == Instruction.FAST_SYNC_READ else self._read_many
-                yield from read(entries, group)
+                entries = [(id_, _word(p, 0), _word(p, 2)) for id_ in p[4:]]
             case Instruction.BULK_READ | Instruction.FAST_BULK_READ:
-                entries = [
-                    (p[k], int.from_bytes(p[k + 1 : k + 3], "little"), int.from_bytes(p[k + 3 : k + 5], "little"))
-                    for k in range(0, len(p) - 4, 5)
-                ]
-                read = self._fast_read if packet.instruction == Instruction.FAST_BULK_READ else self._read_many
-                yield from read(entries, group)
+                entries = [(p[k], _word(p, k + 1), _word(p, k + 3)) for k in range(0, len(p) - 4, 5)]
             case Instruction.SYNC_WRITE if len(p) >= 4:
-                address, length = int.from_bytes(p[0:2], "little"), int.from_bytes(p[2:4], "little")
+                length = _word(p, 2)
                 for k in range(4, len(p) - length, length + 1):
-                    # Servos do not answer a sync write: a refused goal is not reported, as on real servos.
-                    self._write_silently(p[k], address, p[k + 1 : k + 1 + length], group)
+                    self._write_silently(p[k], _word(p, 0), p[k + 1 : k + 1 + length], group)
+                return
             case Instruction.BULK_WRITE:
                 k = 0
                 while k + 5 <= len(p):
-                    address = int.from_bytes(p[k + 1 : k + 3], "little")
-                    length = int.from_bytes(p[k + 3 : k + 5], "little")
-                    self._write_silently(p[k], address, p[k + 5 : k + 5 + length], group)
+                    length = _word(p, k + 3)
+                    self._write_silently(p[k], _word(p, k + 1), p[k + 5 : k + 5 + length], group)
                     k += 5 + length
+                return
             case _:
                 yield from self._answers_of_each(packet, group)
+                return
+        fast = packet.instruction in (Instruction.FAST_SYNC_READ, Instruction.FAST_BULK_READ)
+        yield from (self._fast_read if fast else self._read_many)(entries, group)
 
     def _write_silently(self, id_: int, address: int, data: bytes, group: BaudGroup) -> None:
+        """Write without an answer: a refused goal is not reported, as on real servos."""
         for servo in self._awake(group, id_):
             self._servos.write(servo, address, data)
-        if group.by_shadow and address >= EEPROM_END:
-            for servo in self._shadows(group, id_):
-                self._servos.write(servo, address, data)
 
     def _answers_of_each(self, packet: Packet, group: BaudGroup) -> Iterator[Answer]:
         broadcast = packet.id == BROADCAST_ID
-        for servo in self._shadows(group, packet.id):
-            if (
-                packet.instruction in SHADOW_INSTRUCTIONS
-                and int.from_bytes(packet.parameters[0:2], "little") >= EEPROM_END
-            ):
-                self._reply(servo, packet.id, packet)
         # Iterate over a copy, because the instruction may change the ID of a servo.
         for id_ in sorted(group.by_id) if broadcast else [packet.id]:
             frames = []
@@ -685,11 +650,12 @@ class Firmware:
                 data = (registers.read(0, 2) or b"") + bytes([registers["firmware"]])
                 return self._status(servo, id_, StatusError.NONE, data)
             case Instruction.READ if len(p) == 4:
-                return self._read(servo, id_, int.from_bytes(p[0:2], "little"), int.from_bytes(p[2:4], "little"))
+                return self._read(servo, id_, _word(p, 0), _word(p, 2))
             case Instruction.WRITE if len(p) >= 3:
-                error = self._servos.write(servo, int.from_bytes(p[0:2], "little"), p[2:])
+                error = self._servos.write(servo, _word(p, 0), p[2:])
             case Instruction.REG_WRITE if len(p) >= 3:
-                error = self._register(servo, int.from_bytes(p[0:2], "little"), p[2:])
+                self._registered[servo] = (_word(p, 0), p[2:])  # until ACTION
+                registers["registered_instruction"], error = 1, StatusError.NONE
             case Instruction.ACTION:
                 error = self._act(servo)
             case Instruction.REBOOT | Instruction.FACTORY_RESET:
@@ -747,16 +713,6 @@ class Firmware:
     def _awake(self, group: BaudGroup, id_: int) -> list[int]:
         """Return the servos with an ID that can receive packets."""
         return list(filter(self._servos.receives, group.by_id.get(id_, ())))
-
-    def _shadows(self, group: BaudGroup, id_: int) -> list[int]:
-        """Return the servos with a secondary ID that can receive packets."""
-        return list(filter(self._servos.receives, group.by_shadow.get(id_, ())))
-
-    def _register(self, servo: int, address: int, data: bytes) -> StatusError:
-        """Store a write until :meth:`_act`."""
-        self._registered[servo] = (address, data)
-        self._servos.registers[servo]["registered_instruction"] = 1
-        return StatusError.NONE
 
     def _act(self, servo: int) -> StatusError:
         """Execute the registered write, unless a restart has cleared it."""
