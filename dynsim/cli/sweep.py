@@ -92,7 +92,6 @@ def sweep(
     succeeded, 130 Ctrl-C.
     """
     from dynsim.studies.processes import cores
-    from dynsim.studies.worker import keep_memory
 
     if jobs is not None and scheduler is not None:
         raise ScenarioError(
@@ -110,9 +109,6 @@ def sweep(
     # Invalid values are reported here, before processes and threads start.
     name = plan.scenario(next(plan.points())).name
     folder = out or Path("results", name, "sweep")
-    others = scheduler is not None or min(jobs or cores(), plan.runs) > 1
-    if not others:
-        keep_memory()
     unchecked = list(plot or ())
 
     def warn_once(row: SweepRow) -> None:

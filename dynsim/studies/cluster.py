@@ -16,7 +16,6 @@ from dynsim._version import __version__
 from dynsim.engine import Progress
 from dynsim.errors import DynsimError
 from dynsim.studies.outcome import RunResult
-from dynsim.studies.worker import keep_memory
 from dynsim.system import interruption
 
 Task = TypeVar("Task")
@@ -141,6 +140,5 @@ def _run_piece(
     """Do the work for each task, on a worker."""
     if version != __version__:
         raise ClusterError(f"a worker has dynsim {__version__}, but this is {version}; install the same version")
-    keep_memory()
     with _one_at_a_time:
         return [work(task, None) for task in tasks]

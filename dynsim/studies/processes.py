@@ -1,13 +1,18 @@
-"""Parallel work in worker processes: results in the order of completion, interruption, and loss of workers.
+"""Pool of worker processes: results in the order of completion, Ctrl-C, and loss of workers.
 
-On Ctrl-C the workers return the results that they have. If a worker is killed or stops responding, only its current
-task is lost.
+A worker is a new Python process. The parent sends it pickled tasks on its standard input, one at a time, and reads
+pickled messages from its standard output. A worker ends when its standard input ends, and so never outlives the parent.
+
+The pools of Python and loky do not suffice. ``multiprocessing`` runs the script of the caller again in every worker,
+and imports a ``signal.py`` of the working directory before that. In ``concurrent.futures`` and loky, the death of one
+worker fails all pending tasks. ``multiprocessing.Pool`` never returns the task of a worker that died. None of them lets
+runs return their partial results on Ctrl-C.
 """
 
 from __future__ import annotations
 
+import io
 import logging
-import math
 import os
 import pickle
 import signal
@@ -15,16 +20,15 @@ import subprocess
 import sys
 import threading
 import time as clock
+import traceback
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
 from functools import partial
 from queue import Empty, SimpleQueue
-from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Any, BinaryIO, TypeVar
 
-from dynsim.studies import worker as messages
-from dynsim.studies.worker import LOOK_S, START, STOP_LOOK_S, WorkerError, packed
+from dynsim.errors import DynsimError
 from dynsim.system import interruption
 from dynsim.system.interruption import STOP_SIGNALS
 
@@ -34,24 +38,35 @@ if TYPE_CHECKING:
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
-# Longest time between heartbeats of a worker, and until its first one [s]. A thread of the worker sends them, so that
-# they do not depend on the duration of its work; they end if the process is stopped, or if compiled code never releases
-# the global interpreter lock.
-SILENT_S, START_S = 60.0, 600.0
-# Longest time until a worker confirms Ctrl-C [s]; then it may take any time to return its results. Its heartbeats
-# measure that time, so that no result is lost if the machine is busy; the second value is the limit without heartbeats.
-_PATIENCE_S, _STALLED_S = 0.7, 10.0
-# Interval of the checks for signals [s].
-_SIGNAL_S = 0.1
-# Longest task that is sent to a worker while it is busy [s]: for longer tasks another worker may be free sooner.
-_QUICK_S = 0.5
+# Number of workers that may die in a row while they start, before the pool gives up: the first and three more.
+STARTS = 4
+# After Ctrl-C a worker checks this many times, at this interval [s], whether its work reacts; otherwise it ends. It
+# counts the checks itself, so that no result is lost if the machine is busy.
+_CHECKS, _CHECK_S = 14, 0.05
+# Longest time until a worker reports that its work reacts to Ctrl-C [s], in case the process is suspended.
+_STALLED_S = 10.0
+# Interval of the checks for signals in the parent, and longest wait for the end of a process and of its threads [s].
+_SIGNAL_S, _JOIN_S = 0.1, 0.7
 # Lines of a worker's stderr that are reported when it cannot start.
 _LAST_LINES = 12
+# Let glibc reuse the memory of one run for the next: new pages would cost up to a tenth of each run.
+_MEMORY = {"MALLOC_MMAP_THRESHOLD_": str(32 << 20), "MALLOC_TRIM_THRESHOLD_": str(512 << 20)}
+
+# Program of a worker. Only the worker itself uses the pipes; output of its tasks goes to stderr. The first message
+# lists the folders in which Python searches for dynsim.
+START = """
+import os, pickle, sys
+tasks, answers = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
+os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+os.dup2(2, 1)
+sys.path[:] = pickle.load(tasks)
+from dynsim.studies.processes import serve
+serve(tasks, answers)
+"""
 
 
-def cores() -> int:
-    """Return the number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+class WorkerError(DynsimError):
+    """A process cannot be started, or a task or its result cannot be sent between processes."""
 
 
 class WorkerLost(Exception):
@@ -61,119 +76,29 @@ class WorkerLost(Exception):
         super().__init__(how)
 
 
-class WorkerSilent(WorkerLost):
-    """The parent killed the worker process because its heartbeats stopped."""
-
-    def __init__(self) -> None:
-        super().__init__(f"its process did not respond for {SILENT_S:g} s and was killed")
-
-
 class WorkerInterrupted(WorkerLost):
-    """The parent killed the worker process because it did not react to Ctrl-C while it was starting its work."""
+    """The worker process ended after Ctrl-C without a result, because its work did not react."""
 
 
-@dataclass(eq=False)
-class _Worker:
-    """Worker process and the threads that use its pipes, so that the main thread never waits for a pipe.
+def cores() -> int:
+    """Return the number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
-    Attributes
-    ----------
-    process : Popen
-        The process, with pipes to its three standard streams.
-    outbox : SimpleQueue
-        Messages to the worker; None allows it to end.
-    tasks : deque
-        Tasks sent to it, each with the number of processes that have lost it. The first is in progress, the others wait
-        in the pipe.
-    ready : bool
-        Whether it has sent its first heartbeat.
-    confirmed : bool
-        Whether it has confirmed Ctrl-C.
-    heartbeats : int
-        Number of heartbeats that arrived after Ctrl-C without a confirmation.
-    since : float
-        Time at which it began the first task [s].
-    last_duration : float
-        Duration of its last task [s].
-    silent : float
-        Time since its last message [s].
-    stderr_lines : deque of str
-        The last lines of its stderr.
+
+@contextmanager
+def signals_held() -> Iterator[None]:
+    """Shield processes that start in the block from Ctrl-C in the terminal; this process receives it after the block.
+
+    Only the parent reacts to Ctrl-C and informs the workers; the same applies to the other ``STOP_SIGNALS``.
     """
-
-    process: subprocess.Popen[bytes]
-    outbox: SimpleQueue[bytes | None] = field(default_factory=SimpleQueue)
-    tasks: deque[tuple[Any, int]] = field(default_factory=deque)
-    ready: bool = False
-    confirmed: bool = False
-    heartbeats: int = 0
-    since: float = 0.0
-    last_duration: float = math.inf
-    silent: float = 0.0
-    stderr_lines: deque[str] = field(default_factory=lambda: deque(maxlen=_LAST_LINES))
-    threads: list[threading.Thread] = field(default_factory=list)
-    printing: threading.Lock = field(default_factory=threading.Lock)
-
-    def begin(self, inbox: SimpleQueue[tuple[_Worker, tuple[Any, ...] | None]]) -> None:
-        """Start the threads; they put the messages of the worker into the inbox, and None at their end."""
-        for talk, *arguments in ((self._send,), (self._receive, inbox), (self._forward_stderr,)):
-            self.threads.append(threading.Thread(target=talk, args=arguments, name="worker", daemon=True))
-            self.threads[-1].start()
-
-    def _send(self) -> None:
-        assert self.process.stdin is not None
-        # The thread that reads the answers notices if the process has ended.
-        with suppress(OSError), self.process.stdin as stream:
-            while (content := self.outbox.get()) is not None:
-                stream.write(content)
-                stream.flush()
-
-    def _receive(self, inbox: SimpleQueue[tuple[_Worker, tuple[Any, ...] | None]]) -> None:
-        assert self.process.stdout is not None
-        # The end of the process may cut off a message.
-        with suppress(EOFError, OSError, pickle.UnpicklingError), self.process.stdout as stream:
-            while True:
-                inbox.put((self, pickle.load(stream)))
-        inbox.put((self, None))
-
-    def _forward_stderr(self) -> None:
-        """Forward the stderr of the worker; before it is ready, only keep the lines for the error of a failed start."""
-        assert self.process.stderr is not None
-        with suppress(OSError, ValueError), self.process.stderr as stream:
-            for line in stream:
-                with self.printing:
-                    self.stderr_lines.append(line.decode("utf-8", "replace").rstrip())
-                    if self.ready:
-                        _print(self.stderr_lines[-1])
-
-    def is_ready(self) -> None:
-        """Mark the worker as ready after its first heartbeat, and print the stderr lines kept until then."""
-        with self.printing:
-            self.ready = True
-            for line in self.stderr_lines:
-                _print(line)
-
-    @property
-    def room(self) -> int:
-        """Number of further tasks to send; a quick task is sent early, so that the worker need not wait for it."""
-        return (2 if self.last_duration < _QUICK_S else 1) - len(self.tasks)
-
-    def leave(self) -> None:
-        """End the process, which has no more tasks or has already ended."""
-        self.outbox.put(None)
-        try:
-            self.process.wait(_PATIENCE_S)
-        except subprocess.TimeoutExpired:
-            self.process.kill()
-            self.process.wait()
-        # A child process of the worker may still hold its streams open.
-        for thread in self.threads:
-            thread.join(_PATIENCE_S)
-
-
-def _print(line: str) -> None:
-    if sys.stderr is not None:
-        print(line, file=sys.stderr, flush=True)
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def run_in_processes(
@@ -191,7 +116,7 @@ def run_in_processes(
     work : callable
         Function of an importable module. It must call ``look`` often, which raises KeyboardInterrupt to stop it.
     tasks : iterable
-        Tasks; they are sent to the processes one at a time as these become free, or one ahead if tasks are quick.
+        Tasks; they are sent to the processes one at a time as these become free.
     jobs : int
         Number of processes.
     take : callable
@@ -199,8 +124,7 @@ def run_in_processes(
         work or :class:`WorkerLost`. The result is None if Ctrl-C came before the task began. ``take`` is not called for
         tasks that had not been sent to a process at Ctrl-C.
     attempts : int, optional
-        Number of processes that a task may lose before it is given up; a task whose process stopped responding is given
-        up immediately.
+        Number of processes that a task may lose before it is given up.
 
     Returns
     -------
@@ -210,7 +134,9 @@ def run_in_processes(
     Raises
     ------
     WorkerError
-        If a process cannot start, or a task cannot be sent to it.
+        If a task cannot be sent to a process, or no process can start: ``STARTS`` die in a row while they start.
+    KeyboardInterrupt
+        On a second Ctrl-C; the processes are killed.
     """
     pool = _Pool(work, tasks, jobs, take, attempts)
     try:
@@ -221,18 +147,88 @@ def run_in_processes(
             pool.stop()
             pool.collect()
             return True
-    except BaseException:
-        # If a result cannot be saved, or after a second Ctrl-C, do not wait for the other workers.
-        for worker in pool.workers:
-            worker.process.kill()
-        raise
     finally:
         interruption.heed()
         for worker in pool.workers:
-            worker.outbox.put(None)
+            worker.process.kill()
         for worker in pool.workers:
-            worker.leave()
+            worker.end()
     return False
+
+
+class _Worker:
+    """Worker process, and the threads that use its pipes, so that the main thread never waits for a pipe.
+
+    The threads take messages from ``outbox``, up to an empty one, and put those of the worker, and None at their end,
+    into the inbox of the pool. ``task`` is the task in progress, with the number of processes that it has lost before;
+    ``confirmed`` is whether the work reacted to Ctrl-C.
+    """
+
+    def __init__(self, beginning: bytes, inbox: SimpleQueue[tuple[_Worker, tuple[Any, ...] | None]]) -> None:
+        if not sys.executable:
+            raise WorkerError("no Python interpreter found to start worker processes; use jobs=1")
+        try:
+            with signals_held():
+                self.process = subprocess.Popen(
+                    [sys.executable, "-u", "-P", "-c", START], env=_MEMORY | os.environ,
+                    stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+                )  # fmt: skip
+        except OSError as error:
+            raise WorkerError(f"cannot start a worker process ({error}); use fewer jobs") from error
+        self.task: tuple[Any, int] | None = None
+        self.ready = self.confirmed = False
+        self._inbox, self.outbox = inbox, SimpleQueue[bytes]()
+        self._lines = deque[str](maxlen=_LAST_LINES)
+        self.outbox.put(beginning)
+        streams = self.process.stdin, self.process.stdout, self.process.stderr
+        talks = zip((self._write, self._read, self._forward), streams, strict=True)
+        self._threads = [threading.Thread(target=talk, args=(stream,), daemon=True) for talk, stream in talks]
+        for thread in self._threads:
+            thread.start()
+
+    def _write(self, stream: BinaryIO) -> None:
+        # The thread that reads the answers notices if the process has ended.
+        with suppress(OSError), stream:
+            while content := self.outbox.get():
+                stream.write(content)
+                stream.flush()
+
+    def _read(self, stream: BinaryIO) -> None:
+        # The end of the process may cut off a message.
+        with suppress(EOFError, OSError, pickle.UnpicklingError), stream:
+            while True:
+                self._inbox.put((self, pickle.load(stream)))
+        self._inbox.put((self, None))
+
+    def _forward(self, stream: BinaryIO) -> None:
+        """Forward the stderr of the worker; before it is ready, only keep the lines for the error of a failed start."""
+        with suppress(OSError, ValueError), stream:
+            for line in stream:
+                self._lines.append(line.decode("utf-8", "replace").rstrip())
+                if self.ready:
+                    self.show()
+
+    def show(self) -> None:
+        """Print the stderr lines that have not been printed."""
+        with suppress(IndexError):
+            while sys.stderr is not None:
+                print(self._lines.popleft(), file=sys.stderr, flush=True)
+
+    def end(self) -> None:
+        """Kill the process, and wait until its threads have ended."""
+        self.process.kill()
+        self.process.wait()
+        self.outbox.put(b"")
+        # A child process of the worker may still hold its streams open.
+        for thread in self._threads:
+            thread.join(_JOIN_S)
+
+    def failed_start(self) -> str:
+        """Return how the process ended before it was ready, with its last lines."""
+        code = self.process.returncode
+        how = f"was ended by signal {-code}" if code < 0 else f"ended with exit code {code}"
+        output = "".join(f"\n  {line}" for line in self._lines) or " nothing"
+        return f"a worker process {how} while starting; if memory is short, use fewer jobs; its output:{output}"
 
 
 class _Pool:
@@ -242,73 +238,65 @@ class _Pool:
         self.workers: list[_Worker] = []
         self._jobs, self._take, self._attempts = jobs, take, attempts
         self._beginning = _beginning(work)
-        self._waiting = ((task, 0) for task in tasks)
-        # Tasks to retry after a worker died, with the number of losses; they are sent before new tasks.
-        self._again: list[tuple[Any, int]] = []
+        # Tasks that no worker has, with the number of workers that they have lost.
+        self._waiting = deque((task, 0) for task in tasks)
         self._inbox: SimpleQueue[tuple[_Worker, tuple[Any, ...] | None]] = SimpleQueue()
+        self._failed_starts = 0
         self._stopped: float | None = None
 
     def stop(self) -> None:
-        """Send the stop message to all workers, and hand out no more tasks."""
+        """Request all workers to stop, and hand out no more tasks."""
         self._stopped = clock.monotonic()
+        self._waiting.clear()
         for worker in self.workers:
-            worker.outbox.put(pickle.dumps((messages.STOP,)))
+            worker.outbox.put(pickle.dumps(None))
 
     def collect(self) -> None:
-        """Send tasks and take results until no more are expected; signals are deferred while this process works."""
-        looked = clock.monotonic()
+        """Send tasks and take results until no more are expected; signals are deferred while this process works.
+
+        They still are at the end.
+        """
         while True:
             interruption.keep()
-            if self._stopped is None:
-                self._hand_out()
-            if not any(worker.tasks for worker in self.workers):
-                interruption.heed()
+            self._hand_out()
+            if not self._waiting and not any(worker.task for worker in self.workers):
                 return
             with suppress(Empty):
                 worker, message = self._inbox.get(timeout=_SIGNAL_S)
                 # A worker that this process has ended may have left messages.
                 if worker in self.workers:
                     self._handle(worker, message)
-            # If this process was stopped for a while, for example by Ctrl-Z, it has not looked for messages either.
-            passed, looked = min(clock.monotonic() - looked, 2.0 * LOOK_S), clock.monotonic()
-            self._end_unresponsive(passed)
+            if self._stopped is not None and clock.monotonic() > self._stopped + _STALLED_S:
+                for worker in self.workers:
+                    if not worker.confirmed:
+                        worker.process.kill()
             interruption.heed()
             interruption.check()
 
     def _hand_out(self) -> None:
-        while True:
-            worker = min(self.workers, key=lambda worker: len(worker.tasks), default=None)
-            full = worker is None or worker.tasks
-            if len(self.workers) == self._jobs and (worker is None or worker.room < 1):
-                return
-            task = self._again.pop() if self._again else next(self._waiting, None)
-            if task is None:
-                return
-            content = packed(task[0])
-            if worker is None or (full and len(self.workers) < self._jobs):
-                worker = _start(self._beginning, self._inbox)
-                self.workers.append(worker)
-            if not worker.tasks:
-                worker.since = clock.monotonic()
-            worker.tasks.append(task)
-            worker.outbox.put(pickle.dumps((messages.TASK, content)))
+        """Send tasks to the workers that are ready, and start workers for tasks that wait."""
+        for worker in self.workers:
+            if self._waiting and worker.ready and worker.task is None:
+                content = packed(self._waiting[0][0])
+                worker.task = self._waiting.popleft()
+                worker.outbox.put(pickle.dumps(content))
+        free = sum(worker.task is None for worker in self.workers)
+        for _ in range(min(len(self._waiting) - free, self._jobs - len(self.workers))):
+            self.workers.append(_Worker(self._beginning, self._inbox))
 
     def _handle(self, worker: _Worker, message: tuple[Any, ...] | None) -> None:
         """Handle a message of a worker; None at the end of its output."""
-        worker.silent = 0.0
         match message:
-            case (messages.READY,):
-                worker.is_ready()
-            case (messages.CONFIRMED,):
+            case ("ready",):
+                worker.ready, self._failed_starts = True, 0
+                worker.show()
+            case ("confirmed",):
                 worker.confirmed = True
-            case (messages.ALIVE,):
-                worker.heartbeats += self._stopped is not None
-            case (messages.LOG, name, level, text):
+            case ("log", name, level, text):
                 logging.getLogger(name).log(level, "%s", text)
-            case (messages.ANSWER, good, content, leaves):
-                now = clock.monotonic()
-                worker.since, worker.last_duration = now, now - worker.since
-                task, _ = worker.tasks.popleft()
+            case ("answer", good, content, leaves):
+                assert worker.task is not None
+                (task, _), worker.task = worker.task, None
                 if leaves:
                     self._dismiss(worker)
                 self._take(task, partial(_result, good, content))
@@ -316,54 +304,24 @@ class _Pool:
                 self._lose(worker)
 
     def _lose(self, worker: _Worker) -> None:
-        lost = worker.tasks.popleft() if worker.tasks else None
+        with suppress(subprocess.TimeoutExpired):
+            worker.process.wait(_JOIN_S)  # for its exit code: its output ends a little earlier
         self._dismiss(worker)
-        if not worker.ready and self._stopped is None:
-            raise WorkerError(_no_start(worker))
-        if lost is None:
-            return
-        task, losses = lost
-        if self._stopped is None and losses + 1 < self._attempts:
-            self._again.append((task, losses + 1))
-        else:
-            self._take(task, partial(_raise, WorkerLost if worker.ready else WorkerInterrupted))
+        if worker.task is not None:
+            task, losses = worker.task
+            if self._stopped is None and losses + 1 < self._attempts:
+                self._waiting.appendleft((task, losses + 1))
+            else:
+                lost = WorkerLost() if self._stopped is None else WorkerInterrupted()
+                self._take(task, partial(_result, False, pickle.dumps(lost)))
+        elif not worker.ready:
+            self._failed_starts += 1
+            if self._failed_starts == STARTS and self._stopped is None:
+                raise WorkerError(worker.failed_start())
 
     def _dismiss(self, worker: _Worker) -> None:
-        """Remove a worker that has ended or will end, and return the tasks that wait in its pipe to the queue."""
         self.workers.remove(worker)
-        worker.leave()
-        self._again.extend(worker.tasks)
-        worker.tasks.clear()
-
-    def _end_unresponsive(self, passed: float) -> None:
-        """End workers that stopped responding or do not confirm Ctrl-C in time.
-
-        ``passed`` is the time since the last call [s].
-        """
-        for worker in [worker for worker in self.workers if worker.tasks]:
-            worker.silent += passed
-            if worker.silent > (SILENT_S if worker.ready else START_S):
-                kind: type[WorkerLost] = WorkerSilent
-            elif self._stopped is not None and not worker.confirmed and self._is_unresponsive(worker, self._stopped):
-                kind = WorkerInterrupted
-            else:
-                continue
-            task, _ = worker.tasks.popleft()
-            worker.process.kill()
-            self._dismiss(worker)
-            self._take(task, partial(_raise, kind))
-
-    @staticmethod
-    def _is_unresponsive(worker: _Worker, stopped: float) -> bool:
-        """Return whether a worker had enough time to confirm Ctrl-C, which came at ``stopped`` [s]."""
-        waited = clock.monotonic() - stopped
-        if not worker.ready:
-            return waited > _PATIENCE_S
-        return worker.heartbeats * STOP_LOOK_S > _PATIENCE_S or waited > _STALLED_S
-
-
-def _raise(kind: type[WorkerLost]) -> NoReturn:
-    raise kind
+        worker.end()
 
 
 def _result(good: bool, content: bytes) -> Any:
@@ -374,7 +332,7 @@ def _result(good: bool, content: bytes) -> Any:
 
 
 def _beginning(work: Any) -> bytes:
-    """Return the first messages to a worker, see :func:`dynsim.studies.worker.serve`.
+    """Return the first messages to a worker, see :func:`serve`.
 
     The worker searches for dynsim in the working directory last, so that a ``json.py`` there does not replace the
     standard module.
@@ -383,30 +341,6 @@ def _beginning(work: Any) -> bytes:
     path = [folder for folder in sys.path if isinstance(folder, str)]
     safe = sorted(path, key=lambda folder: folder in here)
     return pickle.dumps(safe) + pickle.dumps((path, _log_level(), packed(work)))
-
-
-def _start(beginning: bytes, inbox: SimpleQueue[tuple[_Worker, tuple[Any, ...] | None]]) -> _Worker:
-    if not sys.executable:
-        raise WorkerError("no Python interpreter found to start worker processes; use jobs=1")
-    try:
-        with signals_held():
-            process = subprocess.Popen(
-                [sys.executable, "-P", "-c", START],
-                stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-            )  # fmt: skip
-    except OSError as error:
-        raise WorkerError(f"cannot start a worker process ({error}); use fewer jobs") from error
-    worker = _Worker(process)
-    worker.outbox.put(beginning)
-    worker.begin(inbox)
-    return worker
-
-
-def _no_start(worker: _Worker) -> str:
-    code = worker.process.returncode
-    how = f"was ended by signal {-code}" if code < 0 else f"ended with exit code {code}"
-    output = "".join(f"\n  {line}" for line in worker.stderr_lines) or " nothing"
-    return f"a worker process {how} while starting; if memory is short, use fewer jobs; its output:{output}"
 
 
 def _log_level() -> int:
@@ -420,17 +354,116 @@ def _log_level() -> int:
     return logging.CRITICAL + 1
 
 
-@contextmanager
-def signals_held() -> Iterator[None]:
-    """Shield processes that start in the block from Ctrl-C in the terminal; this process receives it after the block.
+class _Pickler(pickle.Pickler):
+    """Pickler that rejects objects defined in the script, because other processes do not run the script."""
 
-    Only the parent reacts to Ctrl-C and informs the workers; the same applies to the other ``STOP_SIGNALS``.
+    def reducer_override(self, value: Any) -> Any:
+        if callable(value) and getattr(value, "__module__", None) == "__main__" and hasattr(value, "__qualname__"):
+            raise WorkerError(
+                f"{value.__qualname__} is defined in the script or notebook itself, which other processes do not run; "
+                "move it to a module and import it, or use jobs=1"
+            )
+        return NotImplemented
+
+
+def packed(value: Any) -> bytes:
+    """Return a pickle of a value for another process.
+
+    Raises
+    ------
+    WorkerError
+        If a part of it cannot be sent, or is defined in the module that this process runs as its script.
     """
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
+    stream = io.BytesIO()
     try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        _Pickler(stream, pickle.HIGHEST_PROTOCOL).dump(value)
+    except (pickle.PicklingError, TypeError, AttributeError, RecursionError) as error:
+        raise WorkerError(f"cannot be sent to another process: {error}; use jobs=1") from error
+    return stream.getvalue()
+
+
+# The rest of this file runs in a worker.
+
+
+class _LogToParent(logging.Handler):
+    """Log handler that sends log messages to the parent."""
+
+    def __init__(self, send: Callable[..., None]) -> None:
+        super().__init__()
+        self._send = send
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self._send("log", record.name, record.levelno, record.getMessage())
+
+
+def serve(source: BinaryIO, sink: BinaryIO) -> None:
+    """Do tasks until the parent ends this process or itself."""
+    # A terminal or a service manager sends these signals to every process of a group; only the parent handles them.
+    for number in STOP_SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
+    path, level, content = pickle.load(source)
+    work: Callable[[Any, Any], Any] = pickle.loads(content)
+    # Tasks may need modules from the folder of the script. Imports of dynsim and of the work do not use it.
+    sys.path[:] = path
+    tasks, writing = SimpleQueue[bytes](), threading.Lock()
+    # ``reacted`` is set unless a task is in progress that would not notice a stop.
+    stop, reacted = threading.Event(), threading.Event()
+    reacted.set()
+
+    def send(*message: Any) -> None:
+        # If the parent has ended, the other thread ends this process.
+        with suppress(OSError), writing:
+            sink.write(pickle.dumps(message))
+            sink.flush()
+
+    def listen() -> None:
+        with suppress(EOFError, OSError, pickle.UnpicklingError):
+            while (task := pickle.load(source)) is not None:
+                tasks.put(task)
+            stop.set()
+            for _ in range(_CHECKS):
+                clock.sleep(_CHECK_S)
+                if reacted.is_set() or interruption.is_kept():
+                    send("confirmed")
+                    source.read()  # returns when the parent has ended
+                    break
+        os._exit(0)
+
+    def look(time: float, stage: str = "") -> None:
+        # In the parent, Ctrl-C would stop the work here, with a partial result.
+        if stop.is_set():
+            reacted.set()
+            raise KeyboardInterrupt
+
+    library = logging.getLogger("dynsim")
+    library.setLevel(level)
+    library.addHandler(_LogToParent(send))
+    send("ready")
+    threading.Thread(target=listen, daemon=True).start()
+    while True:
+        task = tasks.get()
+        reacted.clear()
+        try:
+            result = None if stop.is_set() else work(_unpacked(task), look)
+            reacted.set()
+            good, content = True, packed(result)
+        except Exception as error:
+            reacted.set()
+            good, content = False, _packed_error(error)
+        # If a thread of the work remains, the parent ends this process: the thread would slow down other tasks.
+        send("answer", good, content, interruption.is_left())
+
+
+def _unpacked(content: bytes) -> Any:
+    try:
+        return pickle.loads(content)
+    except Exception as error:
+        raise WorkerError(f"a task cannot be loaded in another process: {type(error).__name__}: {error}") from error
+
+
+def _packed_error(error: Exception) -> bytes:
+    error.add_note("".join(traceback.format_exception(error)))
+    try:
+        return packed(error)
+    except WorkerError:
+        return packed(WorkerError(f"{type(error).__name__}: {error}"))

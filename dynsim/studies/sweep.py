@@ -7,7 +7,7 @@ import io
 import json
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from types import TracebackType
@@ -22,8 +22,8 @@ from dynsim.record.sensitivity import sensitivities, spread
 from dynsim.studies.batch import BatchWork, Keep, run_all
 from dynsim.studies.cluster import ClusterError
 from dynsim.studies.outcome import RunResult
+from dynsim.studies.processes import WorkerError
 from dynsim.studies.sweep_plan import Plan, SweepPoint
-from dynsim.studies.worker import WorkerError
 from dynsim.system.files import check_writable, held_folder, json_text, replacing, write_text
 
 # Not among the numbers of a run: names, which have separate columns, and computing times, which are not reproducible.
@@ -326,11 +326,15 @@ def run_sweep(
         If the folder contains a sweep and ``resume`` is False, or a sweep of another scenario; or if the first run of a
         variant is invalid (for example a misspelt key), before anything is simulated.
     SimulationInterrupted
-        On Ctrl-C; tables of the completed runs are written.
+        On Ctrl-C.
     RecordError
         If a file cannot be written, a file of the resumed sweep is damaged, or another process is using the folder.
     WorkerError, ClusterError
         If no process can be started; see :func:`dynsim.studies.cluster.run_on_cluster`.
+
+    Notes
+    -----
+    Tables and statistics of the completed runs are also written if an exception ends the sweep early.
     """
     points = list(plan.points())
     check_writable(folder, (PLAN, JOURNAL, *TABLES, STATISTICS))
@@ -368,11 +372,13 @@ def run_sweep(
                     for row in rows.values():
                         ended(row)
                 work = BatchWork(plan.scenario, keep_records)
-                interrupted = run_all(work, left, take, jobs=jobs, scheduler=scheduler)
-            done = [rows[run] for run in sorted(rows)]
-            write_tables(done, plan, folder)
-            if plan.laws:
-                write_text(folder / STATISTICS, json_text(statistics(done, plan)))
+                try:
+                    interrupted = run_all(work, left, take, jobs=jobs, scheduler=scheduler)
+                except BaseException:
+                    with suppress(RecordError):
+                        _write_results(rows, plan, folder)
+                    raise
+            done = _write_results(rows, plan, folder)
     if interrupted:
         raise SimulationInterrupted(f"interrupted after {len(done)} of {len(points)} runs; continue with --resume")
     return done
@@ -385,6 +391,15 @@ def _resumable(folder: Path) -> Iterator[None]:
         yield
     except (RecordError, WorkerError, ClusterError) as error:
         raise type(error)(f"{error}; completed runs are in {folder / JOURNAL}; continue with --resume") from error
+
+
+def _write_results(rows: Mapping[int, SweepRow], plan: Plan, folder: Path) -> list[SweepRow]:
+    """Write the tables and statistics of the completed runs, and return their rows in the order of the plan."""
+    done = [rows[run] for run in sorted(rows)]
+    write_tables(done, plan, folder)
+    if plan.laws:
+        write_text(folder / STATISTICS, json_text(statistics(done, plan)))
+    return done
 
 
 def _header(plan: Plan) -> dict[str, Any]:

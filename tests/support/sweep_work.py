@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import logging
 import os
 import signal
@@ -39,24 +38,6 @@ def warned(number: int, look: Progress) -> bool:
     log = logging.getLogger("dynsim.work")
     log.warning("number %d", number)
     return log.isEnabledFor(logging.WARNING)
-
-
-def hangs(number: int, look: Progress) -> int:
-    """Hold the interpreter's lock indefinitely (``DEADLY``), like endless compiled code, or stop the process."""
-    if number == DEADLY:
-        ctypes.PyDLL(None).pause()
-    if number == REFUSED:
-        os.kill(os.getpid(), signal.SIGSTOP)
-    return number**2
-
-
-def slow(number: int, look: Progress) -> int:
-    """Take longer than the time limit for silence in the test: half of it in Python code, half of it asleep."""
-    end = time.monotonic() + 1.5
-    while time.monotonic() < end:
-        pass
-    time.sleep(1.5)
-    return number**2
 
 
 def deaf(task: tuple[int, str], look: Progress) -> int:

@@ -16,8 +16,7 @@ from support.processes import wait_for
 from support.sweep_work import pid, says, square, unsendable
 
 from dynsim.studies import processes
-from dynsim.studies.processes import run_in_processes
-from dynsim.studies.worker import START, WorkerError
+from dynsim.studies.processes import START, STARTS, WorkerError, run_in_processes
 
 BATCH = """
 import json, os, sys
@@ -112,6 +111,39 @@ def test_a_worker_that_cannot_start_ends_the_batch(monkeypatch: pytest.MonkeyPat
     with pytest.raises(WorkerError) as caught:
         run_in_processes(square, range(100), 2, lambda number, result: pytest.fail("nothing was done"), attempts=2)
     assert mentions(caught.value, *names)
+
+
+# The first processes that start are killed; each counts itself in a file.
+KILLED_FIRST = """
+import os
+with open({path!r}, "a") as file:
+    file.write("x")
+if os.path.getsize({path!r}) <= {count}:
+    os.kill(os.getpid(), 9)
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="kills with a signal")
+@pytest.mark.parametrize("count", [STARTS - 1, STARTS])
+def test_a_worker_that_dies_while_it_starts_is_started_again(
+    count: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+):
+    """No task counts it as a loss."""
+    counted = tmp_path / "started"
+    monkeypatch.setattr(processes, "START", f"{KILLED_FIRST.format(path=str(counted), count=count)}\n{START}")
+    taken: dict[int, int] = {}
+
+    def run() -> bool:
+        return run_in_processes(square, range(3), 1, lambda number, result: taken.update({number: result()}))
+
+    if count < STARTS:
+        assert run() is False
+        assert taken == {0: 0, 1: 1, 2: 4}
+    else:
+        with raises(WorkerError, "9"):
+            run()
+        assert taken == {}
+    assert counted.stat().st_size == STARTS
 
 
 def test_no_process_at_all_is_one_error(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):

@@ -23,7 +23,7 @@ from hypothesis import strategies as st
 from matplotlib.colors import to_rgb
 from support.messages import mentions, raises
 from support.processes import started, wait_for
-from support.sweep_work import DEADLY, REFUSED, attentive, deaf, hangs, leaves, once_deadly, slow, square, warned
+from support.sweep_work import DEADLY, REFUSED, attentive, deaf, leaves, once_deadly, square, warned
 
 import dynsim
 from dynsim.cli import sweep as sweep_command
@@ -33,9 +33,9 @@ from dynsim.errors import DynsimError, ScenarioError
 from dynsim.record import Record
 from dynsim.record.sensitivity import sensitivities, spread
 from dynsim.scenario import SetOptions, read_scenario
-from dynsim.studies import batch, processes
+from dynsim.studies import batch
 from dynsim.studies import sweep as module
-from dynsim.studies.processes import WorkerInterrupted, WorkerLost, WorkerSilent, run_in_processes
+from dynsim.studies.processes import WorkerInterrupted, WorkerLost, run_in_processes
 from dynsim.studies.sweep import JOURNAL, LOST, SweepRow, numbers, run_sweep
 from dynsim.studies.sweep_plan import Axis, Law, Plan
 
@@ -267,31 +267,6 @@ def test_a_task_outlives_the_process_that_it_had_first(tmp_path: Path):
     assert taken == {number: number**2 for number in range(8)}
 
 
-@pytest.mark.long
-@pytest.mark.skipif(not hasattr(signal, "SIGSTOP"), reason="no signal stops a process here")
-def test_a_process_that_gives_no_sign_of_life_costs_only_its_task(monkeypatch: pytest.MonkeyPatch):
-    """One is in compiled code for good, one is stopped; both are ended, and others do what is left."""
-    monkeypatch.setattr(processes, "SILENT_S", 2.0)
-    taken: dict[int, Any] = {}
-
-    def take(number: int, result: Callable[[], int]) -> None:
-        try:
-            taken[number] = result()
-        except WorkerSilent as error:
-            taken[number] = type(error)
-
-    assert run_in_processes(hangs, range(10), 2, take, attempts=2) is False
-    assert taken == {number: number**2 for number in range(10)} | {DEADLY: WorkerSilent, REFUSED: WorkerSilent}
-
-
-@pytest.mark.long
-def test_a_process_that_takes_its_time_is_not_given_up(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(processes, "SILENT_S", 1.3)
-    taken: dict[int, int] = {}
-    run_in_processes(slow, range(2), 2, lambda number, result: taken.update({number: result()}))
-    assert taken == {0: 0, 1: 1}
-
-
 def test_ctrl_c_does_not_wait_for_who_does_not_look(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Both workers sleep for longer than any test; what they had in hand is interrupted."""
     taken: dict[int, Any] = {}
@@ -348,18 +323,21 @@ def test_a_process_that_leaves_a_thread_behind_is_replaced():
     assert all(taken[number] != left for number in range(DEADLY + 1, 10))
 
 
-def test_a_silent_process_is_a_row_with_its_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_lost_process_is_a_row_with_its_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """What a sweep makes of it: the other runs are there."""
+
+    def lose() -> None:
+        raise WorkerLost
 
     def run(work: Any, tasks: Any, jobs: int, take: Any, *, attempts: int) -> bool:
         for k, task in enumerate(tasks):
-            take(task, partial(processes._raise, WorkerSilent) if k == 1 else partial(work, task, None))
+            take(task, lose if k == 1 else partial(work, task, None))
         return False
 
     monkeypatch.setattr(batch, "run_in_processes", run)
     rows = run_sweep(plan(Axis.parse(f"{LENGTH}=0.5:1:3")), tmp_path, jobs=2)
     assert [row.status for row in rows] == ["ok", "lost", "ok"]
-    assert mentions(rows[1].reason, "60 s")
+    assert mentions(rows[1].reason, "killed")
 
 
 @pytest.mark.parametrize("listens", [True, False])
@@ -664,7 +642,7 @@ def workers_of(pid: int) -> list[int]:
         return sum(map(int, Path(f"/proc/{child}/stat").read_text().rpartition(")")[2].split()[11:13]))
 
     children = map(int, Path(f"/proc/{pid}/task/{pid}/children").read_text().split())
-    workers = [child for child in children if "dynsim.studies.worker" in Path(f"/proc/{child}/cmdline").read_text()]
+    workers = [child for child in children if "dynsim.studies.processes" in Path(f"/proc/{child}/cmdline").read_text()]
     return sorted(workers, key=ticks, reverse=True)
 
 
