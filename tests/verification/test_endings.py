@@ -13,6 +13,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from combinations.sentences import HOLDS_UP
+from support.messages import check_message, mentions, raises, says
 
 import dynsim
 from dynsim.engine import kinematic, stopping
@@ -219,10 +221,9 @@ def test_steps_that_come_nowhere_end_a_run(method: str):
     stop = raised.value
     assert stop.kind == "no_progress"
     assert stop.time < 1e-8
-    message = "no progress, the last 10000 steps came no further than 1.0e-05 s, the last of 1.0e-13 s; elbow_4 s"
-    assert message in str(stop)
+    check_message(stop, "10000", "1.0e-05 s", "1.0e-13 s", "elbow_4")
     # Contact and mode; a step of time stepping begins with different modes.
-    assert method == "time_stepping" or "; elbow_4 slides, elbow_7 sticks; " in str(stop)
+    assert method == "time_stepping" or mentions(stop, "elbow_4", "elbow_7")
     assert stop.record is not None
     assert not stop.record.complete
     assert stop.record.time.tolist() == [0.0]
@@ -239,8 +240,9 @@ def test_steps_are_counted_from_where_they_last_came_on():
 def test_a_simulation_that_comes_nowhere_stops_with_its_trace():
     overrides = {**TINY, "integrator.step_max_s": 1e-13, "integrator.method": "dopri5"}
     simulation = dynsim.Simulation(dynsim.load_scenario("single_pendulum", overrides=overrides), duration=np.inf)
-    with pytest.raises(SimulationStopped, match="no progress") as raised:
+    with pytest.raises(SimulationStopped) as raised:
         simulation.advance(1.0)
+    assert raised.value.kind == "no_progress"
     assert raised.value.record.time.tolist() == [0.0]
     assert not simulation.record().complete
 
@@ -256,7 +258,7 @@ def test_runs_of_a_batch_that_come_nowhere_are_looked_at_alone():
     overrides = {**TINY, "integrator.step_max_s": 1e-12, "integrator.method": "dopri5"}
     lengths = [{"plant.chain.0.length_m": length} for length in (0.5, 1.0)]
     runs = [dynsim.load_scenario("single_pendulum", overrides={**overrides, **length}) for length in lengths]
-    assert all("no progress" in result.reason for result in dynsim.simulate_batch(runs))
+    assert all(mentions(result.reason, "10000") for result in dynsim.simulate_batch(runs))
 
 
 # ---- The wall limit
@@ -266,7 +268,7 @@ SLOW |= {"integrator.method": "dopri5", "integrator.wall_limit_s": 0.3}
 
 
 def test_the_wall_limit_ends_a_run_with_what_it_has():
-    with pytest.raises(SimulationStopped, match=r"wall limit, integrator.wall_limit_s = 0\.3 s, is over") as raised:
+    with raises(SimulationStopped, "integrator.wall_limit_s = 0.3 s") as raised:
         dynsim.simulate(dynsim.load_scenario("single_pendulum", overrides=SLOW))
     assert raised.value.kind == "out_of_time"
     assert 0.0 < raised.value.time < 100.0
@@ -280,33 +282,30 @@ def test_the_wall_limit_of_a_simulation_is_that_of_all_its_pieces():
         for k in range(1, 100_000):
             simulation.advance(1e-3 * k)
 
-    with pytest.raises(SimulationStopped, match="wall limit"):
+    with raises(SimulationStopped, "integrator.wall_limit_s = 0.3 s"):
         advance()
 
 
 @pytest.mark.parametrize(
-    ("ending", "settings"),
+    ("kind", "settings"),
     [
-        ("wall limit", {}),
-        ("no progress", {"duration_s": 36000.0, "record.rate_hz": 1, "integrator.wall_limit_s": None}),
+        ("out_of_time", {}),
+        ("no_progress", {"duration_s": 36000.0, "record.rate_hz": 1, "integrator.wall_limit_s": None}),
     ],
 )
 @pytest.mark.parametrize("law", ["unilateral", "bilateral"])
-def test_a_stop_says_which_friction_holds_explicit_steps_up(law: str, ending: str, settings: dict[str, object]):
+def test_a_stop_says_which_friction_holds_explicit_steps_up(law: str, kind: str, settings: dict[str, object]):
     """A block that creeps down a slope, see the file: its friction changes within m s/(μ f), and W = 1/m.
 
     s is the limit of slow slip, 1e-7 m/s, or √(v² + v_s²) for a glued contact.
     """
     smooth = {"contacts.slip_smoothing_m_s": 1e-7} if law == "bilateral" else {}
-    with pytest.raises(SimulationStopped, match=ending) as raised:
+    with pytest.raises(SimulationStopped) as raised:
         dynsim.simulate(dynsim.load_scenario(CREEPING, overrides={"contacts.law": law, **smooth, **settings}))
-    said = re.search(
-        r"; steps are as short as (\S+) s because foot slips at (\S+) m/s and its friction changes within (\S+) s; "
-        r"integrator\.method: radau5 follows that with longer steps$",
-        str(raised.value),
-    )
+    assert raised.value.kind == kind
+    said = re.search(HOLDS_UP, str(raised.value))
     assert said is not None
-    step, speed, within = map(float, said.groups())
+    step, speed, within = map(float, (said[1], said[3], said[4]))
     v = raised.value.state["v"]
     force = 2.0 * 9.81 / np.hypot(1.0, 0.4 * (1.0 + 4e-4))
     assert speed == pytest.approx(np.linalg.norm(v), rel=5e-3)
@@ -326,15 +325,14 @@ def test_an_implicit_method_is_not_held_up_by_stiff_friction():
 def test_the_wall_limit_ends_a_snake():
     overrides = {"duration_s": 1000, "record.rate_hz": 1, "integrator.wall_limit_s": 0.2}
     scenario = dynsim.load_scenario("snake_circle", overrides=overrides)
-    with pytest.raises(SimulationStopped, match=r"wall limit, .*, is over, in mode") as raised:
+    with raises(SimulationStopped, "integrator.wall_limit_s = 0.2 s", "1") as raised:
         kinematic.simulate(scenario)
     assert len(raised.value.record.time) > 1
 
 
 def test_a_method_that_was_removed_is_told_with_its_replacement():
     for method in ("rk4", "rk43"):
-        says = rf"integrator\.method = '?{method}'?: is no longer there; take dopri5, or time_stepping where steps are"
-        with pytest.raises(ScenarioError, match=says):
+        with raises(ScenarioError, f"integrator.method = '{method}'", "dopri5", "time_stepping"):
             dynsim.load_scenario("single_pendulum", overrides={"integrator.method": method})
 
 
@@ -401,7 +399,7 @@ def test_a_step_that_does_not_end_is_stuck(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(stopping, "STUCK_S", 0.3)
     stands = Stands(monkeypatch)
     try:
-        with pytest.raises(SimulationStopped, match=r"one step of .* does not end") as raised:
+        with pytest.raises(SimulationStopped) as raised:
             dynsim.simulate(floor())
     finally:
         stands.released.set()
@@ -463,7 +461,7 @@ def test_a_simulation_whose_step_did_not_end_does_not_go_on(monkeypatch: pytest.
         stands.released.set()
     record = simulation.record()
     assert not record.complete
-    assert "does not end" in record.summary["warnings"][-1]
+    assert says(record.summary["warnings"][-1], "stuck")
 
 
 def test_ticks_of_a_snake_are_run_without_a_thread_each(monkeypatch: pytest.MonkeyPatch) -> None:

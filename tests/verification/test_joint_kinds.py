@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.special import ellipj
+from support.messages import raises
 from support.random_robots import (
     assemble,
     random_contacts,
@@ -194,7 +195,7 @@ def test_axes_of_a_plane_are_orthonormal_for_every_normal(side, tilt):
 def test_a_start_that_is_no_attitude_is_refused():
     robot = robot_of(floating(body("body")))
     for length in (0.0, 1.0 + 1e-6):
-        with pytest.raises(ModelError, match=r"body_joint: the initial quaternion has length .*; it must be 1"):
+        with raises(ModelError, "body_joint", "1"):
             Model(replace(robot, q0=np.r_[np.zeros(3), length, 0.0, 0.0, 0.0]))
 
 
@@ -202,14 +203,14 @@ def test_a_start_that_is_no_attitude_is_refused():
 def test_a_rate_without_a_position_has_no_motor(joint):
     robot = robot_of(rolling(body("body")) if joint.endswith(("roll", "turn")) else floating(body("body")))
     motor = Motor(joint, 0.1, 1.0, 1e-3, 1e-5, 10.0)
-    with pytest.raises(ModelError, match=rf"motor: {joint} is one of several rates of a joint"):
+    with raises(ModelError, joint):
         Model(replace(robot, motors=(motor,)))
 
 
 def test_contacts_are_on_bodies_and_not_on_rows():
     robot = robot_of(floating(body("body")))
     assert robot.carriers == {link.name for link in robot.links} - {"body"}
-    with pytest.raises(ModelError, match=r"no body 'body\.position'; bodies: body$"):
+    with raises(ModelError, "'body.position'", "body"):
         robot.attach("body.position", np.zeros(3))
 
 

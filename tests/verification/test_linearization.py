@@ -12,6 +12,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from scipy.linalg import expm
+from support.messages import raises
 from support.pinocchio_oracle import Oracle
 
 import dynsim
@@ -264,24 +265,24 @@ def test_a_linear_step_is_the_change_of_the_simulation() -> None:
 
 
 @pytest.mark.parametrize(
-    ("inputs", "outputs", "words"),
+    ("inputs", "outputs", "names"),
     [
-        (["comand.joint_1"], [], "no input 'comand.joint_1'; did you mean 'command.joint_1'"),
-        ([], ["hand"], "no output 'hand'"),
-        ("command", "q", ""),
+        (["comand.joint_1"], [], ["comand.joint_1", "command.joint_1"]),
+        ([], ["hand"], ["'hand'", "hand_position"]),
+        ("command", "q", []),
     ],
 )
-def test_names_are_families_or_one_of_them(inputs: object, outputs: object, words: str) -> None:
+def test_names_are_families_or_one_of_them(inputs: object, outputs: object, names: list[str]) -> None:
     simulation = Simulation(load_scenario("elbow_comparison", "no_elbow"))
-    if not words:
+    if not names:
         linear = simulation.linearize(inputs, outputs)
         assert (linear.B.shape, linear.C.shape) == ((30, 10), (10, 30))
         return
-    with pytest.raises(DynsimError, match=words):
+    with raises(DynsimError, *names):
         simulation.linearize(inputs, outputs)
 
 
 def test_time_stepping_is_refused_in_words() -> None:
     simulation = Simulation(load_scenario("elbow_comparison_floor", overrides={"integrator.method": "time_stepping"}))
-    with pytest.raises(DynsimError, match=r"Simulation\.linearize requires integrator\.method: auto"):
+    with raises(DynsimError, "Simulation.linearize", "integrator.method: auto"):
         simulation.linearize()

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.messages import check_message, lines_with, mentions, raises
 from support.random_robots import CompiledSystem, assemble, random_contacts, random_robot, random_unit
 
 import dynsim
@@ -71,8 +72,7 @@ def test_a_signed_rod_is_stopped_where_its_diagonal_vanishes(method, rtol, turn)
     paradox_seen = paradox(b.system, new_workspace(b.system), run, contacts)
     assert paradox_seen is not None, run.count
     t, y, words = paradox_seen
-    assert "Painlevé's paradox at tip" in words
-    assert "lower contacts.friction" in words
+    check_message(words, "Painlevé", "tip", "contacts.friction")
     assert run.clock[ki.TIME] <= t
     # The steps collapse where the determinant is 2e-5, which is 5e-6 rad before it vanishes.
     assert b.part(y, "q")[2] == pytest.approx(CRITICAL, abs=1e-5)
@@ -88,10 +88,9 @@ def test_a_signed_rod_that_starts_beyond_is_stopped_before_its_first_step(method
     assert run.count[ki.STEPS] == 0
     t, _, words = paradox(b.system, new_workspace(b.system), run, contacts)
     assert t == 0.0
-    assert "is negative" in words
     # 5 − 3 cos 2θ + 3 μ sin 2θ = 0 solved for μ.
     least = (5.0 - 3.0 * np.cos(1.2)) / (3.0 * np.sin(1.2))
-    assert f"below {least:.3g}" in words
+    check_message(words, "Painlevé", "tip", "contacts.friction", f"{least:.3g}")
     b, _ = rod("signed", friction=0.99 * least)
     assert started(b, rod_state(b, -0.6, 0.0), method, end=1e-3).count[ki.STATUS] == ki.FINISHED
 
@@ -103,7 +102,7 @@ def test_a_dissipative_rod_is_stopped_where_a_second_solution_appears(method):
     run = started(b, rod_state(b, 0.0, 0.5), method)
     assert run.count[ki.STATUS] == ki.SEVERAL_FORCES
     t, y, words = paradox(b.system, new_workspace(b.system), run, contacts)
-    assert "two consistent solutions (Painlevé's paradox) at tip" in words
+    check_message(words, "Painlevé", "tip", "contacts.friction")
     assert run.clock[ki.TIME] < t <= run.clock[ki.NOT_UNIQUE]
     # The smoothing speed turns the slip by 5e-8 of its direction, μ by as much; the state is linear over the step.
     assert b.part(y, "q")[2] == pytest.approx(-CRITICAL, abs=2e-6)
@@ -337,7 +336,7 @@ contacts:
 def test_a_run_through_the_paradox_is_stopped_by_name_and_saved(tmp_path: Path, method):
     path = tmp_path / "rod.yaml"
     path.write_text(ROD)
-    with pytest.raises(SimulationStopped, match=r"Painlevé's paradox at tip.*lower contacts.friction") as stop:
+    with raises(SimulationStopped, "Painlevé", "tip", "contacts.friction") as stop:
         dynsim.simulate(dynsim.load_scenario(str(path), overrides={"integrator.method": method}))
     error = stop.value
     assert error.exit_code == 3
@@ -372,10 +371,10 @@ def test_a_summary_says_that_three_braces_on_two_joints_leave_the_yaw_open(tmp_p
     path = tmp_path / "yawing.yaml"
     path.write_text(YAWING.replace("FRICTION", str(friction)))
     warnings = dynsim.simulate(dynsim.load_scenario(str(path))).summary["warnings"]
-    assert any("split of least norm" in text for text in warnings)
-    said = [text for text in warnings if "leave the motion open" in text]
+    assert lines_with(warnings, phrase="least norm")
+    said = lines_with(warnings, phrase="motion open")
     assert len(said) == (friction > 0.0)
-    assert all("acceleration of joint_1 is anything from" in text and "rad/s²" in text for text in said)
+    assert all(mentions(text, "joint_1", "rad/s²") for text in said)
 
 
 def test_a_reversed_diagonal_beside_a_positive_determinant_is_a_warning():
@@ -383,10 +382,12 @@ def test_a_reversed_diagonal_beside_a_positive_determinant_is_a_warning():
     scenario = dynsim.load_scenario("elbow_comparison", overrides={"duration_s": 0.02})
     prepared = simulation.prepare(scenario)
     driver.advance(prepared.system, prepared.workspace, prepared.run, 10**6)
-    for since, expected in ((np.inf, []), (0.013, ["elbow_4: from t = 0.013 s on"])):
+    for since, expected in ((np.inf, []), (0.013, [("elbow_4", "0.013 s")])):
         prepared.run.extremes[0, ki.LOCAL_SINCE] = since  # as the watch does, see the random cases above
         warnings = recording.make_record(scenario, prepared, 1.0).summary["warnings"]
-        assert [text[: len("elbow_4: from t = 0.013 s on")] for text in warnings if "Painlevé" in text] == expected
+        said = lines_with(warnings, "Painlevé")
+        assert [mentions(text, *names) for text in said for names in expected] == [True] * len(expected)
+        assert len(said) == len(expected)
 
 
 def test_dissipative_is_the_default_and_the_published_comparisons_name_their_own_law():
@@ -402,4 +403,5 @@ def test_dissipative_is_the_default_and_the_published_comparisons_name_their_own
 def test_no_false_alarm_in_shipped_braces(simulated, variant):
     record = simulated("thirty_links", variant)
     assert record.complete
-    assert not any("Painlevé" in text or "motion open" in text for text in record.summary["warnings"])
+    assert not lines_with(record.summary["warnings"], "Painlevé")
+    assert not lines_with(record.summary["warnings"], phrase="motion open")

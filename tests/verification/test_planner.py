@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 from studies.planner_scenes import scene, scene_scenario
+from support.messages import check_message, lines_with, mentions, raises, says
 
 import dynsim
 from dynsim.compile.bracing import Brace
@@ -292,25 +294,25 @@ def test_a_path_out_of_reach_is_answered_in_words() -> None:
     plan = dynsim.plan_braces(scenario_from_resolved(data), count=(0, 1), verify=False, starts=1)
     assert plan.best is None
     assert [size["braces"] for size in plan.json["sizes"]] == [[], []]
-    assert all("out of reach" in size.reason for size in plan.sizes)
-    with pytest.raises(ScenarioError, match="out of reach"):
+    assert all(says(size.reason, "no posture") for size in plan.sizes)
+    with raises(ScenarioError, "1", phrase="no posture"):
         plan.scenario(1)
 
 
 def test_what_cannot_be_planned_is_refused_with_its_reason() -> None:
     scenario = scene_scenario(4)
-    with pytest.raises(ModelError, match=r"no candidate 'elbow'"):
+    with raises(ModelError, "'elbow'", "link_1"):
         dynsim.plan_braces(scenario, candidates=["elbow"], verify=False)
-    with pytest.raises(ScenarioError, match="count"):
+    with raises(ScenarioError, "count = 2:1"):
         dynsim.plan_braces(scenario, count=(2, 1))
-    with pytest.raises(ModelError, match="no surface 'roof'"):
+    with raises(ModelError, "'roof'", "floor"):
         dynsim.plan_braces(scenario, surfaces=["roof"], verify=False)
     bare = replace(scenario, config=scenario.config.model_copy(update={"controller": None}))
-    with pytest.raises(ModelError, match=r"controller\.hand\.path"):
+    with raises(ModelError, "controller.hand.path"):
         dynsim.plan_braces(bare, verify=False)
     weightless = scene(4)
     weightless["plant"]["gravity_m_s2"] = [0.0, 0.0, 0.0]
-    with pytest.raises(ScenarioError, match="without gravity"):
+    with raises(ScenarioError, "plant.gravity_m_s2 = [0, 0, 0]"):
         dynsim.plan_braces(scenario_from_resolved(weightless))
 
 
@@ -321,7 +323,7 @@ def test_an_arm_without_braces_is_run_at_all_corners(searched) -> None:  # type:
     near, far = (Verifier(search.task, Tolerances(friction=(1.0,), shift_m=(0.0, shift))) for shift in (0.005, 0.5))
     assert [len(v.verify([(plan.braces, plan.dense)])[0].corners) for v in (near, far)] == [2, 2]
     assert near.verify([(plan.braces, plan.dense)])[0].survives
-    assert "deep at t = " in far.verify([(plan.braces, plan.dense)])[0].reason
+    assert mentions(far.verify([(plan.braces, plan.dense)])[0].reason, "+500 mm", re.compile(r"\d mm .*\bt = "))
 
 
 @pytest.mark.long  # a program of its own to compile
@@ -380,28 +382,28 @@ def test_a_frame_is_a_candidate_at_its_point(urdf_arm: dynsim.Scenario) -> None:
     (pad,) = task(urdf_arm, Options(candidates=("pad",))).candidates
     assert (pad.name, pad.body, pad.point_m, pad.radius) == ("pad", "pad", (0.0, 0.0, 0.0), 0.0)
     assert pad.on_joint == pytest.approx([0.1, 0.0, -0.02])
-    with pytest.raises(ModelError, match=r"no candidate 'foot'; contact points, links and frames: heel, .*pad"):
+    with raises(ModelError, "'foot'", "heel", "pad"):
         task(urdf_arm, Options(candidates=("foot",)))
 
 
 @pytest.mark.parametrize(
-    ("options", "bare"),
+    ("options", "names"),
     [
-        ({"candidates": ["heel", "fore", "pad"]}, "candidates fore, pad have radius 0"),
-        ({"candidates": ["heel", "fore"], "radius_m": 0.02}, ""),
-        ({"candidates": ["heel"]}, ""),
+        ({"candidates": ["heel", "fore", "pad"]}, ["fore, pad", "--radius"]),
+        ({"candidates": ["heel", "fore"], "radius_m": 0.02}, []),
+        ({"candidates": ["heel"]}, []),
     ],
 )
 def test_candidates_without_a_radius_are_warned_of(
-    urdf_arm: dynsim.Scenario, options: dict[str, Any], bare: str
+    urdf_arm: dynsim.Scenario, options: dict[str, Any], names: list[str]
 ) -> None:
     """Links of a URDF have none; a radius that was asked for, or that of a contact point, is meant."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         dynsim.plan_braces(urdf_arm, count=(0, 1), starts=1, verify=False, **options)
-    texts = [str(warning.message) for warning in caught if "radius 0" in str(warning.message)]
-    assert len(texts) == bool(bare)
-    assert all(bare in text and "--radius" in text for text in texts)
+    texts = lines_with([str(warning.message) for warning in caught], "--radius")
+    assert len(texts) == bool(names)
+    assert all(mentions(text, *names) for text in texts)
 
 
 def test_loads_that_no_plan_knows_are_warned_of(urdf_arm: dynsim.Scenario) -> None:
@@ -418,11 +420,11 @@ def test_loads_that_no_plan_knows_are_warned_of(urdf_arm: dynsim.Scenario) -> No
             warnings.simplefilter("always")
             plan = dynsim.plan_braces(dynsim.load_scenario(path), count=(0, 0), starts=1, verify=False)
         heats[name] = plan.sizes[0].heat
-        texts[name] = [str(warning.message) for warning in caught if "only payloads" in str(warning.message)]
+        texts[name] = lines_with([str(warning.message) for warning in caught], f"loads.{name}")
     assert heats["pull"] == heats["none"] < heats["weight"]
     assert not texts["none"]
     assert not texts["weight"]
-    assert texts["pull"][0].startswith("plan: loads.pull: planned without")
+    check_message(texts["pull"][0], "plan")
 
 
 def test_a_plan_that_costs_less_than_planned_holds() -> None:
@@ -441,7 +443,7 @@ def test_a_plan_that_costs_less_than_planned_holds() -> None:
     # More by over 5 % is refused.
     greedy = replace(size.dense, heat=size.nominal.heat_W / 1.06)
     (verdict,) = Verifier(plan.task, Tolerances(gains=(size.k_p,))).verify([(size.braces, greedy)])
-    assert "over 5 % more than the planned" in verdict.reason
+    assert mentions(verdict.reason, "5 %", f"{greedy.heat:.3g} W")
     assert not verdict.sound
 
 

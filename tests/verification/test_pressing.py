@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
+from support.messages import raises
 
 import dynsim
 from dynsim.compile.bracing import Brace
@@ -79,7 +81,7 @@ contacts: {law: unilateral, points: {tip: {body: link_2, point_m: [0, 0, 0.4]}}}
     assert np.degrees(model.robot.initial[0]) <= 100.0
     assert np.abs(gaps_and_rates(model, build.contacts(case), model.robot.initial)[0]).max() <= 1e-12
     path.write_text(arm.replace("UPPER", "25").replace("[-90, 100]", "[-90, 62]"), encoding="utf-8")
-    with pytest.raises(DynsimError, match=r"onto the surfaces with joint_[12], joint_[12] at the limit; 0\.\d+ m"):
+    with raises(DynsimError, "tip", "joint_1, joint_2", re.compile(r"\b0\.\d+ m\b"), "initial"):
         dynsim.build_model(dynsim.load_scenario(path))
 
 
@@ -93,7 +95,7 @@ def test_candidates_are_put_on_their_surfaces_too():
     for body in ("link_4", "link_7"):
         assert model.point_position(body, [0, 0, 0], model.robot.initial)[2] == pytest.approx(-0.01, abs=1e-12)
     pillar = {"type": "sphere", "center_m": [0, 0, -9], "radius_m": 1}
-    with pytest.raises(DynsimError, match=r"initial.on_surface: 'link_4' is the axis of a link"):
+    with raises(DynsimError, "initial.on_surface", "'link_4'"):
         dynsim.build_model(
             dynsim.load_scenario(
                 "elbow_comparison_links",
@@ -104,11 +106,11 @@ def test_candidates_are_put_on_their_surfaces_too():
 
 def test_posture_that_no_joint_can_reach_is_refused():
     everything = [f"joint_{k}" for k in range(1, 11)]
-    with pytest.raises(DynsimError, match=r"initial: the joints that may move do not bring elbow_4, elbow_7"):
+    with raises(DynsimError, "initial", "elbow_4, elbow_7", "0.1 m"):
         dynsim.build_model(
             scenario(**{"plant.initial_deg": OFF, "initial": {"on_surface": ELBOWS, "keep": everything}})
         )
-    with pytest.raises(DynsimError, match=r"initial.on_surface: no contact 'elbow_5'"):
+    with raises(DynsimError, "initial.on_surface", "'elbow_5'", "elbow_4, elbow_7"):
         dynsim.build_model(scenario(initial={"on_surface": ["elbow_5"]}))
 
 
@@ -185,17 +187,20 @@ def test_least_heat_keeps_both_elbows_on_the_real_floor(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("overrides", "said"),
+    ("overrides", "names"),
     [
-        ({"controller.brace": {"elbow_9": 1.0}}, "no contact 'elbow_9'"),
-        ({"controller.brace": {"elbow_4": -1.0}}, "controller.brace"),
-        ({"controller.brace": "optimal", "controller.feed_forward": "gravity"}, "leave feed_forward away"),
-        ({"controller.min_N": 1.0}, "min_N is for brace: optimal"),
+        ({"controller.brace": {"elbow_9": 1.0}}, ["controller.brace", "'elbow_9'", "elbow_4, elbow_7"]),
+        ({"controller.brace": {"elbow_4": -1.0}}, ["controller.brace.elbow_4 = -1.0", "0 N"]),
+        (
+            {"controller.brace": "optimal", "controller.feed_forward": "gravity"},
+            ["controller.feed_forward = 'gravity'"],
+        ),
+        ({"controller.min_N": 1.0}, ["controller.min_N = 1.0", "brace: optimal"]),
     ],
 )
-def test_refused(overrides, said):
+def test_refused(overrides, names):
     model = dynsim.build_model(scenario())
-    with pytest.raises(DynsimError, match=said):
+    with raises(DynsimError, *names):
         build.controller(scenario(**overrides), model)
 
 
@@ -203,5 +208,5 @@ def test_a_brace_in_the_air_is_refused(tmp_path):
     """Nothing would carry what is planned for it."""
     raised = {"plant.base.position_m": [0.0, 0.0, 0.3], "controller.hand.path.center_m": [1.5, 1.5, 0.7]}
     case = real_floor(tmp_path, **{"controller.brace": FORCES}, **raised)
-    with pytest.raises(DynsimError, match=r"elbow_4 \+0.3 m off surface 'floor'"):
+    with raises(DynsimError, "controller.brace", "elbow_4", "+0.3 m", "floor"):
         dynsim.simulate(case)
