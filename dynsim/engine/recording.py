@@ -45,7 +45,7 @@ from dynsim.record.measures import (
     sinks,
 )
 from dynsim.record.poses import TOUCHING, add_body_poses, point_positions
-from dynsim.record.scene import Grip, Point, Scene, vector3
+from dynsim.record.scene import Point, Scene, SoftGripper, vector3
 from dynsim.scenario import Scenario, build, to_yaml
 from dynsim.system.files import discard, json_text, replace_together, write_text
 from dynsim.system.memo import recall
@@ -460,7 +460,7 @@ def pictured_parts(scene: Scene, scenario: Scenario) -> Scene:
     """Return the scene with the parts that only the scenario names: objects, mesh folders and the gripper."""
     plant, grip, tip = scenario.plant, None, 0.0
     if (law := getattr(plant, "gripper", None)) is not None:
-        grip = Grip(law.capture_m, law.bound_N, law.turning_bound_N_m)
+        grip = SoftGripper(law.capture_m, law.bound_N, law.turning_bound_N_m)
         tip = 0.0 if plant.controlled_point == "gripper" else plant.gripper_length_m
     files = (getattr(part, "file", None) for part in (plant, getattr(plant, "arm", None)))
     folders = tuple(str(Path(file).parent) for file in files if file is not None)

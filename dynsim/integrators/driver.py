@@ -36,6 +36,7 @@ from dynsim.integrators.methods import compiled
 from dynsim.integrators.radau5.step import after_step, end_accepted, end_workspace, step_radau5
 from dynsim.integrators.radau5.tables import discard_history
 from dynsim.integrators.run import Run, forces_unique, rewrite_sample, sample_step, settle, watch, write_waiting
+from dynsim.integrators.simd import radau5  # noqa: F401 (registers variants of kernels)
 from dynsim.integrators.steps import choose_step, finished, finite, first_step, next_step, rejected, stalled
 from dynsim.jit.kernel import FixedSignature, free_kernel, inline_kernel, internal_kernel, noinline_kernel
 

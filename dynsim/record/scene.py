@@ -280,7 +280,7 @@ class Point:
 
 
 @dataclass(frozen=True)
-class Grip:
+class SoftGripper:
     """Soft gripper of a snake.
 
     Attributes
@@ -320,7 +320,7 @@ class Scene:
         Resistance [ohm] and voltage limit [V] of the DC motors, if all have the same.
     mesh_folders : tuple of str
         Folders in which mesh files are searched for.
-    grip : Grip or None
+    grip : SoftGripper or None
         Gripper of a snake.
     tip : float
         Distance of the tip of a snake's gripper ahead of the controlled point [m].
@@ -341,7 +341,7 @@ class Scene:
     resistance: float | None = None
     voltage_limit: float | None = None
     mesh_folders: tuple[str, ...] = ()
-    grip: Grip | None = None
+    grip: SoftGripper | None = None
     tip: float = 0.0
 
     def __post_init__(self) -> None:

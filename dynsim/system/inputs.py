@@ -289,7 +289,7 @@ class _Reader:
         if event.anchor is not None:
             self._anchors[event.anchor] = name
         if name in mapping:
-            self._fail(_line(event), f"duplicate key {name!r} (first in line {mapping.lines[name]})")
+            self._fail(_line(event), f"duplicate key {name!r} (already on line {mapping.lines[name]})")
         return name
 
     def _copy(self, value: Any, line: int, depth: int) -> Any:

@@ -379,7 +379,7 @@ def in_process(
     return finished.value.code, captured.out, [line for line in captured.err.splitlines() if line.strip()]
 
 
-@pytest.mark.parametrize("command", [[], ["run"], ["compare"], ["plot"], ["bench"], ["hw", "replay"]])
+@pytest.mark.parametrize("command", [[], ["run"], ["compare"], ["plot"], ["list"], ["hw", "replay"]])
 def test_help_shows_flags_without_a_type(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture, command: list[str]
 ):

@@ -11,7 +11,7 @@ DO_NOT_BRING = "cannot bring"
 NOTHING_HOLDS = "this posture cannot be held at rest"
 NO_WAYPOINTS = "no joint has waypoints"
 OFF_SURFACE = "from surface"
-REFERENCES_OFF = "the joint references move its point .* off surface"
+REFERENCES_OFF = "references move .* off surface"
 
 # Parts of warnings and stops.
 DRIFTED = "contacts drifted"
@@ -103,7 +103,7 @@ UNVERIFIED: dict[str, str] = {
     r"has no effect: ": "said of a key of the scenario, not of the run",
     r"^the target waited|^the path is|^feedback and shape points|^the null-space|^joints were clamped|^the robot tips|"
     r"^the support margin|^mode \d+ was|passes its limit by|"
-    r"^the head is up to": "for the kinematic snake, which these scenes do not have",
+    r"^the head is up to|^the controller's estimate": "for the kinematic snake, which these scenes do not have",
 }
 """Warnings that nothing outside the engine can tell, each with the reason."""
 # Sentences of the modules that make warnings which end as part of an error, of a stop, or of another sentence.

@@ -48,6 +48,10 @@ def test_scalar_and_simd_solutions_agree(make, h):
     scalar, lanes = copies(run.newton)._replace(lanes=None), copies(run.newton)
     solve_compiled(b.system, b.ws, run.y, scalar, h)
     solve_compiled(b.system, b.ws, run.y, lanes, h)
+    # Each has worked in its own arrays.
+    assert scalar.real_inverse.any()
+    assert lanes.circuit.any() or lanes.over.any()
+    assert not np.array_equal(scalar.direct, lanes.direct)
     for expected, solved in ((scalar.one, lanes.one), (scalar.two, lanes.two)):
         assert np.abs(solved - expected).max() <= 1e-9 * np.abs(expected).max()
 

@@ -75,6 +75,7 @@ def reduced_inverse(system: System, r: NewtonArrays, g, A):
     """Write the inverse of the reduced matrix for g, real or complex, to A (n, n), by Gauss–Jordan elimination."""
     along, block, table, pivot = r.along, r.linear, system.drives.table, r.pivot
     n = A.shape[0]
+    first = 2 * n  # first row of the circuits
     for i in range(n):
         for j in range(n):
             A[i, j] = -along[j, i] / g - along[n + j, i]
@@ -84,7 +85,7 @@ def reduced_inverse(system: System, r: NewtonArrays, g, A):
         if k >= 0:
             gain = (block[a, ka.RATE_Q] / g + block[a, ka.RATE_V]) / (g - block[a, ka.RATE_I])
             for i in range(n):
-                A[i, j] -= along[2 * n + k, i] * gain
+                A[i, j] -= along[first + k, i] * gain
     for k in range(n):
         best = k
         for i in range(k + 1, n):
@@ -114,6 +115,7 @@ def solve_newton(system: System, y, r: NewtonArrays, g, A, x, room):
     """Replace x (s,) by (g I − J)⁻¹ x, from the inverse A of the reduced matrix; ``room`` (2, s) is scratch."""
     along, block, table, layout = r.along, r.linear, system.drives.table, system.layout
     n, q, v, current, angle, u = A.shape[0], layout.q, layout.v, layout.current, room[0], room[1]
+    first = 2 * n  # first row of the circuits
     if layout.extra > 0:
         rates_across(system.model, y, q, x, angle)
     for i in range(n):
@@ -127,7 +129,7 @@ def solve_newton(system: System, y, r: NewtonArrays, g, A, x, room):
         if k >= 0:
             free = (x[current + k] + block[a, ka.RATE_Q] * angle[j]) / (g - block[a, ka.RATE_I])
             for i in range(n):
-                u[i] += along[2 * n + k, i] * free
+                u[i] += along[first + k, i] * free
     for i in range(n):
         total = 0.0 * u[i]
         for j in range(n):

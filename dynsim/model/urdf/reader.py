@@ -497,7 +497,9 @@ class _Reader:
             for lost in shape.children if shape.tag not in ("inertial", "gazebo") else ():
                 if lost.tag in ("inertial", "mass", "inertia"):
                     raise self.file.error(
-                        lost.line, f"{who}: <{lost.tag}> in <{cut(shape.tag)}>; it belongs in <inertial>"
+                        lost.line,
+                        f"{who}: <{lost.tag}> is inside <{cut(shape.tag)}>; move it "
+                        f"{'directly below <link>' if lost.tag == 'inertial' else 'into <inertial>'}",
                     )
         shaped = any(child.tag in ("visual", "collision") for child in element.children)
         inertial = element.child("inertial")
@@ -812,7 +814,8 @@ def _locked(tree: UrdfTree, lock: Mapping[str, float]) -> UrdfTree:
             raise ModelError(f"{tree.path}: lock: {name} = {value} is not a finite number")
         if not joint.lower - 1e-9 <= value <= joint.upper + 1e-9:
             warnings.warn(
-                f"{tree.path}: joint {name} is locked at {value:g}, beyond its limits {joint.lower:g}, {joint.upper:g}",
+                f"{tree.path}: joint {name!r} is locked at {value:g}, outside its limits "
+                f"[{joint.lower:g}, {joint.upper:g}]",
                 stacklevel=3,
             )
         if joint.kind == "prismatic":
