@@ -58,6 +58,14 @@ PHRASES = {
     "steps gain": "the steps themselves add",
     "stuck": "does not end",
     "tips over": "tips over",
+    # Warnings of drives and of snakes.
+    "diverges": "its prediction diverges",
+    "out of reach": "out of reach",
+    "overload": "rms over the run",
+    "slowed down": "slowed down",
+    "target waited": "the target waited for",
+    "too fast": "too fast for the joints",
+    "would stop": "a real one would stop",
     # Rows of tables.
     "energy row": "electrical energy [J]",
     "impact row": "impact loss",

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.messages import check_message, lines_with, raises
 
 from dynsim import Scenario, Simulation, State, load_scenario
 from dynsim.engine.trace import even_times
@@ -70,7 +71,7 @@ def test_ties_go_on_from_the_state_as_they_were(kind: str, tmp_path: Path):
     # The first step does not extrapolate the accelerations of the last one: second order in the step.
     np.testing.assert_allclose(record["q"], whole["q"][later], atol=100.0 * STEP**2)
     assert record.summary["warnings"] == []
-    with pytest.raises(ModelError, match="2 values of tie_rest"):
+    with raises(ModelError, "2", "tie_rest", "1"):
         Simulation(scenario, state=replace(state, tie_rest=np.zeros(2)))
 
 
@@ -81,9 +82,9 @@ def test_a_state_that_does_not_say_how_far_ties_have_slid_is_said(tmp_path: Path
         simulation.advance(HALFWAY)
         again = Simulation(simulation.scenario, state=State.of(simulation.record()))
         again.advance(0.2)
-        said[kind] = [text for text in again.record().summary["warnings"] if "how far ties have slid" in text]
+        said[kind] = lines_with(again.record().summary["warnings"], "tie")
     assert not said["linear"]
-    assert said["bound"][0].startswith("tie: the state does not say")
+    check_message(said["bound"][0])
 
 
 LANDED = """
@@ -120,7 +121,7 @@ def test_a_run_goes_on_from_what_time_stepping_leaves(until: float, tmp_path: Pa
     ending = State.of(before)
     deep = ending.q.copy()
     deep[0] = np.radians(61.0)
-    with pytest.raises(ModelError, match="beyond its stop"):
+    with raises(ModelError, "joint_1", "61°", "60°", "contacts.law: unilateral"):
         Simulation(scenario, state=replace(ending, q=deep))
 
 

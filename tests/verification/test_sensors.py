@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+import re
 
 import numpy as np
 import pytest
+from support.messages import lines_with, raises
 
 from dynsim import Simulation, check, load_scenario, simulate
 from dynsim.engine import stopping
@@ -128,18 +130,18 @@ def test_a_snapshot_has_the_same_future(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("changes", "line", "words"),
+    ("changes", "line", "names"),
     [
-        ({"controller.sample_time_s": None}, 2, "give controller.sample_time_s, or remove the encoders"),
-        ({"controller": None}, 2, "there is no controller; remove them"),
-        ({"sensors.motion_capture": {}}, 0, "arms have sensors.encoders alone"),
+        ({"controller.sample_time_s": None}, 2, ["sensors.encoders", "controller.sample_time_s"]),
+        ({"controller": None}, 2, ["sensors.encoders"]),
+        ({"sensors.motion_capture": {}}, 0, ["sensors.motion_capture", "sensors.encoders"]),
     ],
 )
-def test_sensors_that_nobody_reads_are_refused_where_they_stand(tmp_path, changes, line, words):
+def test_sensors_that_nobody_reads_are_refused_where_they_stand(tmp_path, changes, line, names):
     path = tmp_path / "arm.yaml"
     path.write_text("sensors:\n  encoders: {delay_s: 0.01}\n" + ARM)
     at = f"arm.yaml:{line}" if line else "overrides"
-    with pytest.raises(ModelError, match=rf"{at}.*sensors\.(encoders|motion_capture).*{words}"):
+    with raises(ModelError, at, *names):
         simulate(load_scenario(path, None, changes))
 
 
@@ -147,7 +149,7 @@ def test_encoders_of_a_plant_without_motors_tell_nothing(tmp_path):
     path = tmp_path / "pendulum.yaml"
     path.write_text(PENDULUM)
     scenario = load_scenario(path)
-    assert any("sensors.encoders has no effect: the plant has no motors" in text for text in check(scenario).warnings)
+    assert lines_with(check(scenario).warnings, "sensors.encoders")
     assert simulate(scenario)["q_measured"].shape == (11, 0)
 
 
@@ -183,7 +185,7 @@ def test_pieces_of_a_run_that_ends_between_samples_are_the_run(run, tmp_path):
     pieces = simulation.record(scenario)
     for name in record:
         assert record[name].tobytes() == pieces[name].tobytes(), name
-    with pytest.raises(ScenarioError, match="samples cannot end"):
+    with raises(ScenarioError, "0.01 s", re.compile(r"\b0\.0237\d* s")):
         simulation.end_samples(0.01)
 
 

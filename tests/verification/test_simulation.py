@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 from scipy.special import ellipkinc
+from support.messages import check_message, raises
 
 import dynsim
 from dynsim.errors import ModelError, ScenarioError
@@ -96,7 +97,7 @@ def test_a_snapshot_has_the_same_future(method):
     assert np.abs(other.q - untouched["q"][300]).max() > 1e-3
     np.testing.assert_array_equal(first.q, untouched["q"][-1])
     assert same(simulation.record(), untouched)
-    with pytest.raises(ScenarioError, match="another simulation"):
+    with raises(ScenarioError):
         dynsim.Simulation(dynsim.load_scenario("single_pendulum")).restore(snapshot)
 
 
@@ -174,7 +175,7 @@ def test_bodies_without_a_fixed_base_can_be_pushed(tmp_path, kind):
     record = simulation.record()
     assert record.complete
     assert record.summary["loads_work_J"] == {"brick": pytest.approx(2.25, abs=1e-9)}
-    with pytest.raises(ModelError, match=r"no body 'brick\.x'; those are: brick"):
+    with raises(ModelError, "'brick.x'", "brick"):
         simulation.set_wrench("brick.x", force=[1.0, 0.0, 0.0])
 
 
@@ -525,51 +526,52 @@ def test_ticks_are_where_they_should_be_and_do_not_add_up_roundings():
 
 
 @pytest.mark.parametrize(
-    ("call", "error", "words"),
+    ("call", "error", "names"),
     [
-        (lambda s: s.advance("x"), ScenarioError, "cannot advance to t = 'x'"),
-        (lambda s: s.set_command("joint_1", "a"), ModelError, "must be numbers"),
-        (lambda s: s.advance(-1.0), ScenarioError, "cannot advance"),
-        (lambda s: s.advance(math.nan), ScenarioError, "cannot advance"),
-        (lambda s: s.set_reference("joint_x", 0.0), ModelError, "no motor 'joint_x'; those are: joint_1"),
-        (lambda s: s.set_reference("joint_1", math.inf), ModelError, "must be finite"),
-        (lambda s: s.set_wrench("hand"), ModelError, "no body 'hand'"),
-        (lambda s: s.set_wrench("link_1", force=[1.0]), ModelError, "three components"),
-        (lambda s: s.watch("angle", "joint_1"), ModelError, "no event 'angle'; events: joint_position"),
-        (lambda s: s.watch("contact_gap", "toe"), ModelError, "no contact 'toe'; those are: elbow_4, elbow_7"),
-        (lambda s: s.every(0.0, print), ScenarioError, "a period of at least"),
-        (lambda s: s.every(1e-14, print), ScenarioError, "a period of at least"),
-        (lambda s: [s.every(1.0, print, first=9.0) for _ in range(61)], ScenarioError, "at most 60 ticks"),
-        (lambda s: (s.every(1.0, lambda t: t.advance(0.1)), s.advance(0.1)), ScenarioError, "callback cannot advance"),
-        (lambda s: s.watch("joint_rate", "joint_1", math.nan), ModelError, "must be finite"),
-        (lambda s: s.restore(None), ScenarioError, "from its snapshot"),
-        (lambda s: s.restore(dynsim.Simulation(s.scenario).snapshot()), ScenarioError, "another simulation"),
-        (lambda s: dynsim.Simulation(s.scenario, trace=-1), ScenarioError, "number of samples"),
-        (lambda s: dynsim.Simulation(s.scenario, state=7), ModelError, "starts from a State"),
+        (lambda s: s.advance("x"), ScenarioError, ["'x'", "0 s"]),
+        (lambda s: s.set_command("joint_1", "a"), ModelError, ["command", "['a']"]),
+        (lambda s: s.advance(-1.0), ScenarioError, ["-1.0 s", "0 s"]),
+        (lambda s: s.advance(math.nan), ScenarioError, ["nan s", "0 s"]),
+        (lambda s: s.set_reference("joint_x", 0.0), ModelError, ["'joint_x'", "joint_1, joint_2"]),
+        (lambda s: s.set_reference("joint_1", math.inf), ModelError, ["reference", "[[inf, 0.0]]"]),
+        (lambda s: s.set_wrench("hand"), ModelError, ["'hand'", "link_1, link_2"]),
+        (lambda s: s.set_wrench("link_1", force=[1.0]), ModelError, []),
+        (lambda s: s.watch("angle", "joint_1"), ModelError, ["'angle'", "joint_position, joint_rate"]),
+        (lambda s: s.watch("contact_gap", "toe"), ModelError, ["'toe'", "elbow_4, elbow_7"]),
+        (lambda s: s.every(0.0, print), ScenarioError, ["1e-09 s", "0.0"]),
+        (lambda s: s.every(1e-14, print), ScenarioError, ["1e-09 s", "1e-14"]),
+        (lambda s: [s.every(1.0, print, first=9.0) for _ in range(61)], ScenarioError, ["60"]),
+        (lambda s: (s.every(1.0, lambda t: t.advance(0.1)), s.advance(0.1)), ScenarioError, []),
+        (lambda s: s.watch("joint_rate", "joint_1", math.nan), ModelError, ["level", "[nan]"]),
+        (lambda s: s.restore(None), ScenarioError, ["None"]),
+        (lambda s: s.restore(dynsim.Simulation(s.scenario).snapshot()), ScenarioError, []),
+        (lambda s: dynsim.Simulation(s.scenario, trace=-1), ScenarioError, ["trace", "-1"]),
+        (lambda s: dynsim.Simulation(s.scenario, state=7), ModelError, ["State", "7"]),
     ],
 )
-def test_wrong_calls_say_what_is_wrong(call, error, words):
+def test_wrong_calls_say_what_is_wrong(call, error, names):
     simulation = dynsim.Simulation(arm(duration_s=0.1))
-    with pytest.raises(error, match=words):
+    with raises(error, *names):
         call(simulation)
 
 
 def test_states_of_other_robots_and_off_the_floor_are_refused():
     record = dynsim.simulate(dynsim.load_scenario("single_pendulum", overrides={"duration_s": 0.1}))
-    with pytest.raises(ModelError, match="1 values of q"):
+    with raises(ModelError, "1", "q", "serial_arm", "10"):
         dynsim.Simulation(arm(), state=dynsim.State.of(record))
     simulation = dynsim.Simulation(arm())
     state = simulation.state
     lifted = dynsim.State(0.0, state.q + 0.1, state.v, state.current)
-    with pytest.raises(ModelError, match=r"from surface 'floor'.*; take another posture to start from; or change the"):
+    with raises(ModelError, "contacts.points.elbow_4", "floor", "elbow_7") as caught:
         dynsim.Simulation(arm(), state=lifted)
-    with pytest.raises(ModelError, match="kinematic"):
+    assert "on_surface" not in str(caught.value)  # a state has a posture of its own
+    with raises(ModelError, "snake", "kinematic"):
         dynsim.Simulation(dynsim.load_scenario("snake_circle"))
 
 
 def test_a_state_starts_a_scenario_whose_own_posture_is_below_the_floor():
     sunk = arm(**{"controller": None, "plant.initial_deg": [0, 50, 90, -90, 45, 45, -90, 45, -45, 45]})
-    with pytest.raises(ModelError, match="from surface 'floor'"):
+    with raises(ModelError, "contacts.points.elbow_4", "floor", "elbow_7", "on_surface"):
         dynsim.Simulation(sunk)
     state = dynsim.Simulation(arm()).state
     np.testing.assert_array_equal(dynsim.Simulation(sunk, state=state).state.q, state.q)
@@ -987,9 +989,9 @@ def test_a_callback_cannot_restore_the_simulation_that_calls_it(tmp_path):
     before = simulation.snapshot()
     simulation.watch("joint_position", "joint_1", 0.2)
     simulation.every(0.1, lambda s: s.restore(before))
-    with pytest.raises(ScenarioError, match="a callback cannot restore the simulation that calls it; restore it after"):
+    with raises(ScenarioError):
         simulation.advance(0.5)
-    with pytest.raises(ScenarioError, match="ticks or events were added since"):
+    with raises(ScenarioError):
         simulation.restore(before)
 
 
@@ -1008,7 +1010,7 @@ def test_a_tick_added_in_a_callback_is_called_at_that_time(tmp_path):
         simulation.advance(0.45)
         np.testing.assert_allclose(times, [0.1, 0.3, 0.4], atol=1e-12)
         simulation.restore(kept[1])
-    with pytest.raises(ScenarioError, match="ticks or events were added since"):
+    with raises(ScenarioError):
         simulation.restore(kept[0])
 
 
@@ -1035,10 +1037,7 @@ def test_an_operator_says_what_of_its_way_was_not_carried_out(tmp_path):
     assert 0.09 < moved <= 0.1
     said = [line for line in record.summary["warnings"] if line.startswith("operator:")]
     assert len(said) == 1
-    assert (
-        f"operator: {0.4 - moved:.3g} m of the 0.4 m that the hand was commanded to go were not carried out" in said[0]
-    )
-    assert "(joint_1 is at its limit)" in said[0]
+    check_message(said[0], f"{0.4 - moved:.3g} m", "0.4 m", "joint_1")
     record = dynsim.simulate(read(tmp_path, RAIL.replace("SPEED", "-0.2")))
     assert record["target_position"][-1, 0] - record["target_position"][0, 0] == pytest.approx(-0.4, abs=1e-9)
     assert not record.summary["warnings"]
@@ -1060,7 +1059,7 @@ def test_the_source_of_an_operator_cannot_take_a_snapshot(tmp_path):
 
     scenario_script = dynsim.Simulation(scenario).operator.source
     simulations.append(dynsim.Simulation(scenario, operator=Source()))
-    with pytest.raises(ScenarioError, match="source of its commands, cannot take a snapshot"):
+    with raises(ScenarioError, "Simulation.every"):
         simulations[0].advance(0.5)
     assert asked == [3]
 
