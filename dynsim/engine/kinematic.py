@@ -639,6 +639,12 @@ def prepare(scenario: Scenario, source: CommandSource | None = None) -> SnakeRun
             f"loads is not supported by the kinematic plant {scenario.plant.type!r}, which has no forces; remove it",
             keys=("loads",),
         )
+    if scenario.config.sensors is not None and scenario.config.sensors.wrench:
+        raise ModelError(
+            f"sensors.wrench is not supported by the kinematic plant {scenario.plant.type!r}, which has no forces; "
+            "remove it, or set plant.level: dynamic",
+            keys=("sensors", "wrench"),
+        )
     description = build.machine(scenario)
     assert isinstance(description, SnakeDescription)
     controller = build.controller(scenario, description)

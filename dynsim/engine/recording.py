@@ -23,6 +23,7 @@ from dynsim.dynamics import state as kst
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.unilateral import UnilateralArrays
 from dynsim.dynamics.tree import support as ks
+from dynsim.engine.link_sensors import Push, add_link_sensors
 from dynsim.engine.prepare import Prepared
 from dynsim.engine.ring import counted_within
 from dynsim.engine.warnings import warnings_of
@@ -473,6 +474,7 @@ def make_record(
     wall: float,
     *,
     pushed: Sequence[int] | None = None,
+    pushes: Sequence[Push] = (),
     happened: Sequence[Event] = (),
     base_as_planned: bool = True,
     pictured: bool = True,
@@ -490,6 +492,8 @@ def make_record(
         Wall-clock time of the integration [s].
     pushed : sequence of int, optional
         Indices of the caller's wrenches (the last of the loads) that have been set; default: no such wrenches.
+    pushes : sequence of Push, optional
+        These wrenches, in the order of time, if the scenario has sensors on links.
     happened : sequence of Event, optional
         Events of the run.
     base_as_planned : bool, optional
@@ -547,6 +551,7 @@ def make_record(
     _add_touch(record, prepared)
     if prepared.system.unilateral is not None:
         _add_unilateral(record, prepared)
+    add_link_sensors(record, scenario, prepared, pushes)
     for event in happened:
         record.add_event(event.time, event.kind, event.name)
     if pictured:

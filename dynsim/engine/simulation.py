@@ -41,6 +41,7 @@ from dynsim.dynamics.tree.joints import normalise
 from dynsim.engine import SIMULATION, Progress, Start, stopping
 from dynsim.engine.brakes import Brakes, projection_loss
 from dynsim.engine.linearization import Linearization, linearized
+from dynsim.engine.link_sensors import Push, mounts
 from dynsim.engine.operator import EncodedCommands, Operator
 from dynsim.engine.outcome import interrupted, mark_stopped, raise_stopped
 from dynsim.engine.prepare import Prepared, at_start, prepare, sample_times
@@ -203,6 +204,8 @@ class Simulation:
         self._references_end = self._prepared.control.end
         self._frozen = not math.isfinite(self._references_end)
         self._pushed: set[int] = set()
+        # Sensors on links need them; other records have their work only.
+        self._keeps_pushes, self._past_pushes = bool(mounts(scenario, robot)), list[Push]()
         times = None
         if state is None and self._end == scenario.duration_s and trace is None:
             # Exactly the samples of simulate, including its size limit.
@@ -995,6 +998,9 @@ class Simulation:
         loads.data[offset + kl.POINT : offset + kl.POINT + 9] = values
         if values[3:].any():
             self._pushed.add(k)
+        if self._keeps_pushes:
+            index, _ = self.robot.attach(body, values[:3])
+            self._past_pushes.append(Push(self.time, index, in_body, values))
         self._restart()
 
     def linearize(
@@ -1092,7 +1098,7 @@ class Simulation:
         arrays = {name: array.copy() for name, array in self._arrays().items()}
         tick_handlers = [handler.saved_state() for handler in self._tick_handlers]
         trace, happened, pushed = self._trace.snapshot(), tuple(self._happened), frozenset(self._pushed)
-        shown = (pushed, self._base_as_planned, self._prepared.behind_brakes)
+        shown = (pushed, tuple(self._past_pushes), self._base_as_planned, self._prepared.behind_brakes)
         due, window = tuple(self._due), (self._samples_end, self._window)
         return Snapshot(
             self._token, arrays, self._time, trace, happened, *shown, self._frozen, tick_handlers, due, window
@@ -1141,6 +1147,7 @@ class Simulation:
         self._trace.restore(snapshot.trace)
         self._time, self._frozen, self._happened = snapshot.time, snapshot.frozen, list(snapshot.happened)
         self._pushed, self._base_as_planned = set(snapshot.pushed), snapshot.base_as_planned
+        self._past_pushes = list(snapshot.pushes)
         self._prepared = replace(self._prepared, behind_brakes=snapshot.behind_brakes)
         for handler, kept in zip(self._tick_handlers, snapshot.tick_handlers, strict=True):
             handler.restore(kept)
@@ -1262,6 +1269,7 @@ class Simulation:
             replace(self._prepared, run=whole, control=planned),
             wall,
             pushed=sorted(self._pushed),
+            pushes=self._past_pushes,
             happened=self._happened,
             base_as_planned=self._base_as_planned,
             pictured=pictured,

@@ -225,6 +225,7 @@ def _alone(scenario: Scenario) -> Scenario:
         "loads": {name: load for name, load in config.loads.items() if isinstance(load, Payload)},
         "objects": {},
         "ties": {},
+        "sensors": None,
         "surfaces": {name: surface for name, surface in config.surfaces.items() if name == GROUND},
         "contacts": config.contacts.model_copy(update={"points": points}),
     }

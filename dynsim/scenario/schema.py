@@ -30,7 +30,7 @@ from dynsim.record.scene import HERE, Shape, quaternion
 from dynsim.scenario.combinations import BILATERAL_KEYS, METHODS, THETA, UNILATERAL_KEYS, check_keys
 from dynsim.scenario.effect import idle_keys, is_set
 
-# Section `sensors`: sampling rate, delay, resolution and noise of the controller's inputs.
+# Section `sensors`: sampling rate, delay, resolution and noise of the controller's inputs; recorded sensors on links.
 
 # Rate of a sensor [Hz]; limited because each sample is a Python call.
 Rate = Annotated[float, Field(gt=0.0, le=1e5)]
@@ -69,6 +69,23 @@ class MotionCapture(Sensor):
     attitude_noise_rad: NonNegative = Field(5e-4, description="standard deviation of the noise of each angle (assumed)")
 
 
+class LinkSensorConfig(StrictConfig):
+    """Recorded sensor on a link: the body that carries it, and its point and axes there."""
+
+    body: str = Field(description="name of the body that carries the sensor")
+    frame: str | None = Field(
+        None, description="frame fixed to `body`, from which the sensor has its axes; default: the frame of `body`"
+    )
+    point_m: Vector3 = Field([0.0, 0.0, 0.0], description="point of the sensor, in the axes of `frame`")
+
+
+class WrenchSensor(LinkSensorConfig):
+    """Exact force and torque from the parent of `body` across its joint; the torque is about the point of the sensor.
+
+    The joint is the joint that carries `body`, not a fixed joint of `frame`.
+    """
+
+
 class Sensors(StrictConfig):
     """Sensors of the robot; without a sensor the controller reads the exact state without delay."""
 
@@ -76,6 +93,9 @@ class Sensors(StrictConfig):
     encoders: Encoders | None = Field(None, description="joint encoders; default: exact joint angles and rates")
     motion_capture: MotionCapture | None = Field(
         None, description="motion capture of a snake's controlled point; default: the exact pose"
+    )
+    wrench: dict[str, WrenchSensor] | None = Field(
+        None, description="named six-axis force/torque sensors at joints, recorded; default: no such sensors"
     )
 
 
@@ -993,7 +1013,8 @@ class ScenarioConfig(StrictConfig):
     objects: dict[str, SceneObject] = Field(default={}, description="named bodies in addition to the robot")
     ties: dict[str, TieChoice] = Field(default={}, description="named springs and dampers between two bodies")
     sensors: Sensors | None = Field(
-        default=None, description="sensors of a sampled controller; default: the exact state without delay"
+        default=None,
+        description="sensors of a sampled controller (default: the exact state without delay), and recorded sensors",
     )
     integrator: Integrator = Field(default=Integrator(), description="time integration")
     record: RecordOptions = Field(default=RecordOptions(), description="sampling rate and size limit of the record")

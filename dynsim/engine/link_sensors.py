@@ -1,0 +1,349 @@
+"""Recorded sensors on links: their signals follow from the samples of a run after its end, by Newton and Euler's laws.
+
+A kind of sensor is an entry of :data:`LINK_SENSORS`, whose name is its key in ``sensors``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from dynsim.compile.shapes import touching_points
+from dynsim.config.problems import dotted
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.contact import unilateral as ku
+from dynsim.dynamics.tree import joints, sweep
+from dynsim.errors import ModelError
+from dynsim.integrators import run as ki
+from dynsim.model.description import WORLD, Array, Load, Robot
+from dynsim.record import Record
+from dynsim.scenario import Scenario
+from dynsim.scenario.schema import LinkSensorConfig
+
+if TYPE_CHECKING:
+    from dynsim.engine.prepare import Prepared
+
+# Samples that are evaluated together: the bodies need 0.3 kB each.
+BLOCK = 4096
+# Samples closer to a jump than this fraction of their time show the loads after it, see integrators.run.sampled_now; in
+# time stepping, steps that end closer to a jump than this fraction of a step end there.
+SAME_TIME, SAME_STEP = 1e-12, 1e-9
+# Sine of the angle below which a rotation counts as a small rotation.
+SMALL = 1e-9
+
+
+@dataclass(frozen=True)
+class LinkMotion:
+    """Motion of all n links at T samples, and the wrenches across their joints.
+
+    Attributes
+    ----------
+    rotation, origin : (T, n, 3, 3) and (T, n, 3) ndarray
+        Frames of the links in the world [m].
+    velocity, acceleration : (T, n, 6) ndarray
+        Angular part, and linear part of the point at the world's origin; the acceleration minus gravity.
+    across : (T, n, 6) ndarray
+        Torque about the world's origin [N m], and force [N], from the parent on the link across its joint.
+    """
+
+    rotation: Array
+    origin: Array
+    velocity: Array
+    acceleration: Array
+    across: Array
+
+    def point(self, body: int, point: Array) -> Array:
+        """Return the position of a point of a link, (3,), in the world, (T, 3) [m]."""
+        return np.asarray(self.origin[:, body] + self.rotation[:, body] @ point)
+
+
+class Mount(NamedTuple):
+    """Place of a sensor: index of its link, and axes (3, 3) and point (3,) [m] of the sensor in the link's frame."""
+
+    body: int
+    axes: Array
+    point: Array
+
+    def seen(self, motion: LinkMotion, vectors: Array) -> Array:
+        """Return the components of world vectors (T, 3) in the axes of the sensor."""
+        return np.asarray(np.einsum("tji,tj->ti", motion.rotation[:, self.body] @ self.axes, vectors))
+
+
+@dataclass(frozen=True)
+class LinkSensor:
+    """Kind of sensor.
+
+    Attributes
+    ----------
+    signals : tuple of (str, str, str)
+        Name, unit and description of each signal; a signal has a vector for each sensor.
+    measure : callable
+        Returns the vectors (T, 3) of each signal for the motion of the links and the mount of a sensor.
+    """
+
+    signals: tuple[tuple[str, str, str], ...]
+    measure: Callable[[LinkMotion, Mount], tuple[Array, ...]]
+
+
+def wrench(motion: LinkMotion, mount: Mount) -> tuple[Array, Array]:
+    """Return force [N] and torque about the sensor's point [N m] of the parent on the link, in axes of the sensor."""
+    torque, force = motion.across[:, mount.body, :3], motion.across[:, mount.body, 3:]
+    about = torque - np.cross(motion.point(mount.body, mount.point), force)
+    return mount.seen(motion, force), mount.seen(motion, about)
+
+
+LINK_SENSORS = {
+    "wrench": LinkSensor(
+        (
+            ("wrench_force", "N", "force of the parent on the body across its joint, in axes of the sensor"),
+            ("wrench_torque", "N m", "torque across the joint about the point of the sensor, in its axes"),
+        ),
+        wrench,
+    ),
+}
+
+
+class Push(NamedTuple):
+    """Wrench that a caller has set: point [m], force [N] and torque [N m], (9,), on a link from a time [s] on."""
+
+    time: float
+    body: int
+    in_body: bool
+    values: Array
+
+
+def mounts(scenario: Scenario, robot: Robot) -> dict[str, dict[str, Mount]]:
+    """Return the sensors on links of a scenario by kind and name.
+
+    Raises
+    ------
+    ModelError
+        If a body or frame does not exist, or the frame is not fixed to the body.
+    """
+    sensors = scenario.config.sensors
+    configs = {} if sensors is None else {kind: getattr(sensors, kind) or {} for kind in LINK_SENSORS}
+    return {
+        kind: {name: _mount(robot, config, ("sensors", kind, name)) for name, config in named.items()}
+        for kind, named in configs.items()
+        if named
+    }
+
+
+def _mount(robot: Robot, config: LinkSensorConfig, keys: tuple[str, ...]) -> Mount:
+    frames = {frame.name: frame.body for frame in robot.frames}
+    key = "body"
+    try:
+        if config.body == WORLD:
+            raise ModelError(f"'world' has no joint; bodies: {', '.join(robot.bodies)}")
+        body, _ = robot.attach(config.body, np.zeros(3))
+        if config.body not in robot.bodies:
+            carrier = frames[config.body]
+            raise ModelError(
+                f"{config.body!r} is a frame fixed to {carrier}; use body: {carrier}, frame: {config.body}"
+            )
+        key, frame = "frame", config.body if config.frame is None else config.frame
+        carrying, point = robot.attach(frame, np.array(config.point_m))
+        if carrying != body:
+            carrier = robot.links[carrying].name
+            raise ModelError(f"{frame!r} is not fixed to {config.body}, but to {carrier}; change body or frame")
+    except ModelError as error:
+        keys = (*keys, key)
+        raise ModelError(f"{dotted(keys)}: {error}", keys=keys) from error
+    return Mount(body, robot.attached_axes(frame), point)
+
+
+def add_link_sensors(record: Record, scenario: Scenario, prepared: Prepared, pushes: Sequence[Push]) -> None:
+    """Add the signals of the scenario's sensors on links, from the motion and the forces of the record.
+
+    Parameters
+    ----------
+    pushes : sequence of Push
+        Wrenches that the caller of a stepped simulation has set, in the order of time.
+    """
+    placed, count = mounts(scenario, prepared.model.robot), len(record)
+    values = {kind: np.empty((len(LINK_SENSORS[kind].signals), count, len(named), 3)) for kind, named in placed.items()}
+    for first in range(0, count if placed else 0, BLOCK):
+        rows = slice(first, first + BLOCK)
+        motion = link_motion(record, prepared, pushes, rows)
+        for kind, named in placed.items():
+            for k, mount in enumerate(named.values()):
+                values[kind][:, rows, k] = LINK_SENSORS[kind].measure(motion, mount)
+    for kind, named in placed.items():
+        for (name, unit, description), data in zip(LINK_SENSORS[kind].signals, values[kind], strict=True):
+            record.add(name, data, unit, labels=tuple(named), description=description)
+
+
+def link_motion(record: Record, prepared: Prepared, pushes: Sequence[Push], rows: slice) -> LinkMotion:
+    """Return the motion of the links, and the wrenches across their joints, at some samples.
+
+    The wrench across a joint is what the bodies that it carries need for their motion against gravity, minus the
+    wrenches of contacts, loads and ties on them:
+
+        F_i = Σ (İV − weight) − Σ W_outside, over the bodies from i to the tips
+
+    Its component along the axis of the joint is the force of its drive, losses, stop and coupling on the bodies, after
+    the inertia of the rotor: rotors turn with their joint only.
+    """
+    model, n = prepared.system.model, prepared.model.n
+    q, v, vdot = (np.asarray(record[name][rows], dtype=np.float64) for name in ("q", "v", "vdot"))
+    ws, links = ka.workspace(n, 0, 0), np.empty((len(q), n, ka.F + 6))
+    for k in range(len(q)):
+        if prepared.model.nq == n:
+            ws.joints[:, ka.Q] = q[k]
+        else:
+            joints.read_positions(model, q[k], 0, ws)
+        ws.joints[:, ka.QD], ws.joints[:, ka.QDD] = v[k], vdot[k]
+        sweep.newton_euler(model, ws, 1.0, 1.0, 1.0)
+        links[k] = ws.links[:, : ka.F + 6]
+    motion = LinkMotion(
+        links[:, :, ka.R : ka.R + 9].reshape(len(q), n, 3, 3),
+        links[:, :, ka.P : ka.P + 3],
+        links[:, :, ka.V : ka.V + 6],
+        links[:, :, ka.A : ka.A + 6],
+        links[:, :, ka.F : ka.F + 6],
+    )
+    # The last samples of a diverged run may overflow.
+    with np.errstate(over="ignore", invalid="ignore"):
+        outside = np.zeros((len(q), n, 6))
+        for body, at, force, torque in (
+            *_contact_forces(record, prepared, motion, rows),
+            *_load_forces(record, prepared, motion, pushes, rows),
+            *_tie_forces(record, prepared, motion, rows),
+        ):
+            outside[:, body, :3] += np.cross(at, force) + torque
+            outside[:, body, 3:] += force
+        for i in range(n - 1, -1, -1):
+            if (parent := model.tree[i, ka.PARENT]) >= 0:
+                outside[:, parent] += outside[:, i]
+        motion.across[...] -= outside
+        _add_wheel_spin(prepared.model.robot, motion, v, vdot)
+    return motion
+
+
+# Force that acts on a link: its index, the point (T, 3), force and torque there (T, 3), in the world.
+Acting = tuple[int, Array, Array, Array | float]
+
+
+def _contact_forces(record: Record, prepared: Prepared, motion: LinkMotion, rows: slice) -> list[Acting]:
+    robot, acting = prepared.model.robot, []
+    for k, contact in enumerate(prepared.contacts):
+        ends = [robot.attach(contact.body, end) for end in (contact.point, contact.tip) if end is not None]
+        at, *tip = (motion.point(body, end) for body, end in ends)
+        if contact.radius > 0.0 or tip:
+            at = touching_points(contact, at, *tip)
+        acting.append((ends[0][0], at, record["contact_force"][rows, k], 0.0))
+    return acting
+
+
+def _load_forces(
+    record: Record, prepared: Prepared, motion: LinkMotion, pushes: Sequence[Push], rows: slice
+) -> list[Acting]:
+    robot, time, acting = prepared.model.robot, _load_times(record, prepared, pushes)[rows], []
+
+    def add(body: int, in_body: bool, point: Array, wrenches: Array) -> None:
+        parts = wrenches[:, :3], wrenches[:, 3:]
+        if in_body:
+            parts = tuple(np.einsum("tij,tj->ti", motion.rotation[:, body], part) for part in parts)
+        acting.append((body, motion.point(body, point), *parts))
+
+    for load in prepared.loads:
+        if len(load.coefficients):
+            body, point = robot.attach(load.body, load.point)
+            add(body, load.in_body, point, _components(load, time))
+    # A wrench lasts until the next wrench on its body.
+    for body in dict.fromkeys(push.body for push in pushes):
+        own = [push for push in pushes if push.body == body]
+        index = np.searchsorted([push.time for push in own], time, side="right") - 1
+        for k in np.unique(index[index >= 0]).tolist():
+            add(body, own[k].in_body, own[k].values[:3], np.where((index == k)[:, None], own[k].values[3:], 0.0))
+    return acting
+
+
+def _components(load: Load, time: Array) -> Array:
+    """Return force and torque (T, 6); a load that is not held begins at its first time and has ended at its last."""
+    lasts = load.hold | ((time >= load.knots[0]) & (time < load.knots[-1]))
+    return np.where(lasts[:, None], load.components(time), 0.0)
+
+
+def _load_times(record: Record, prepared: Prepared, pushes: Sequence[Push]) -> Array:
+    """Return the times of the loads that the samples show, (T,) [s].
+
+    In time stepping a step has the loads at t + θh. Steps begin when a load jumps, and at the start.
+    """
+    run, time = prepared.run, record.time
+    after = SAME_TIME * np.maximum(1.0, np.abs(time))
+    if run.stepping is None or not len(time):
+        return np.asarray(time + after)
+    h = float(run.clock[ki.STEP])
+    begins = np.unique([time[0], *run.breaks, *(push.time for push in pushes)])
+    began = begins[np.maximum(np.searchsorted(begins, time - SAME_STEP * h) - 1, 0)]
+    return np.asarray(np.maximum(time - (1.0 - run.stepping.theta) * h, began + after))
+
+
+def _tie_forces(record: Record, prepared: Prepared, motion: LinkMotion, rows: slice) -> list[Acting]:
+    """Return the forces of ties on both bodies; they act at the point of the second body."""
+    unilateral, acting = prepared.system.unilateral, []
+    for k, tie in enumerate(prepared.model.robot.ties if "tie_force" in record and unilateral is not None else ()):
+        (a, b), row = unilateral.tie_table[k, [ku.TIE_A, ku.TIE_B]].tolist(), unilateral.tie[k]
+        axis, other = row[ku.TIE_AXIS : ku.TIE_AXIS + 3], row[ku.TIE_OTHER_POINT : ku.TIE_OTHER_POINT + 3]
+        size = record["tie_force"][rows, k : k + 1]
+        at = np.broadcast_to(other, (len(size), 3)) if b < 0 else motion.point(b, other)
+        axes = np.broadcast_to(axis, (len(size), 3))
+        if tie.turns:
+            second = np.eye(3) if b < 0 else motion.rotation[:, b]
+            attitude = _attitudes(record, prepared, k)[rows]
+            turned = np.swapaxes(motion.rotation[:, a], 1, 2) @ second @ np.swapaxes(attitude, 1, 2)
+            axes = _turning_axes(axis, turned)
+        push = size * np.einsum("tij,tj->ti", motion.rotation[:, a], axes)
+        force, torque = (0.0 * push, push) if tie.turns else (push, 0.0 * push)
+        acting += [(body, at, sign * force, sign * torque) for body, sign in ((a, 1.0), (b, -1.0)) if body >= 0]
+    return acting
+
+
+def _attitudes(record: Record, prepared: Prepared, k: int) -> Array:
+    """Return the rotation of the second body of a torsion tie in the axes of the first without deflection, (T, 3, 3).
+
+    The table has the rotation since the tie began last. If it has begun more often, the rotation before is that of the
+    first sample with a force.
+    """
+    unilateral, tie, count = prepared.system.unilateral, prepared.model.robot.ties[k], len(record)
+    assert unilateral is not None
+    last = unilateral.tie[k, ku.TIE_ATTITUDE : ku.TIE_ATTITUDE + 9].reshape(1, 3, 3)
+    acts = record["tie_force"][:, k] != 0.0
+    begins = np.flatnonzero(acts & ~np.append(False, acts[:-1]))
+    if len(begins) < 2 or tie.pushes or not np.isnan(tie.rest):
+        return np.broadcast_to(last, (count, 3, 3))
+    a, b = unilateral.tie_table[k, [ku.TIE_A, ku.TIE_B]].tolist()
+    q, model = np.asarray(record["q"], dtype=np.float64), prepared.model
+    second = [np.eye(3) if b < 0 else model.body_pose(b, q[row])[0] for row in begins[:-1]]
+    first = [model.body_pose(a, q[row])[0] for row in begins[:-1]]
+    attitudes = np.concatenate([np.swapaxes(first, 1, 2) @ np.array(second), last])
+    return np.asarray(attitudes[np.maximum(np.searchsorted(begins, np.arange(count), side="right") - 1, 0)])
+
+
+def _turning_axes(axis: Array, turned: Array) -> Array:
+    """Return the axes of :func:`dynsim.integrators.stepping.contacts.turning_axis` for rotations (T, 3, 3)."""
+    twice = np.stack([turned[:, i, j] - turned[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0))], axis=1)
+    sine = 0.5 * np.linalg.norm(twice, axis=1)
+    angle = np.arctan2(sine, 0.5 * (np.trace(turned, axis1=1, axis2=2) - 1.0))
+    turn = 0.5 * twice * (np.where(sine > SMALL, angle, 1.0) / np.where(sine > SMALL, sine, 1.0))[:, None]
+    half = np.where(angle > 1e-2, 0.5 * angle, 0.5)
+    exact = (1.0 - half / np.tan(half)) / (4.0 * half * half)
+    factor = np.where(angle > 1e-2, exact, 1.0 / 12.0 + angle * angle / 720.0)
+    once = np.cross(turn, axis)
+    return np.asarray(axis + 0.5 * once + factor[:, None] * np.cross(turn, once))
+
+
+def _add_wheel_spin(robot: Robot, motion: LinkMotion, v: Array, vdot: Array) -> None:
+    """Add the spin of the wheels of a mobile base to what the ground exerts on it; see dynamics.tree.support."""
+    base = robot.base
+    if base is None:
+        return
+    body, _ = robot.attach(base.body, np.zeros(3))
+    wheels = [robot.joint_names.index(wheel) for wheel in base.wheels]
+    axle = motion.rotation[:, body, :, 1]
+    spin, rate = (base.spin_inertia * x[:, wheels].sum(axis=1, keepdims=True) for x in (v, vdot))
+    motion.across[:, body, :3] += rate * axle + spin * np.cross(motion.velocity[:, body, :3], axle)
