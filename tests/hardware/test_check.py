@@ -363,7 +363,7 @@ def test_a_rate_the_bus_cannot_carry_is_refused_with_one_it_can(rig) -> None:
 
 
 def test_a_rate_at_which_the_watchdogs_would_trip_is_refused(rig) -> None:
-    with raises(CheckRefused, "14 Hz", "0.2 s", "--rate 15"):
+    with raises(CheckRefused, "--rate 14", "0.2 s", "use 15"):
         plan_cycle(rig.map, 14)
     plan_cycle(rig.map, 15)
 

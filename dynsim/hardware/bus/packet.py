@@ -152,15 +152,12 @@ class Decoder:
 
     Attributes
     ----------
-    rejected : int
-        Number of candidates with a wrong checksum so far.
     garbage : int
         Number of bytes skipped so far.
     """
 
     def __init__(self) -> None:
         self._buffer = bytearray()
-        self.rejected = 0
         self.garbage = 0
 
     def feed(self, data: bytes | bytearray) -> Iterator[Packet]:
@@ -171,11 +168,6 @@ class Decoder:
     def flush(self) -> Iterator[Packet]:
         """Yield the packets after an incomplete candidate, then discard all bytes."""
         return self._packets(final=True)
-
-    @property
-    def pending(self) -> int:
-        """Number of buffered bytes of an incomplete packet."""
-        return len(self._buffer)
 
     def _packets(self, *, final: bool) -> Iterator[Packet]:
         buffer = self._buffer
@@ -201,7 +193,6 @@ class Decoder:
                 continue
             frame = bytes(buffer[:end])
             if contains_bare_header(frame[7:-2]) or crc16(frame[:-2]) != int.from_bytes(frame[-2:], "little"):
-                self.rejected += 1
                 self._skip(1)
                 continue
             # Unstuff the body only: FF FF FD may also occur across length field and instruction.

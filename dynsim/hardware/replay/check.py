@@ -7,12 +7,11 @@ exceeds a limit is rejected as a whole, before a port is opened. This module als
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dynsim.errors import CheckRefused
 from dynsim.hardware.bus.control_table import HEALTH_BLOCK, STATE_BLOCK, TICKS_PER_TURN
@@ -126,15 +125,13 @@ class CheckedMotion(MotionTask):
     def tightest(self, servo_map: ServoMap) -> tuple[Margin, float] | None:
         """Return the smallest relative margin and its value; position margins are relative to half of the range."""
         ranges = {servo.joint: servo.position_limits[1] - servo.position_limits[0] for servo in servo_map.servos}
-        parts = [
-            (
-                margin.margin / (0.5 * ranges[margin.joint] if margin.quantity == "position" else abs(margin.limit)),
-                margin,
-            )
-            for margin in self.margins
-        ]
-        part, margin = min(parts, key=lambda entry: entry[0], default=(math.inf, None))
-        return None if margin is None else (margin, part)
+
+        def part(margin: Margin) -> float:
+            whole = 0.5 * ranges[margin.joint] if margin.quantity == "position" else abs(margin.limit)
+            return margin.margin / whole
+
+        tightest = min(self.margins, key=part, default=None)
+        return None if tightest is None else (tightest, part(tightest))
 
     @property
     def start(self) -> Array:
@@ -316,13 +313,12 @@ class MotionLimits:
                 "jerk": (speed * (speed * (speed * jerk)), jerk_time),
                 "shaking": (speed * shaking, shaking_time),
             }
-        position, at = (part.reshape(-1, len(self._servos)) for part in (extremes.position, extremes.position_time))
-        places = [self._tightest_position(position, at)]
+        columns = [self._tightest_position(extremes.position, extremes.position_time)]
         for quantity, (value, time) in values.items():
             limit = self._highest[quantity]
-            worst, when = _values_and_times(value, time, np.abs(value.reshape(-1, len(limit))).argmax(axis=0))
-            places.append((worst, limit, limit - np.abs(worst), when))
-        table = np.array(places).transpose(2, 0, 1)  # (N, quantities, 4)
+            worst, when = _extreme(np.abs, value, time)
+            columns.append((worst, limit, limit - np.abs(worst), when))
+        table = np.array(columns).transpose(2, 0, 1)  # (N, quantities, 4)
         wanted = ~(table[..., 2] >= -ROUNDING) if broken else np.ones(table.shape[:2], dtype=bool)
         wanted[:, 0] &= self._in_position_mode
         quantities: list[Quantity] = ["position", *values]
@@ -342,8 +338,8 @@ class MotionLimits:
         )
 
     def _tightest_position(self, position: Array, time: Array) -> tuple[Array, Array, Array, Array]:
-        lowest, lowest_time = _values_and_times(position, time, position.argmin(axis=0))
-        highest, highest_time = _values_and_times(position, time, position.argmax(axis=0))
+        lowest, lowest_time = _extreme(np.negative, position, time)
+        highest, highest_time = _extreme(np.positive, position, time)
         below = lowest - self._low < self._high - highest
         return (
             np.where(below, lowest, highest),
@@ -353,10 +349,11 @@ class MotionLimits:
         )
 
 
-def _values_and_times(values: Array, times: Array, rows: NDArray[np.intp]) -> tuple[Array, Array]:
-    """Return the value of each joint in its entry of ``rows``, and the time of that value; shape (N,)."""
-    columns = np.arange(len(rows))
-    return values.reshape(-1, len(rows))[rows, columns], times.reshape(-1, len(rows))[rows, columns]
+def _extreme(key: Callable[[Array], Array], values: Array, times: Array) -> tuple[Array, Array]:
+    """Return the value of each joint with the largest ``key``, and the time of that value; shape (N,)."""
+    values, times = (part.reshape(-1, values.shape[-1]) for part in (values, times))
+    largest = key(values).argmax(axis=0), np.arange(values.shape[1])
+    return values[largest], times[largest]
 
 
 def position_bounds(servo: MappedServo) -> tuple[float, float]:

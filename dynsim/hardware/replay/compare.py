@@ -153,14 +153,9 @@ class Comparison:
             }
             for joint in self.joints
         }
+        units = {"rate_rms": "rad_s", "rate_max": "rad_s", "turned": "rad", "angle_max": "rad", "angle_end": "rad"}
         wheels = {
-            wheel.wheel: {
-                "rate_rms_rad_s": wheel.rate_rms,
-                "rate_max_rad_s": wheel.rate_max,
-                "turned_rad": wheel.turned,
-                "angle_max_rad": wheel.angle_max,
-                "angle_end_rad": wheel.angle_end,
-            }
+            wheel.wheel: {f"{name}_{unit}": getattr(wheel, name) for name, unit in units.items()}
             for wheel in self.wheels
         }
         return {

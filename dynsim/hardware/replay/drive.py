@@ -445,7 +445,8 @@ class LiftLookahead:
 
     def remaining(self) -> list[Sample]:
         """Return all pending samples after the last posture; lifted pairs stay lifted."""
-        return [*self._completed(np.inf), *self._last()]
+        completed = self._completed(np.inf)
+        return completed if len(self._folded) < 2 else [*completed, self._with_rate(len(self._folded) - 1)]
 
     def _enqueue(self, sample: Sample, yaw: Array) -> None:
         copy = Sample(sample.time, sample.position.copy(), sample.velocity.copy())
@@ -477,11 +478,6 @@ class LiftLookahead:
                 samples.append(self._with_rate(1))
                 del self._folded[0]
         return samples
-
-    def _last(self) -> list[Sample]:
-        if len(self._folded) < 2:
-            return []
-        return [self._with_rate(len(self._folded) - 1)]
 
     def _fold(self, entry: _PendingPosture) -> Sample:
         sample = entry.sample

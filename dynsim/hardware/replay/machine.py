@@ -109,6 +109,7 @@ class Loop:
         Number of the last deadline.
     course : GoalCourse or None
         Current or last course.
+    in_position_mode : bool array, shape (N,)
     path_started : float or None
         Clock time of path time 0 [s]; None before the replay of the path.
     policy_goals : list
@@ -141,7 +142,7 @@ class Loop:
         self._clock = clock
         self._recorder = recorder
         self._journal = journal
-        self._in_position_mode = np.array([servo.in_position_mode for servo in servo_map.servos])
+        self.in_position_mode = np.array([servo.in_position_mode for servo in servo_map.servos])
         # Limits of goals: lowest and highest tick and maximum step from goal to goal, or maximum speed.
         self._tick_bounds = [
             (*servo.tick_limits, velocity_limit(servo) * servo.gear * 2 * self.period / RAD_PER_TICK + 2)
@@ -182,6 +183,12 @@ class Loop:
     def deadline_of(self, tick: int) -> float:
         return self.origin + tick * self.period
 
+    def next_cycle(self) -> tuple[float, int]:
+        """Wait for the next deadline as :meth:`wait_for_deadline`; raise Stopped if the user has requested a stop."""
+        lateness, skipped = self.wait_for_deadline()
+        self.stop.check()
+        return lateness, skipped
+
     def wait_for_deadline(self) -> tuple[float, int]:
         """Sleep until the next cycle is due; return its lateness [s] and the number of skipped cycles."""
         self.tick += 1
@@ -199,32 +206,24 @@ class Loop:
         """
         self.course = course
         while not course.over:
-            lateness, skipped = self.wait_for_deadline()
-            self.stop.check()
-            position, velocity = course.advance(self.period)
-            self._cycle(position, velocity, lateness, skipped)
+            due = self.next_cycle()
+            self._cycle(*course.advance(self.period), *due)
 
     def stay(self, position: Array) -> Cycle:
         """Execute one cycle at rest."""
-        lateness, skipped = self.wait_for_deadline()
-        self.stop.check()
-        return self._cycle(position, np.zeros_like(position), lateness, skipped)
+        return self._cycle(position, np.zeros_like(position), *self.next_cycle())
 
     def read_only_cycle(self) -> None:
         """Execute one cycle that does not write goals."""
-        lateness, skipped = self.wait_for_deadline()
-        self.stop.check()
-        self.exchange(lateness, skipped, write=False)
+        self.exchange(*self.next_cycle(), write=False)
 
     def _cycle(self, position: Array, velocity: Array, lateness: float, skipped: int) -> Cycle:
-        stall = self.stall()
-        if stall:
+        if stall := self.stall():
             # Servos that were stopped by their watchdogs must not jump to the current goal.
             raise Stopped(stall)
         self.goal, self.goal_rate = position, velocity
         cycle = self.exchange(lateness, skipped, write=True)
-        faults = self.rules.examine(cycle)
-        if faults:
+        if faults := self.rules.examine(cycle):
             raise Stopped(*faults)
         return cycle
 
@@ -240,14 +239,10 @@ class Loop:
         position, velocity, torque = np.full((3, count), np.nan)
         alert = np.zeros(count, dtype=bool)
         for index, servo in enumerate(servos):
-            reply = block.replies.get(servo.id)
-            if reply is None:
-                continue
-            effort, units, ticks = STATE.unpack(reply.data)
-            torque[index] = servo.to_torque(effort)
-            velocity[index] = servo.to_velocity(units)
-            position[index] = servo.to_angle(ticks)
-            alert[index] = reply.alert
+            if reply := block.replies.get(servo.id):
+                effort, units, ticks = STATE.unpack(reply.data)
+                torque[index], velocity[index] = servo.to_torque(effort), servo.to_velocity(units)
+                position[index], alert[index] = servo.to_angle(ticks), reply.alert
         cycle = Cycle(
             time=began,
             goal_position=self.goal.copy(),
@@ -280,7 +275,7 @@ class Loop:
         return cycle
 
     def _report(self, cycle: Cycle) -> None:
-        error = self.rules.following_error(cycle)[self._in_position_mode]
+        error = self.rules.following_error(cycle)[self.in_position_mode]
         worst = float(np.nanmax(np.abs(error))) if np.isfinite(error).any() else 0.0
         self._journal.report(worst, self.course.fraction if self.course else 0.0)
 
@@ -459,20 +454,18 @@ class Ending:
     def _hold_measured(self, indices: Iterable[int]) -> None:
         """Set the goals of some servos to their measured positions."""
         loop = self._loop
-        goals: GoalRegisters = {"goal_position": {}, "goal_velocity": {}}
+        reliable = []
         for index in indices:
             servo = self._servos[index]
             loop.goal_rate[index] = 0.0
-            if not servo.in_position_mode:
-                goals["goal_velocity"][servo.id] = 0
-                continue
-            ticks = servo.to_ticks(float(loop.measured[index]))
             low, high = servo.tick_limits
-            if low <= ticks <= high:
-                goals["goal_position"][servo.id] = ticks
+            if servo.in_position_mode and not low <= servo.to_ticks(float(loop.measured[index])) <= high:
+                # A measurement outside the limits of the joint is unreliable: the servo keeps its last goal.
+                continue
+            reliable.append(index)
+            if servo.in_position_mode:
                 loop.goal[index] = loop.measured[index]
-            # A measurement outside the limits of the joint is unreliable: the servo keeps its last goal.
-        loop.write_goals(goals)
+        self._write(reliable)
 
     def _decelerate(self) -> None:
         """Slow down along the path to rest, all joints synchronously; faulty servos stop at their present positions."""
@@ -490,8 +483,7 @@ class Ending:
         elapsed, goals = 0.0, 0
         while elapsed < stop_time and not loop.stop.for_release and not self._frozen:
             lateness, skipped = loop.wait_for_deadline()
-            stall = loop.stall()
-            if stall:
+            if stall := loop.stall():
                 self._declare(stall)
                 return self._freeze()
             goals += 1
@@ -508,7 +500,12 @@ class Ending:
         loop = self._loop
         sound = [index for index in range(len(self._servos)) if index not in self._faulty]
         loop.goal[sound], loop.goal_rate[sound] = position[sound], velocity[sound]
-        loop.write_goals(goal_registers([self._servos[index] for index in sound], position[sound], velocity[sound]))
+        self._write(sound)
+
+    def _write(self, indices: list[int]) -> None:
+        """Write the goals of some servos."""
+        loop, servos = self._loop, [self._servos[index] for index in indices]
+        loop.write_goals(goal_registers(servos, loop.goal[indices], loop.goal_rate[indices]))
 
     def _come_to_rest(self) -> None:
         """Wait until all servos answer and are at rest, for REST_TIME at most."""
@@ -771,8 +768,7 @@ class Replay:
 
     def _move_to_start(self) -> None:
         here = self.loop.goal.copy()
-        in_position_mode = np.array([servo.in_position_mode for servo in self._servos])
-        goal = np.where(in_position_mode, self.motion.start, here)
+        goal = np.where(self.loop.in_position_mode, self.motion.start, here)
         distance = float(np.abs(goal - here).max())
         duration = max(QUINTIC_PEAK * distance / self.map.safety.approach_velocity, self.loop.period)
         self.journal.enter(ReplayState.MOVE_TO_START)

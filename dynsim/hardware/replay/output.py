@@ -862,12 +862,9 @@ def is_locked(part: Path) -> bool:
 
 def _new_folder(folder: Path) -> Path:
     for number in itertools.count(1):
-        target = folder / f"previous_{number}"
-        try:
-            target.mkdir()
-        except FileExistsError:
-            continue
-        return target
+        with suppress(FileExistsError):
+            (target := folder / f"previous_{number}").mkdir()
+            return target
     raise AssertionError
 
 
