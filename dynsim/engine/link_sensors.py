@@ -60,7 +60,7 @@ class LinkMotion:
         return np.asarray(self.origin[:, body] + self.rotation[:, body] @ point)
 
 
-class Mount(NamedTuple):
+class SensorMount(NamedTuple):
     """Place of a sensor: index of its link, and axes (3, 3) and point (3,) [m] of the sensor in the link's frame."""
 
     body: int
@@ -85,10 +85,10 @@ class LinkSensor:
     """
 
     signals: tuple[tuple[str, str, str], ...]
-    measure: Callable[[LinkMotion, Mount], tuple[Array, ...]]
+    measure: Callable[[LinkMotion, SensorMount], tuple[Array, ...]]
 
 
-def wrench(motion: LinkMotion, mount: Mount) -> tuple[Array, Array]:
+def wrench(motion: LinkMotion, mount: SensorMount) -> tuple[Array, Array]:
     """Return force [N] and torque about the sensor's point [N m] of the parent on the link, in axes of the sensor."""
     torque, force = motion.across[:, mount.body, :3], motion.across[:, mount.body, 3:]
     about = torque - np.cross(motion.point(mount.body, mount.point), force)
@@ -106,7 +106,7 @@ LINK_SENSORS = {
 }
 
 
-class Push(NamedTuple):
+class AppliedForce(NamedTuple):
     """Wrench that a caller has set: point [m], force [N] and torque [N m], (9,), on a link from a time [s] on."""
 
     time: float
@@ -115,7 +115,7 @@ class Push(NamedTuple):
     values: Array
 
 
-def mounts(scenario: Scenario, robot: Robot) -> dict[str, dict[str, Mount]]:
+def mounts(scenario: Scenario, robot: Robot) -> dict[str, dict[str, SensorMount]]:
     """Return the sensors on links of a scenario by kind and name.
 
     Raises
@@ -132,7 +132,7 @@ def mounts(scenario: Scenario, robot: Robot) -> dict[str, dict[str, Mount]]:
     }
 
 
-def _mount(robot: Robot, config: LinkSensorConfig, keys: tuple[str, ...]) -> Mount:
+def _mount(robot: Robot, config: LinkSensorConfig, keys: tuple[str, ...]) -> SensorMount:
     frames = {frame.name: frame.body for frame in robot.frames}
     key = "body"
     try:
@@ -152,15 +152,15 @@ def _mount(robot: Robot, config: LinkSensorConfig, keys: tuple[str, ...]) -> Mou
     except ModelError as error:
         keys = (*keys, key)
         raise ModelError(f"{dotted(keys)}: {error}", keys=keys) from error
-    return Mount(body, robot.attached_axes(frame), point)
+    return SensorMount(body, robot.attached_axes(frame), point)
 
 
-def add_link_sensors(record: Record, scenario: Scenario, prepared: Prepared, pushes: Sequence[Push]) -> None:
+def add_link_sensors(record: Record, scenario: Scenario, prepared: Prepared, pushes: Sequence[AppliedForce]) -> None:
     """Add the signals of the scenario's sensors on links, from the motion and the forces of the record.
 
     Parameters
     ----------
-    pushes : sequence of Push
+    pushes : sequence of AppliedForce
         Wrenches that the caller of a stepped simulation has set, in the order of time.
     """
     placed, count = mounts(scenario, prepared.model.robot), len(record)
@@ -176,7 +176,7 @@ def add_link_sensors(record: Record, scenario: Scenario, prepared: Prepared, pus
             record.add(name, data, unit, labels=tuple(named), description=description)
 
 
-def link_motion(record: Record, prepared: Prepared, pushes: Sequence[Push], rows: slice) -> LinkMotion:
+def link_motion(record: Record, prepared: Prepared, pushes: Sequence[AppliedForce], rows: slice) -> LinkMotion:
     """Return the motion of the links, and the wrenches across their joints, at some samples.
 
     The wrench across a joint is what the bodies that it carries need for their motion against gravity, minus the
@@ -239,7 +239,7 @@ def _contact_forces(record: Record, prepared: Prepared, motion: LinkMotion, rows
 
 
 def _load_forces(
-    record: Record, prepared: Prepared, motion: LinkMotion, pushes: Sequence[Push], rows: slice
+    record: Record, prepared: Prepared, motion: LinkMotion, pushes: Sequence[AppliedForce], rows: slice
 ) -> list[Acting]:
     robot, time, acting = prepared.model.robot, _load_times(record, prepared, pushes)[rows], []
 
@@ -268,7 +268,7 @@ def _components(load: Load, time: Array) -> Array:
     return np.where(lasts[:, None], load.components(time), 0.0)
 
 
-def _load_times(record: Record, prepared: Prepared, pushes: Sequence[Push]) -> Array:
+def _load_times(record: Record, prepared: Prepared, pushes: Sequence[AppliedForce]) -> Array:
     """Return the times of the loads that the samples show, (T,) [s].
 
     In time stepping a step has the loads at t + θh. Steps begin when a load jumps, and at the start.

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dynsim.engine.link_sensors import Push
 from dynsim.engine.prepare import Prepared
 from dynsim.engine.trace import TraceState
 from dynsim.integrators import events
