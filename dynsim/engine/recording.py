@@ -474,7 +474,7 @@ def make_record(
     wall: float,
     *,
     pushed: Sequence[int] | None = None,
-    pushes: Sequence[Push] = (),
+    pushes: Sequence[AppliedForce] = (),
     happened: Sequence[Event] = (),
     base_as_planned: bool = True,
     pictured: bool = True,
@@ -492,7 +492,7 @@ def make_record(
         Wall-clock time of the integration [s].
     pushed : sequence of int, optional
         Indices of the caller's wrenches (the last of the loads) that have been set; default: no such wrenches.
-    pushes : sequence of Push, optional
+    pushes : sequence of AppliedForce, optional
         These wrenches, in the order of time, if the scenario has sensors on links.
     happened : sequence of Event, optional
         Events of the run.

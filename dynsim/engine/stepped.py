@@ -175,7 +175,7 @@ class Snapshot:
     trace: TraceState
     happened: tuple[Event, ...]
     pushed: frozenset[int]
-    pushes: tuple[Push, ...]
+    pushes: tuple[AppliedForce, ...]
     base_as_planned: bool
     behind_brakes: Mapping[str, float]
     frozen: bool
