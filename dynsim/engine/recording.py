@@ -23,7 +23,7 @@ from dynsim.dynamics import state as kst
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.unilateral import UnilateralArrays
 from dynsim.dynamics.tree import support as ks
-from dynsim.engine.link_sensors import add_link_sensors
+from dynsim.engine.link_sensors import AppliedForce, add_link_sensors
 from dynsim.engine.prepare import Prepared
 from dynsim.engine.ring import counted_within
 from dynsim.engine.warnings import warnings_of

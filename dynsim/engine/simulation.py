@@ -41,7 +41,7 @@ from dynsim.dynamics.tree.joints import normalise
 from dynsim.engine import SIMULATION, Progress, Start, stopping
 from dynsim.engine.brakes import Brakes, projection_loss
 from dynsim.engine.linearization import Linearization, linearized
-from dynsim.engine.link_sensors import mounts
+from dynsim.engine.link_sensors import AppliedForce, mounts
 from dynsim.engine.operator import EncodedCommands, Operator
 from dynsim.engine.outcome import interrupted, mark_stopped, raise_stopped
 from dynsim.engine.prepare import Prepared, at_start, prepare, sample_times

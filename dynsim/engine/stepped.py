@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dynsim.engine.link_sensors import AppliedForce
 from dynsim.engine.prepare import Prepared
 from dynsim.engine.trace import TraceState
 from dynsim.integrators import events
