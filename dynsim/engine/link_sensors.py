@@ -228,7 +228,8 @@ Acting = tuple[int, Array, Array, Array | float]
 
 
 def _contact_forces(record: Record, prepared: Prepared, motion: LinkMotion, rows: slice) -> list[Acting]:
-    robot, acting = prepared.model.robot, []
+    robot = prepared.model.robot
+    acting: list[Acting] = []
     for k, contact in enumerate(prepared.contacts):
         ends = [robot.attach(contact.body, end) for end in (contact.point, contact.tip) if end is not None]
         at, *tip = (motion.point(body, end) for body, end in ends)
@@ -241,7 +242,8 @@ def _contact_forces(record: Record, prepared: Prepared, motion: LinkMotion, rows
 def _load_forces(
     record: Record, prepared: Prepared, motion: LinkMotion, pushes: Sequence[AppliedForce], rows: slice
 ) -> list[Acting]:
-    robot, time, acting = prepared.model.robot, _load_times(record, prepared, pushes)[rows], []
+    robot, time = prepared.model.robot, _load_times(record, prepared, pushes)[rows]
+    acting: list[Acting] = []
 
     def add(body: int, in_body: bool, point: Array, wrenches: Array) -> None:
         parts = wrenches[:, :3], wrenches[:, 3:]
@@ -285,8 +287,11 @@ def _load_times(record: Record, prepared: Prepared, pushes: Sequence[AppliedForc
 
 def _tie_forces(record: Record, prepared: Prepared, motion: LinkMotion, rows: slice) -> list[Acting]:
     """Return the forces of ties on both bodies; they act at the point of the second body."""
-    unilateral, acting = prepared.system.unilateral, []
-    for k, tie in enumerate(prepared.model.robot.ties if "tie_force" in record and unilateral is not None else ()):
+    unilateral = prepared.system.unilateral
+    acting: list[Acting] = []
+    if unilateral is None or "tie_force" not in record:
+        return acting
+    for k, tie in enumerate(prepared.model.robot.ties):
         (a, b), row = unilateral.tie_table[k, [ku.TIE_A, ku.TIE_B]].tolist(), unilateral.tie[k]
         axis, other = row[ku.TIE_AXIS : ku.TIE_AXIS + 3], row[ku.TIE_OTHER_POINT : ku.TIE_OTHER_POINT + 3]
         size = record["tie_force"][rows, k : k + 1]
