@@ -350,7 +350,7 @@ def test_a_list_in_a_pipe_is_lines_with_tabs_and_names_papers(tmp_path: Path):
     assert row[:2] == ["bouncing_link", "half, dead, lively"]
     assert all(line == line.rstrip() and "  " not in line for line in lines)
     assert "[" not in re.sub(r"\[(m|rad)\]", "", listed), "a paper is named"
-    assert "(Wang and Minami, section" in listed
+    assert mentions(listed, "Wang", "Minami")
     wide = dynsim("list", folder=tmp_path, env=environment | {"COLUMNS": "90"}).stdout
     assert max(map(len, wide.splitlines())) <= 90
 

@@ -26,10 +26,12 @@ from combinations.sentences import (
     INCOMPLETE,
     INSTEAD_OF,
     LAST_STEP,
+    MOVED_BACK,
     OVERLOAD,
     SENTENCES,
     SHARE_OF_RUN,
     STEP_FELL,
+    STILL_BEYOND,
     UNSTABLE,
     UNVERIFIED,
     WEDGE,
@@ -448,7 +450,7 @@ def _passes_limit(match: Match, seen: Observed) -> str:
     if not over.size:
         return "no sample is beyond it"
     still = float(beyond[-1]) > 1e-6
-    if (still and "has moved it back" in match.string) or (not still and "it is still" in match.string):
+    if (still and MOVED_BACK in match.string) or (not still and STILL_BEYOND in match.string):
         return f"it is {beyond[-1]:.3g} beyond it at the end"
     first = float(seen.time[over[0]])
     return "" if _near(first, match[3]) or abs(first - float(match[3])) < 1e-3 else f"first at t = {first:.4g} s"

@@ -23,6 +23,7 @@ from dynsim.hardware.replay.output import ReplayState
 from dynsim.hardware.replay.rules import Cause
 from dynsim.hardware.servo_map import SHIPPED, load_servo_map
 from dynsim.teleop.web.live import NOT_READY
+from dynsim.teleop.web.pilot import RELEASED
 
 pytestmark = pytest.mark.long
 
@@ -338,7 +339,7 @@ def test_hw_stop_releases_a_robot_that_is_driven(drives: Callable[..., Drive], t
             client = drive.connect()
             client.take()
             states: list[str] = []
-            while "key released" not in states:
+            while RELEASED not in states:
                 client.wish({"y": 1.0})
                 states.append(client.until("state")["state"])
             assert NOT_READY in states

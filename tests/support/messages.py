@@ -42,6 +42,7 @@ PHRASES = {
     # Warnings of a run.
     "base lifted": "the base is lifted",
     "behind brakes": "only braked joints move this point",
+    "friction gains": "friction has added",
     "held down": "held down",
     "immobile": "no joint moves this point",
     "jolt": "a jolt at the start",
@@ -65,6 +66,7 @@ PHRASES = {
     "slowed down": "slowed down",
     "target waited": "the target waited for",
     "too fast": "too fast for the joints",
+    "unstable": "sampled loop is unstable",
     "would stop": "a real one would stop",
     # Rows of tables.
     "energy row": "electrical energy [J]",

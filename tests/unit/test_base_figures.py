@@ -164,8 +164,8 @@ def test_tipping_is_marked_in_every_panel_that_shows_its_time(tipped: Record, tu
         marked = {line.get_xdata()[0] for line in axes.get_lines() if line.get_marker() == "v"}
         low, high = axes.get_xlim()
         assert marked == {time for time in times if low <= time <= high}
-    assert f"at {min(times):.3g} s" in texts(figure)
-    assert f"at {min(times):.3g} s" in texts(drawn(base.margin_comparison({"a": tipped, "b": turning})))
+    assert mentions(texts(figure), f"{min(times):.3g} s")
+    assert mentions(texts(drawn(base.margin_comparison({"a": tipped, "b": turning}))), f"{min(times):.3g} s")
 
 
 def test_marks_of_later_times_take_no_room_beside_the_transient() -> None:

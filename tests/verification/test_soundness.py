@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+import re
 
 import numpy as np
 import pytest
 from scipy.linalg import expm
+from support.messages import check_message, lines_with, mentions, raises
 
 from dynsim import Simulation, State, build_model, load_scenario, simulate
 from dynsim.compile.mobility import moving_nothing, without_inertia
@@ -116,12 +118,11 @@ def test_the_radius_of_the_published_arm_agrees_with_its_linearization():
 def test_check_warns_of_an_unstable_loop_alone(name, variant, period, stable):
     """Each was run for a second: the stable ones track, the others grow to 60 to 800 rad/s or a limit cycle."""
     scenario = load_scenario(name, variant, {"controller.sample_time_s": period})
-    warnings = [text for text in check(scenario).warnings if "sampled loop is unstable" in text]
+    warnings = lines_with(check(scenario).warnings, phrase="unstable")
     assert len(warnings) == (0 if stable else 1)
     for text in warnings:
-        assert text.startswith(f"controller.sample_time_s = {period:g} s: ")
-        assert "k_p = " in text
-        assert ", which is stable, or smaller gains" in text
+        check_message(text, f"controller.sample_time_s = {period:g} s", "k_p")
+        assert any(0.0 < float(number) < period for number in re.findall(r"\d\.\d+", text))
 
 
 def test_the_shown_encoders_are_stable_with_the_shown_gains():
@@ -135,10 +136,10 @@ def test_the_shown_encoders_are_stable_with_the_shown_gains():
 def test_a_run_and_a_stop_name_the_unstable_loop():
     """It read: no signs of the normal forces agree, or no step forward; the arm sways by its own commands."""
     settings = {"controller.sample_time_s": 0.1, "duration_s": 1.0}
-    with pytest.raises(SimulationStopped, match=r"sampled loop is unstable .* k_p = 500 V/rad") as raised:
+    with raises(SimulationStopped, "controller.sample_time_s = 0.1 s", "k_p = 500 V/rad", phrase="unstable") as raised:
         simulate(load_scenario("elbow_comparison", "two_elbows", settings))
-    assert "Painlevé" not in str(raised.value)
-    assert any("sampled loop is unstable" in text for text in raised.value.record.summary["warnings"])
+    assert not mentions(raised.value, "Painlevé")
+    assert lines_with(raised.value.record.summary["warnings"], phrase="unstable")
 
 
 FOLDED = """
@@ -164,15 +165,15 @@ def test_a_run_warns_of_a_loop_that_is_unstable_in_a_later_posture_only(end, uns
     path = tmp_path / "folded.yaml"
     path.write_text(FOLDED.replace("END", end))
     scenario = load_scenario(path)
-    assert not [text for text in check(scenario).warnings if "sampled loop is unstable" in text]
-    warnings = [text for text in simulate(scenario).summary["warnings"] if "sampled loop is unstable" in text]
-    assert [("in the posture reached" in text, "from t = 0." in text) for text in warnings] == [(True, True)] * unstable
+    assert not lines_with(check(scenario).warnings, phrase="unstable")
+    warnings = lines_with(simulate(scenario).summary["warnings"], phrase="unstable")
+    assert [mentions(text, re.compile(r"\bt = 0\.\d")) for text in warnings] == [True] * unstable
 
 
 def test_a_session_logs_the_unstable_loop_when_it_starts(caplog):
     scenario = load_scenario("elbow_comparison", "two_elbows", {"controller.sample_time_s": 0.001})
     Simulation(scenario)
-    assert any("sampled loop is unstable" in message for message in caplog.messages)
+    assert lines_with(caplog.messages, phrase="unstable")
 
 
 def wrist(**changes) -> Robot:
@@ -205,7 +206,7 @@ def test_a_joint_that_moves_no_inertia_is_named(shift):
     for angles in ([0.0, 0.0], [0.7, -1.1]):
         assert without_inertia(Model(robot), np.array(angles)) == [1]
     text = moving_nothing(Model(robot), np.zeros(2))
-    assert text.startswith("joint wrist_joint moves no inertia in this posture: the mass behind it (wrist)")
+    check_message(text, "wrist_joint", "wrist")
 
 
 @pytest.mark.parametrize("changes", [
@@ -245,7 +246,7 @@ def test_check_refuses_a_joint_without_inertia(tmp_path):
     )
     (tmp_path / "arm.yaml").write_text("duration_s: 0.5\nplant: {type: urdf_arm, file: arm.urdf}\n")
     for start in (check, simulate):
-        with pytest.raises(ModelError, match=r"arm\.yaml:2.*plant: joint wrist_joint moves no inertia"):
+        with raises(ModelError, "arm.yaml:2", "plant", "wrist_joint", "wrist"):
             start(load_scenario(tmp_path / "arm.yaml"))
 
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.messages import raises
 
 import dynsim
 from dynsim.engine.recording import energy_residual
@@ -130,24 +131,24 @@ def test_snapshots_bring_back_modes_supply_and_brakes() -> None:
 
 
 @pytest.mark.parametrize(
-    ("call", "message"),
+    ("call", "names"),
     [
-        (lambda s: s.set_mode("joint_1", "torque"), "no mode 'torque'; those are: position, velocity, off"),
-        (lambda s: s.set_mode("joint_1", "velocity"), "joint_1 has no gain in mode velocity"),
-        (lambda s: s.set_mode("joint_2", "off"), "no motor 'joint_2'"),
-        (lambda s: s.set_supply(-1.0), "-1 V; it must not be negative"),
-        (lambda s: s.set_supply(float("nan")), "must be finite"),
-        (lambda s: s.set_brake("joint_2", True), "no joint 'joint_2'"),
+        (lambda s: s.set_mode("joint_1", "torque"), ["'torque'", "position, velocity, off"]),
+        (lambda s: s.set_mode("joint_1", "velocity"), ["joint_1", "velocity"]),
+        (lambda s: s.set_mode("joint_2", "off"), ["'joint_2'", "joint_1"]),
+        (lambda s: s.set_supply(-1.0), ["-1 V"]),
+        (lambda s: s.set_supply(float("nan")), ["[nan]"]),
+        (lambda s: s.set_brake("joint_2", True), ["'joint_2'", "joint_1"]),
     ],
 )
-def test_what_cannot_be_set_is_refused(call, message) -> None:
-    with pytest.raises(ModelError, match=message):
+def test_what_cannot_be_set_is_refused(call, names) -> None:
+    with raises(ModelError, *names):
         call(pendulum())
 
 
 def test_only_servos_have_modes_and_motors_need_joints() -> None:
     wound = dynsim.Simulation(dynsim.load_scenario("elbow_comparison", variant="no_elbow"))
-    with pytest.raises(ModelError, match="the motor of joint_1 is no servo"):
+    with raises(ModelError, "joint_1"):
         wound.set_mode("joint_1", "off")
-    with pytest.raises(ModelError, match="joint_7"):
+    with raises(ModelError, "'joint_7'", "joint_1"):
         dynsim.Simulation(dynsim.load_scenario("single_pendulum"), motors=[servo("joint_7")])

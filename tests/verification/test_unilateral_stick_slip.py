@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.optimize import brentq
+from support.messages import check_message, raises
 from support.random_robots import CompiledSystem, assemble
 from support.unilateral_checks import events, random_touch, violations
 
@@ -164,16 +166,15 @@ def test_the_paradox_names_contact_time_and_state(tmp_path: Path):
     """A rod is flung over its foot, which begins to slip where 1 + 3 s (s − μ c) < 0: less friction avoids this."""
     path = tmp_path / "rod.yaml"
     path.write_text(ROD)
-    with pytest.raises(SimulationStopped, match="Painlevé's paradox at tip: det J M⁻¹F is negative") as stop:
+    with raises(SimulationStopped, "Painlevé", "tip", "det J M⁻¹F", re.compile(r"\(-0\.\d")) as stop:
         dynsim.simulate(dynsim.load_scenario(str(path)))
     error = stop.value
-    assert f"stopped at t = {error.time:.6g} s" in str(error)
     assert error.record.time[-1] <= error.time < error.record.time[-1] + 0.01
     _, height, lean = error.state["q"]
     assert height == pytest.approx(0.5 * np.cos(lean), abs=1e-9)
     critical = (1.0 + 3.0 * np.sin(lean) ** 2) / (3.0 * np.sin(lean) * np.cos(lean))
     assert critical < 2.0
-    assert f"lower contacts.friction below {critical:.3g}" in str(error)
+    check_message(error, f"{error.time:.6g} s", "contacts.friction", f"{critical:.3g}")
     stopped = error.record.provenance["stopped"]
     assert (stopped["time_s"], stopped["reason"]) == (error.time, str(error))
     assert stopped["state"] == error.state
@@ -186,7 +187,7 @@ def test_a_stop_at_an_event_names_the_contacts_that_touch():
     assert run.count[ki.STATUS] == ki.FORCES_REVERSED
     t, _, words = paradox(b.system, b.ws, run, b.contacts)
     assert t == run.clock[ki.TIME]
-    assert words.startswith("Painlevé's paradox at contact_0: ")
+    check_message(words, "Painlevé", "contact_0")
 
 
 @pytest.mark.parametrize("method", ["dopri5", "radau5"])

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.messages import raises
 
 from dynsim import Record, load_scenario, simulate
 from dynsim.errors import ModelError, ScenarioError
@@ -173,22 +174,22 @@ ties:
 
 
 @pytest.mark.parametrize(
-    ("changes", "line", "says"),
+    ("changes", "line", "names"),
     [
-        ({"METHOD": "radau5"}, 11, r"ties.spring.*requires integrator.method: time_stepping \(here: radau5\)"),
-        ({"WHEELS": "wheels: {a: {position_m: [0, 0, 0], radius_m: 1, mass_kg: 1}}"}, 9, "wheels.*are of free objects"),
-        ({"STIFF": "bound_N: 3"}, 11, "stiffness_N_per_m: is needed, or damping_N_s_per_m"),
-        ({"OTHER": "link_1"}, 12, "other.*a tie has two ends"),
-        ({"OTHER": "bax"}, 12, "ties.spring.other: .*'bax'.*box"),
-        ({"STIFF": "stiffness_N_per_m: 1, pushes: true, bound_N: 2"}, 12, "bound_N.*is none of a tie that only pushes"),
+        ({"METHOD": "radau5"}, 11, ["ties.spring", "integrator.method: time_stepping", "radau5"]),
+        ({"WHEELS": "wheels: {a: {position_m: [0, 0, 0], radius_m: 1, mass_kg: 1}}"}, 9, ["objects.valve.wheels"]),
+        ({"STIFF": "bound_N: 3"}, 11, ["ties.spring.stiffness_N_per_m", "damping_N_s_per_m"]),
+        ({"OTHER": "link_1"}, 12, ["ties.spring.other = 'link_1'", "body"]),
+        ({"OTHER": "bax"}, 12, ["ties.spring.other", "'bax'", "'box'"]),
+        ({"STIFF": "stiffness_N_per_m: 1, pushes: true, bound_N: 2"}, 12, ["ties.spring.bound_N = 2"]),
     ],
 )
-def test_what_cannot_be_is_refused_where_it_stands(tmp_path, changes, line, says):
+def test_what_cannot_be_is_refused_where_it_stands(tmp_path, changes, line, names):
     usual = {"METHOD": "time_stepping", "OTHER": "box", "STIFF": "stiffness_N_per_m: 1"}
     text = SCENE if "WHEELS" in changes else SCENE.replace(", WHEELS", "")
     for word, value in (usual | changes).items():
         text = text.replace(word, value)
     path = tmp_path / "scene.yaml"
     path.write_text(text)
-    with pytest.raises((ScenarioError, ModelError), match=rf"scene.yaml:{line}.*{says}"):
+    with raises((ScenarioError, ModelError), f"scene.yaml:{line}", *names):
         simulate(load_scenario(path))
