@@ -186,7 +186,9 @@ def dotted(keys: Sequence[int | str]) -> str:
 def value_text(value: object) -> str:
     """Return a value for a message, on one line and of limited length."""
     if isinstance(value, str):
-        return repr(value if len(value) <= SHOWN_LIMIT else value[:SHOWN_LIMIT] + "…")
+        # The name of a file is at the end of its path.
+        half = SHOWN_LIMIT // 2
+        return repr(value if len(value) <= SHOWN_LIMIT else f"{value[:half]}…{value[-half:]}")
     text = repr(value)
     return text if len(text) <= SHOWN_LIMIT else text[:SHOWN_LIMIT] + "…"
 

@@ -281,7 +281,7 @@ class _Reader:
                 counts = len(columns[name]), len(columns["time"])
                 raise RecordError(f"{_describe(path)} has {counts[0]} entries, but there are {counts[1]} times")
         if not all(map(math.isfinite, columns["time"])):
-            raise RecordError("the time of an event is not finite")
+            raise RecordError("events: the time of an event is not finite")
         columns["value"] = [None if math.isnan(value) else value for value in columns["value"]]
         return [Event(*entries) for entries in zip(*(columns[name] for name in EVENT_COLUMNS), strict=True)]
 

@@ -511,7 +511,7 @@ def test_command(
         out.unlink()
     for wrong, name in (
         (("--size", "big"), "'big'"),
-        (("--out", "film"), "FILE.mp4"),
+        (("--out", "film"), ".mp4"),
         (("--plot", "nothing"), "'nothing'"),
     ):
         assert run(monkeypatch, "animate", tmp_path / "all/a", "--out", out, *quick, *wrong) != 0

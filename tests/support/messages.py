@@ -53,7 +53,7 @@ PHRASES = {
     "never": "never",
     "not unique": "the motion is not unique",
     "pulls in a step": "would lift off and land again",
-    "shared": "shared forces",
+    "shared": "the motion does not determine",
     "sinks": "below floor",
     "start jumps": "still jumps at the start",
     "steps gain": "the steps themselves add",
@@ -62,12 +62,12 @@ PHRASES = {
     # Warnings of drives and of snakes.
     "diverges": "its prediction diverges",
     "out of reach": "out of reach",
-    "overload": "rms over the run",
+    "overload": "of the run exceeds the nominal",
     "slowed down": "slowed down",
     "target waited": "the target waited for",
     "too fast": "too fast for the joints",
     "unstable": "sampled loop is unstable",
-    "would stop": "a real one would stop",
+    "would stop": "would stop there",
     # Rows of tables.
     "energy row": "electrical energy [J]",
     "impact row": "impact loss",

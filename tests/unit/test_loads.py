@@ -175,7 +175,7 @@ def test_a_payload_without_mass_adds_nothing(tmp_path: Path, shape: str) -> None
         ("{type: payload, body: link_9, mass_kg: 0}", "case.yaml:6: loads.push.body link_9"),
         (
             "{type: payload, body: link_1, mass_kg: 0, inertia_kg_m2: [1, 1, 1]}",
-            "case.yaml:6: loads.push.inertia_kg_m2 mass_kg 0",
+            "case.yaml:6: loads.push.inertia_kg_m2 mass_kg",
         ),
         (
             "{type: payload, body: link_1, mass_kg: 1, radius_m: 1, inertia_kg_m2: [1, 1, 1]}",

@@ -13,8 +13,8 @@ from numba.core import ir
 from numba.core.types.functions import BaseFunction
 from support.messages import check_message, raises
 
-from dynsim.jit import compiler
 from dynsim.jit import kernel as jit
+from dynsim.jit import numba_version
 
 pytestmark = pytest.mark.skipif(numba.config.DISABLE_JIT, reason="what the compiler does")
 
@@ -230,9 +230,9 @@ def test_kernels_are_not_compiled_by_another_numba(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: str
 ) -> None:
     name = NAME if change == "another source" else f"{NAME}_all"
-    monkeypatch.setitem(compiler.REPLACED, name, "0" * 32)
+    monkeypatch.setitem(numba_version.REPLACED, name, "0" * 32)
     monkeypatch.setattr(jit, "cache_folder", lambda: tmp_path)
-    compiler.check_sources.cache_clear()
+    numba_version.check_sources.cache_clear()
 
     @jit.kernel
     def double(x):  # type: ignore[no-untyped-def]
@@ -241,7 +241,7 @@ def test_kernels_are_not_compiled_by_another_numba(
     with raises(ImportError, f"numba {numba.__version__}", "0.68.1", name, 'pip install "numba==0.68.1"'):
         double(3)
     monkeypatch.undo()
-    compiler.check_sources()
+    numba_version.check_sources()
 
 
 def test_another_minor_version_of_numba_is_refused_before_its_internals_are_imported() -> None:

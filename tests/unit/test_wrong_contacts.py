@@ -54,7 +54,7 @@ def test_without_a_fault_it_is_accepted(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("contacts", "names"),
     [
-        ("friction: 0.5, static_friction: 0.2", ("static_friction = 0.2", "friction 0.5")),
+        ("friction: 0.5, static_friction: 0.2", ("static_friction = 0.2", "friction (0.5)")),
         (
             "slip_smoothing_m_s: 0.001",
             ("slip_smoothing_m_s = 0.001", "contacts.law: bilateral", "unilateral"),

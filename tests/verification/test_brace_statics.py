@@ -391,10 +391,10 @@ def test_a_motion_in_one_call_is_its_instants(arm, seed):
     ("changes", "names"),
     [
         ({"normal_force": -1.0}, ["link_4", "normal_force -1.0"]),
-        ({"normal": np.zeros(3)}, ["link_4", "normal [0.0, 0.0, 0.0]"]),
+        ({"normal": np.zeros(3)}, ["link_4", "normal"]),
         ({"friction": -0.1}, ["link_4", "friction -0.1"]),
         ({"min_N": math.nan}, ["link_4", "min_N nan"]),
-        ({"sliding": UP}, ["link_4", "sliding [0.0, 0.0, 1.0]"]),
+        ({"sliding": UP}, ["link_4", "sliding", "[0.0, 0.0, 1.0]"]),
         ({"body": "link_99"}, ["link_99", "link_9"]),
         ({"point": np.zeros(2)}, ["point", "array([0., 0.])"]),
     ],

@@ -119,9 +119,9 @@ def test_pose_from_the_base_and_chain_from_the_pose_agree(robot, seed):
     ("settings", "names"),
     [
         ({"head_joints": 2}, ["plant.head_joints = 2", "([T] eq 1)"]),
-        ({"head_joints": 5}, ["plant.head_joints = 5", "n_h"]),
+        ({"head_joints": 5}, ["plant.head_joints = 5"]),
         ({"yaw_joints": 3, "head_joints": 6}, ["plant", "yaw_joints = 3", "head_joints = 6", "n_b = 0"]),
-        ({"yaw_joints": 4, "head_joints": 6, "driven_side": "none"}, ["plant", "1 + 0 < 2", "[T] eq 16"]),
+        ({"yaw_joints": 4, "head_joints": 6, "driven_side": "none"}, ["plant", "1 + 0", "[T] eq 16"]),
         ({"wheel_gap_m": [0.1, 0.2]}, ["plant.wheel_gap_m", "2", "7"]),
         (
             {"initial_joints_rad": [1.2, 0, 0, 0, 0, 0]},
