@@ -136,7 +136,7 @@ def check(rig: Rig, ending: str, expected: Case, call: Call, folder: Path) -> No
     if not call.looping:
         messages = " ".join(map(str, [case.error, *case.warnings]))
         assert says(messages, "output failed"), "told to nobody"
-        if call.place.startswith("display.py"):
+        if call.place.startswith("output.py:Display"):
             summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
             assert "progress bar" in summary["outputs_failed"]
     if not (folder / "measured.h5").exists():

@@ -24,7 +24,7 @@ import errno
 import os
 import select
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -52,6 +52,10 @@ SINGLE_LATENCY = 0.034
 STATUS_BYTES = 11
 """Number of bytes of an answer without its parameters."""
 TORQUE_ENABLE = 64
+
+
+Answers = tuple[dict[int, Packet], dict[int, Packet], int]
+"""Packets as requested and others, by ID, and number of bytes outside packets; see :meth:`DynamixelBus._receive`."""
 
 
 class SerialPort(PortHandler):
@@ -225,11 +229,7 @@ class DynamixelBus:
         lengths = self._lengths.setdefault(("id", id_), RequestLengths())
         for _ in range(RETRIES + 1):
             asked = lengths.choose(length)
-            with self._transaction():
-                result = self._library.readTx(self.port, id_, address, asked)
-                self._raise_unsent(result)
-                self._wait_at_most(1, asked, max(self.latency, SINGLE_LATENCY))
-                answers, others, garbage = self._receive((id_,), asked)
+            answers, others, garbage = self._ask(id_, asked, self._library.readTx, address, asked)
             if id_ in answers:
                 packet = answers[id_]
                 self._raise_refusal(id_, packet.error)
@@ -243,14 +243,18 @@ class DynamixelBus:
         data = list(field.encode(value))
         self._reject_header(bytes([field.address & 0xFF, field.address >> 8, *data]))
         for _ in range(RETRIES + 1):
-            with self._transaction():
-                self._raise_unsent(self._library.writeTxOnly(self.port, id_, field.address, field.size, data))
-                self._wait_at_most(1, 0, max(self.latency, SINGLE_LATENCY))
-                answers, others, garbage = self._receive((id_,), 0)
+            answers, others, garbage = self._ask(id_, 0, self._library.writeTxOnly, field.address, field.size, data)
             if id_ in answers:
                 self._raise_refusal(id_, answers[id_].error)
                 return
         raise NoAnswer(id_, garbled=bool(others) or garbage > 0)
+
+    def _ask(self, id_: int, asked: int, send: Callable[..., int], *request: Any) -> Answers:
+        """Send a request to one servo and receive its answer with ``asked`` bytes of parameters."""
+        with self._transaction():
+            self._raise_unsent(send(self.port, id_, *request))
+            self._wait_at_most(1, asked, max(self.latency, SINGLE_LATENCY))
+            return self._receive((id_,), asked)
 
     def sync_write(self, field: Field, values: dict[int, int]) -> None:
         body = b"".join(bytes([id_]) + field.encode(value) for id_, value in values.items())
@@ -287,7 +291,7 @@ class DynamixelBus:
         milliseconds += 1e3 * (servos * (self.return_delay + 50e-6) + latency)
         self.port.setPacketTimeoutMillis(milliseconds)
 
-    def _receive(self, ids: Sequence[int], asked: int) -> tuple[dict[int, Packet], dict[int, Packet], int]:
+    def _receive(self, ids: Sequence[int], asked: int) -> Answers:
         """Receive until all servos have answered or the time-out.
 
         Returns

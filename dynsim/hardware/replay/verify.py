@@ -73,20 +73,13 @@ def configure(bus: Bus, servo_map: ServoMap, report: Callable[[str], None]) -> N
     NoAnswer, RequestRefused
         If a servo does not answer or refuses a write, for example because its torque is on, which locks the EEPROM.
     """
+    wanted = {"return_delay": int(servo_map.bus.return_delay / RETURN_DELAY_SECONDS_PER_UNIT), "drive_mode": 0}
     for servo in servo_map.servos:
         now = snapshot(bus, servo)
-        for name, value in _wanted_eeprom(servo, servo_map).items():
+        for name, value in {"operating_mode": int(servo.operating_mode), **wanted}.items():
             if now[name] != value:
                 bus.write(servo.id, servo.model.fields[name], value)
                 report(f"{servo}: {name} {now[name]} -> {value}")
-
-
-def _wanted_eeprom(servo: MappedServo, servo_map: ServoMap) -> Registers:
-    return {
-        "operating_mode": int(servo.operating_mode),
-        "return_delay": int(servo_map.bus.return_delay / RETURN_DELAY_SECONDS_PER_UNIT),
-        "drive_mode": 0,
-    }
 
 
 def verify(
