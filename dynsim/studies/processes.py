@@ -240,7 +240,7 @@ class _Pool:
         self._beginning = _beginning(work)
         # Tasks that no worker has, with the number of workers that they have lost.
         self._waiting = deque((task, 0) for task in tasks)
-        self._inbox: SimpleQueue[tuple[_Worker, tuple[Any, ...] | None]] = SimpleQueue()
+        self._inbox = SimpleQueue[tuple[_Worker, tuple[Any, ...] | None]]()
         self._failed_starts = 0
         self._stopped: float | None = None
 
@@ -298,7 +298,8 @@ class _Pool:
                 assert worker.task is not None
                 (task, _), worker.task = worker.task, None
                 if leaves:
-                    self._dismiss(worker)
+                    self.workers.remove(worker)
+                    worker.end()
                 self._take(task, partial(_result, good, content))
             case None:
                 self._lose(worker)
@@ -306,7 +307,8 @@ class _Pool:
     def _lose(self, worker: _Worker) -> None:
         with suppress(subprocess.TimeoutExpired):
             worker.process.wait(_JOIN_S)  # for its exit code: its output ends a little earlier
-        self._dismiss(worker)
+        self.workers.remove(worker)
+        worker.end()
         if worker.task is not None:
             task, losses = worker.task
             if self._stopped is None and losses + 1 < self._attempts:
@@ -318,10 +320,6 @@ class _Pool:
             self._failed_starts += 1
             if self._failed_starts == STARTS and self._stopped is None:
                 raise WorkerError(worker.failed_start())
-
-    def _dismiss(self, worker: _Worker) -> None:
-        self.workers.remove(worker)
-        worker.end()
 
 
 def _result(good: bool, content: bytes) -> Any:

@@ -72,8 +72,8 @@ SHADOWS = ("signal", "json", "pickle", "numpy", "dynsim")
     ids=["sweep", "compare"],
 )
 def test_workers_run_nothing_of_the_working_directory(tmp_path: Path, command: list[str], name: str):
-    for name in SHADOWS:
-        (tmp_path / f"{name}.py").write_text("raise RuntimeError('not this one')\n")
+    for module in SHADOWS:
+        (tmp_path / f"{module}.py").write_text("raise RuntimeError('not this one')\n")
     dynsim = Path(sys.executable).with_name("dynsim")
     arguments = [*command, "--no-figures", "--jobs", "2", "--out", "out"]
     ended = subprocess.run([dynsim, *arguments], cwd=tmp_path, capture_output=True, text=True, timeout=300)

@@ -375,6 +375,19 @@ def test_the_table_has_every_run_whatever_the_jobs(tmp_path: Path):
             assert all(float(row[key]) == value for key, value in numbers(summary).items())
 
 
+def test_an_error_in_a_sweep_leaves_the_table_of_what_was_done(tmp_path: Path):
+    rows: list[Any] = []
+
+    def ended(row: Any) -> None:
+        rows.append(row)
+        if len(rows) == 2:
+            raise KeyError("no such bug")
+
+    with pytest.raises(KeyError):
+        run_sweep(plan(Axis.parse(f"{LENGTH}=0.5:1:3")), tmp_path, ended=ended)
+    assert (tmp_path / "sweep.csv").read_text().count("\n") == 3
+
+
 def test_parquet_is_the_table(tmp_path: Path):
     parquet = pytest.importorskip("pyarrow.parquet")
     rows = run_sweep(plan(Axis.parse(f"{LENGTH}=0.5:1:3"), MASSES), tmp_path)
