@@ -18,6 +18,7 @@ from dynsim.hardware.bus.control_table import RAD_PER_TICK
 from dynsim.hardware.calibrate import write_into_map
 from dynsim.hardware.errors import ReplayAborted, ReplayInterrupted, ServoMapError, VerificationFailed
 from dynsim.hardware.nudge import ANGLE, PAUSE, SPEED, nudge, swapped
+from dynsim.hardware.replay.rules import Cause
 from dynsim.hardware.replay.states import StopRequest
 from dynsim.hardware.servo_map import load_servo_map
 from dynsim.system.terminal import Terminal
@@ -91,7 +92,7 @@ def test_a_robot_that_is_held_is_not_nudged(rig) -> None:
 def test_a_joint_held_fast_is_let_go_before_the_nudge_is_at_its_end(rig) -> None:
     """The map's own bound of 0.2 rad would never be reached."""
     run = rig.prepare({"kind": "stuck", "id": 1})
-    with raises(ReplayAborted, "shoulder", "following error", "REPLAY"):
+    with raises(ReplayAborted, "shoulder", Cause.FOLLOWING_ERROR, "REPLAY"):
         nudged(run, "shoulder")
     furthest = max(abs(run.map.servos[0].to_angle(value) - 0.1) for _, _, value in run.goals())
     assert furthest < 0.9 * ANGLE
