@@ -90,7 +90,7 @@ def test_a_robot_that_is_held_is_not_nudged(rig) -> None:
 def test_a_joint_held_fast_is_let_go_before_the_nudge_is_at_its_end(rig) -> None:
     """The map's own bound of 0.2 rad would never be reached."""
     run = rig.prepare({"kind": "stuck", "id": 1})
-    with raises(ReplayAborted, "shoulder", "following error", "REPLAY"):
+    with raises(ReplayAborted, "shoulder", Cause.FOLLOWING_ERROR, "REPLAY"):
         nudged(run, "shoulder")
     furthest = max(abs(run.map.servos[0].to_angle(value) - 0.1) for _, _, value in run.goals())
     assert furthest < 0.9 * ANGLE

@@ -118,7 +118,7 @@ def test_a_description_by_hand_is_refused_with_the_quantity(link: Any, robot: An
             ModelError,
             ("controller",),
         ),
-        (lambda: load_servo_map(None), ServoMapError, ("servo map", "None")),
+        (lambda: load_servo_map(None), ServoMapError, ("None",)),
     ],
 )
 def test_scenarios_and_maps_name_what_they_cannot_take(
