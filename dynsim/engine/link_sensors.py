@@ -60,7 +60,7 @@ class LinkMotion:
         return np.asarray(self.origin[:, body] + self.rotation[:, body] @ point)
 
 
-class Mount(NamedTuple):
+class SensorMount(NamedTuple):
     """Place of a sensor: index of its link, and axes (3, 3) and point (3,) [m] of the sensor in the link's frame."""
 
     body: int
@@ -85,10 +85,10 @@ class LinkSensor:
     """
 
     signals: tuple[tuple[str, str, str], ...]
-    measure: Callable[[LinkMotion, Mount], tuple[Array, ...]]
+    measure: Callable[[LinkMotion, SensorMount], tuple[Array, ...]]
 
 
-def wrench(motion: LinkMotion, mount: Mount) -> tuple[Array, Array]:
+def wrench(motion: LinkMotion, mount: SensorMount) -> tuple[Array, Array]:
     """Return force [N] and torque about the sensor's point [N m] of the parent on the link, in axes of the sensor."""
     torque, force = motion.across[:, mount.body, :3], motion.across[:, mount.body, 3:]
     about = torque - np.cross(motion.point(mount.body, mount.point), force)
@@ -106,7 +106,7 @@ LINK_SENSORS = {
 }
 
 
-class Push(NamedTuple):
+class AppliedWrench(NamedTuple):
     """Wrench that a caller has set: point [m], force [N] and torque [N m], (9,), on a link from a time [s] on."""
 
     time: float
@@ -115,7 +115,7 @@ class Push(NamedTuple):
     values: Array
 
 
-def mounts(scenario: Scenario, robot: Robot) -> dict[str, dict[str, Mount]]:
+def mounts(scenario: Scenario, robot: Robot) -> dict[str, dict[str, SensorMount]]:
     """Return the sensors on links of a scenario by kind and name.
 
     Raises
@@ -132,35 +132,33 @@ def mounts(scenario: Scenario, robot: Robot) -> dict[str, dict[str, Mount]]:
     }
 
 
-def _mount(robot: Robot, config: LinkSensorConfig, keys: tuple[str, ...]) -> Mount:
-    frames = {frame.name: frame.body for frame in robot.frames}
-    key = "body"
+def _mount(robot: Robot, config: LinkSensorConfig, keys: tuple[str, ...]) -> SensorMount:
+    frames, key = {frame.name: frame.body for frame in robot.frames}, "body"
     try:
         if config.body == WORLD:
             raise ModelError(f"'world' has no joint; bodies: {', '.join(robot.bodies)}")
-        body, _ = robot.attach(config.body, np.zeros(3))
-        if config.body not in robot.bodies:
-            carrier = frames[config.body]
-            raise ModelError(
-                f"{config.body!r} is a frame fixed to {carrier}; use body: {carrier}, frame: {config.body}"
-            )
+        robot.attach(config.body, np.zeros(3))
+        if config.body in frames:
+            body = frames[config.body]
+            raise ModelError(f"{config.body!r} is a frame fixed to {body}; use body: {body}, frame: {config.body}")
         key, frame = "frame", config.body if config.frame is None else config.frame
-        carrying, point = robot.attach(frame, np.array(config.point_m))
-        if carrying != body:
-            carrier = robot.links[carrying].name
-            raise ModelError(f"{frame!r} is not fixed to {config.body}, but to {carrier}; change body or frame")
+        if config.frame is not None and frames.get(config.frame) != config.body:
+            own = [name for name, body in frames.items() if body == config.body]
+            fix = f"frames: {', '.join(own)}" if own else "remove it, this body has no frames"
+            raise ModelError(f"{config.frame!r} is not a frame fixed to {config.body}; {fix}")
     except ModelError as error:
         keys = (*keys, key)
         raise ModelError(f"{dotted(keys)}: {error}", keys=keys) from error
-    return Mount(body, robot.attached_axes(frame), point)
+    index, point = robot.attach(frame, np.array(config.point_m))
+    return SensorMount(index, robot.attached_axes(frame), point)
 
 
-def add_link_sensors(record: Record, scenario: Scenario, prepared: Prepared, pushes: Sequence[Push]) -> None:
+def add_link_sensors(record: Record, scenario: Scenario, prepared: Prepared, pushes: Sequence[AppliedWrench]) -> None:
     """Add the signals of the scenario's sensors on links, from the motion and the forces of the record.
 
     Parameters
     ----------
-    pushes : sequence of Push
+    pushes : sequence of AppliedWrench
         Wrenches that the caller of a stepped simulation has set, in the order of time.
     """
     placed, count = mounts(scenario, prepared.model.robot), len(record)
@@ -176,7 +174,7 @@ def add_link_sensors(record: Record, scenario: Scenario, prepared: Prepared, pus
             record.add(name, data, unit, labels=tuple(named), description=description)
 
 
-def link_motion(record: Record, prepared: Prepared, pushes: Sequence[Push], rows: slice) -> LinkMotion:
+def link_motion(record: Record, prepared: Prepared, pushes: Sequence[AppliedWrench], rows: slice) -> LinkMotion:
     """Return the motion of the links, and the wrenches across their joints, at some samples.
 
     The wrench across a joint is what the bodies that it carries need for their motion against gravity, minus the
@@ -239,7 +237,7 @@ def _contact_forces(record: Record, prepared: Prepared, motion: LinkMotion, rows
 
 
 def _load_forces(
-    record: Record, prepared: Prepared, motion: LinkMotion, pushes: Sequence[Push], rows: slice
+    record: Record, prepared: Prepared, motion: LinkMotion, pushes: Sequence[AppliedWrench], rows: slice
 ) -> list[Acting]:
     robot, time, acting = prepared.model.robot, _load_times(record, prepared, pushes)[rows], []
 
@@ -268,7 +266,7 @@ def _components(load: Load, time: Array) -> Array:
     return np.where(lasts[:, None], load.components(time), 0.0)
 
 
-def _load_times(record: Record, prepared: Prepared, pushes: Sequence[Push]) -> Array:
+def _load_times(record: Record, prepared: Prepared, pushes: Sequence[AppliedWrench]) -> Array:
     """Return the times of the loads that the samples show, (T,) [s].
 
     In time stepping a step has the loads at t + θh. Steps begin when a load jumps, and at the start.
@@ -306,8 +304,7 @@ def _tie_forces(record: Record, prepared: Prepared, motion: LinkMotion, rows: sl
 def _attitudes(record: Record, prepared: Prepared, k: int) -> Array:
     """Return the rotation of the second body of a torsion tie in the axes of the first without deflection, (T, 3, 3).
 
-    The table has the rotation since the tie began last. If it has begun more often, the rotation before is that of the
-    first sample with a force.
+    The table has the rotation since the tie began last. Earlier, it is the rotation at the first sample with a force.
     """
     unilateral, tie, count = prepared.system.unilateral, prepared.model.robot.ties[k], len(record)
     assert unilateral is not None
