@@ -106,7 +106,7 @@ LINK_SENSORS = {
 }
 
 
-class AppliedForce(NamedTuple):
+class AppliedWrench(NamedTuple):
     """Wrench that a caller has set: point [m], force [N] and torque [N m], (9,), on a link from a time [s] on."""
 
     time: float
@@ -133,34 +133,32 @@ def mounts(scenario: Scenario, robot: Robot) -> dict[str, dict[str, SensorMount]
 
 
 def _mount(robot: Robot, config: LinkSensorConfig, keys: tuple[str, ...]) -> SensorMount:
-    frames = {frame.name: frame.body for frame in robot.frames}
-    key = "body"
+    frames, key = {frame.name: frame.body for frame in robot.frames}, "body"
     try:
         if config.body == WORLD:
             raise ModelError(f"'world' has no joint; bodies: {', '.join(robot.bodies)}")
-        body, _ = robot.attach(config.body, np.zeros(3))
-        if config.body not in robot.bodies:
-            carrier = frames[config.body]
-            raise ModelError(
-                f"{config.body!r} is a frame fixed to {carrier}; use body: {carrier}, frame: {config.body}"
-            )
+        robot.attach(config.body, np.zeros(3))
+        if config.body in frames:
+            body = frames[config.body]
+            raise ModelError(f"{config.body!r} is a frame fixed to {body}; use body: {body}, frame: {config.body}")
         key, frame = "frame", config.body if config.frame is None else config.frame
-        carrying, point = robot.attach(frame, np.array(config.point_m))
-        if carrying != body:
-            carrier = robot.links[carrying].name
-            raise ModelError(f"{frame!r} is not fixed to {config.body}, but to {carrier}; change body or frame")
+        if config.frame is not None and frames.get(config.frame) != config.body:
+            own = [name for name, body in frames.items() if body == config.body]
+            fix = f"frames: {', '.join(own)}" if own else "remove it, this body has no frames"
+            raise ModelError(f"{config.frame!r} is not a frame fixed to {config.body}; {fix}")
     except ModelError as error:
         keys = (*keys, key)
         raise ModelError(f"{dotted(keys)}: {error}", keys=keys) from error
-    return SensorMount(body, robot.attached_axes(frame), point)
+    index, point = robot.attach(frame, np.array(config.point_m))
+    return SensorMount(index, robot.attached_axes(frame), point)
 
 
-def add_link_sensors(record: Record, scenario: Scenario, prepared: Prepared, pushes: Sequence[AppliedForce]) -> None:
+def add_link_sensors(record: Record, scenario: Scenario, prepared: Prepared, pushes: Sequence[AppliedWrench]) -> None:
     """Add the signals of the scenario's sensors on links, from the motion and the forces of the record.
 
     Parameters
     ----------
-    pushes : sequence of AppliedForce
+    pushes : sequence of AppliedWrench
         Wrenches that the caller of a stepped simulation has set, in the order of time.
     """
     placed, count = mounts(scenario, prepared.model.robot), len(record)
@@ -176,7 +174,7 @@ def add_link_sensors(record: Record, scenario: Scenario, prepared: Prepared, pus
             record.add(name, data, unit, labels=tuple(named), description=description)
 
 
-def link_motion(record: Record, prepared: Prepared, pushes: Sequence[AppliedForce], rows: slice) -> LinkMotion:
+def link_motion(record: Record, prepared: Prepared, pushes: Sequence[AppliedWrench], rows: slice) -> LinkMotion:
     """Return the motion of the links, and the wrenches across their joints, at some samples.
 
     The wrench across a joint is what the bodies that it carries need for their motion against gravity, minus the
@@ -240,7 +238,7 @@ def _contact_forces(record: Record, prepared: Prepared, motion: LinkMotion, rows
 
 
 def _load_forces(
-    record: Record, prepared: Prepared, motion: LinkMotion, pushes: Sequence[AppliedForce], rows: slice
+    record: Record, prepared: Prepared, motion: LinkMotion, pushes: Sequence[AppliedWrench], rows: slice
 ) -> list[Acting]:
     robot, time = prepared.model.robot, _load_times(record, prepared, pushes)[rows]
     acting: list[Acting] = []
@@ -270,7 +268,7 @@ def _components(load: Load, time: Array) -> Array:
     return np.where(lasts[:, None], load.components(time), 0.0)
 
 
-def _load_times(record: Record, prepared: Prepared, pushes: Sequence[AppliedForce]) -> Array:
+def _load_times(record: Record, prepared: Prepared, pushes: Sequence[AppliedWrench]) -> Array:
     """Return the times of the loads that the samples show, (T,) [s].
 
     In time stepping a step has the loads at t + θh. Steps begin when a load jumps, and at the start.
@@ -311,8 +309,7 @@ def _tie_forces(record: Record, prepared: Prepared, motion: LinkMotion, rows: sl
 def _attitudes(record: Record, prepared: Prepared, k: int) -> Array:
     """Return the rotation of the second body of a torsion tie in the axes of the first without deflection, (T, 3, 3).
 
-    The table has the rotation since the tie began last. If it has begun more often, the rotation before is that of the
-    first sample with a force.
+    The table has the rotation since the tie began last. Earlier, it is the rotation at the first sample with a force.
     """
     unilateral, tie, count = prepared.system.unilateral, prepared.model.robot.ties[k], len(record)
     assert unilateral is not None

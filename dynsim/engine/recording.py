@@ -23,7 +23,7 @@ from dynsim.dynamics import state as kst
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.unilateral import UnilateralArrays
 from dynsim.dynamics.tree import support as ks
-from dynsim.engine.link_sensors import AppliedForce, add_link_sensors
+from dynsim.engine.link_sensors import AppliedWrench, add_link_sensors
 from dynsim.engine.prepare import Prepared
 from dynsim.engine.ring import counted_within
 from dynsim.engine.warnings import warnings_of
@@ -474,7 +474,7 @@ def make_record(
     wall: float,
     *,
     pushed: Sequence[int] | None = None,
-    pushes: Sequence[AppliedForce] = (),
+    pushes: Sequence[AppliedWrench] = (),
     happened: Sequence[Event] = (),
     base_as_planned: bool = True,
     pictured: bool = True,
@@ -492,7 +492,7 @@ def make_record(
         Wall-clock time of the integration [s].
     pushed : sequence of int, optional
         Indices of the caller's wrenches (the last of the loads) that have been set; default: no such wrenches.
-    pushes : sequence of AppliedForce, optional
+    pushes : sequence of AppliedWrench, optional
         These wrenches, in the order of time, if the scenario has sensors on links.
     happened : sequence of Event, optional
         Events of the run.

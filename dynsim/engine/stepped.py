@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dynsim.engine.link_sensors import AppliedForce
+from dynsim.engine.link_sensors import AppliedWrench
 from dynsim.engine.prepare import Prepared
 from dynsim.engine.trace import TraceState
 from dynsim.integrators import events
@@ -176,7 +176,7 @@ class Snapshot:
     trace: TraceState
     happened: tuple[Event, ...]
     pushed: frozenset[int]
-    pushes: tuple[AppliedForce, ...]
+    pushes: tuple[AppliedWrench, ...]
     base_as_planned: bool
     behind_brakes: Mapping[str, float]
     frozen: bool

@@ -18,7 +18,7 @@ from combinations.agreement import disagreements
 from combinations.commands import commands
 from combinations.contact_law import CREEP, dry, friction, gaps, stops, touching
 from combinations.energy import ledger, losses, powers
-from combinations.newton import circuit, equation, momentum, motion, support
+from combinations.newton import circuit, equation, momentum, motion, support, wrench
 from combinations.observed import Observed, warned
 from combinations.running import Run
 from combinations.sentences import JUMPS, MOVED, OTHER_FORCES, SLIPS_AT_START, UNSTABLE, WEDGED
@@ -308,6 +308,7 @@ CHECKS: dict[str, Callable[[Observed], Finding]] = {
     "motion": motion,
     "circuit": circuit,
     "support": support,
+    "wrench": wrench,
     "touching": touching,
     "friction": friction,
     "gaps": gaps,

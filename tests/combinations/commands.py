@@ -26,7 +26,7 @@ def commands(seen: Observed) -> Finding:
     ):
         return
     # Encoders measure other states; an equilibrium start shifts the references.
-    if seen.config.get("sensors") or (seen.config.get("initial") or {}).get("equilibrium"):
+    if seen.reads_sensors or (seen.config.get("initial") or {}).get("equilibrium"):
         return
     if controller.get("feed_forward", "none") != "none":
         return

@@ -106,8 +106,13 @@ def _products_jumped(seen: Observed, chosen: list[int], rows: NDArray[np.int64])
     return seen.step * np.abs(needed(end) - needed(start))
 
 
-def _acting_on(seen: Observed, chosen: set[int], weight: bool = True) -> tuple[Array, Array, Array]:
-    """Return outside moment (about the world's origin) and force on a set of bodies, and the sum of magnitudes."""
+def _acting_on(
+    seen: Observed, chosen: set[int], weight: bool = True, load_time: Array | None = None
+) -> tuple[Array, Array, Array]:
+    """Return outside moment (about the world's origin) and force on a set of bodies, and the sum of magnitudes.
+
+    ``load_time`` : times of the loads, (T,) [s]; None for the times of the samples
+    """
     moment, force, size = np.zeros((len(seen), 3)), np.zeros((len(seen), 3)), np.zeros(len(seen))
 
     def add(at: Array, push: Array, twist: Array | float = 0.0) -> None:
@@ -125,8 +130,8 @@ def _acting_on(seen: Observed, chosen: set[int], weight: bool = True) -> tuple[A
     for load in seen.loads:
         body, point = seen.robot.attach(load.body, load.point)
         if body in chosen:
-            wrench = load.components(seen.time)
-            parts = [wrench[:, :3], wrench[:, 3:]]
+            pushing = load.components(seen.time if load_time is None else load_time)
+            parts = [pushing[:, :3], pushing[:, 3:]]
             if load.in_body:
                 parts = [np.einsum("tij,tj->ti", seen.motion.rotation[body], part) for part in parts]
             add(seen.motion.point(body, point), *parts)
@@ -276,12 +281,7 @@ def support(seen: Observed) -> Finding:
     # The forces that the bodies need already include weight.
     acting_moment, acting_force, _ = _acting_on(seen, tree, weight=False)
     moment, force = moment - acting_moment, force - acting_force
-    # Wheels spin about an axle that turns with the base.
-    left, right = (seen.joints.index(joint) for joint in base.wheels)
-    axle = motion.rotation[body][:, :, 1]
-    spin = base.spin_inertia * (seen.v[:, left] + seen.v[:, right])[:, None]
-    rate = base.spin_inertia * (seen.vdot[:, left] + seen.vdot[:, right])[:, None]
-    moment = moment + rate * axle + spin * np.cross(motion.spin[body], axle)
+    moment = moment + _wheel_spin(seen)
     at = motion.origin[body]
     own_moment = np.einsum("tji,tj->ti", motion.rotation[body], moment - np.cross(at, force))
     own_force = np.einsum("tji,tj->ti", motion.rotation[body], force)
@@ -298,3 +298,58 @@ def support(seen: Observed) -> Finding:
             f"wheels and caster at t = {seen.time[i]:.6g} s carry {seen.record['wheel_load'][i].round(4)} N, "
             f"by the bodies {loads[i].round(4)} N"
         )
+
+
+def _wheel_spin(seen: Observed) -> Array:
+    """Return the moment for the spin of a mobile base's wheels, about an axle that turns with the base, (T, 3)."""
+    base, motion = seen.robot.base, seen.motion
+    assert base is not None
+    body = [link.name for link in seen.robot.links].index(base.body)
+    left, right = (seen.joints.index(joint) for joint in base.wheels)
+    axle = motion.rotation[body][:, :, 1]
+    spin = base.spin_inertia * (seen.v[:, left] + seen.v[:, right])[:, None]
+    rate = base.spin_inertia * (seen.vdot[:, left] + seen.vdot[:, right])[:, None]
+    return np.asarray(rate * axle + spin * np.cross(motion.spin[body], axle))
+
+
+# Share of the magnitudes of all forces that a wrench may differ: turning axes of ties are differences of rotations.
+SAME_WRENCH = 1e-6
+
+
+def wrench(seen: Observed) -> Finding:
+    """Check that sensors at joints show what the bodies beyond the joint need, minus the forces on them."""
+    bodies, motion = seen.bodies, seen.motion
+    needed = bodies.wrenches(motion)
+    rows, load_time = np.arange(len(seen)), seen.time
+    if seen.loads:
+        start, end = seen.steps_around if seen.stepped else (seen.time, seen.time)
+        load_time = start + seen.scenario.integrator.theta * (end - start)
+        jumps = np.concatenate([load.knots for load in seen.loads])
+        apart = np.abs(load_time[:, None] - jumps).min(axis=1) > 1e-9
+        # Of samples within a step, and of steps that are cut, the sensor may show loads at another time of the step.
+        whole = np.abs(seen.time - start - seen.step) < 1e-6 * seen.step if seen.stepped else apart
+        rows = np.flatnonzero(apart & whole)
+    for k, name in enumerate(seen.record.labels["wrench_force"] if "wrench_force" in seen.record and len(rows) else ()):
+        config = seen.config["sensors"]["wrench"][name]
+        body, point = seen.robot.attach(config["body"], np.array(config["point_m"]))
+        beyond = {i for i in range(bodies.n) if body in bodies.ancestors(i)}
+        moment, force, size = _acting_on(seen, beyond, weight=False, load_time=load_time)
+        moment, force = (
+            sum((needed[i][part] for i in beyond), start=-outside) for part, outside in ((0, moment), (1, force))
+        )
+        if seen.robot.base is not None and config["body"] == seen.robot.base.body:
+            moment = moment + _wheel_spin(seen)
+        at = motion.point(body, point)
+        moment = moment - np.cross(at, force)
+        size = size + sum(np.linalg.norm(needed[i][1], axis=1) for i in beyond)
+        size = size * (1.0 + np.max([np.linalg.norm(origin - at, axis=1) for origin in motion.origin], axis=0))
+        size = size + sum(np.linalg.norm(needed[i][0], axis=1) for i in beyond)
+        for signal, expected in (("wrench_force", force), ("wrench_torque", moment)):
+            shown = np.einsum("tij,tj->ti", motion.rotation[body], seen.record[signal][:, k])
+            excess = (np.linalg.norm(shown - expected, axis=1) / (SAME_WRENCH * size + 1e-12))[rows]
+            if excess.max() > 1.0:
+                row = rows[excess.argmax()]
+                yield (
+                    f"{signal} of {config['body']} at t = {seen.time[row]:.6g} s is {shown[row]} in the world, "
+                    f"but its bodies need {expected[row]}"
+                )

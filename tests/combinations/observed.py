@@ -302,6 +302,11 @@ class Observed:
         return (self.config.get("controller") or {}).get("sample_time_s")
 
     @property
+    def reads_sensors(self) -> bool:
+        """Whether the controller reads sensors instead of the exact state."""
+        return not {"encoders", "motion_capture"}.isdisjoint(self.config.get("sensors") or {})
+
+    @property
     def periods(self) -> list[float]:
         """Periods of ticks, at which commands of a controller or an operator are taken [s]."""
         controller = self.config.get("controller") or {}

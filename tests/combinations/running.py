@@ -97,7 +97,8 @@ def run(scene: Scene, method: str, manner: str = "simulate") -> Run:
 def _simulation(scenario: Scenario) -> Simulation:
     """Return a simulation like that of ``simulate``; with Python ticks it has no end time, which would cut a step."""
     sensors, controller = scenario.config.sensors, scenario.controller
-    attended = sensors is not None or getattr(controller, "operator", None) is not None
+    read = sensors is not None and not (sensors.encoders is None and sensors.motion_capture is None)
+    attended = read or getattr(controller, "operator", None) is not None
     attended = attended or getattr(controller, "type", "") == "task_space"
     simulation = Simulation(scenario, duration=math.inf if attended else None)
     if attended:

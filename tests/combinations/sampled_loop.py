@@ -22,7 +22,7 @@ def loop_growth(seen: Observed, q: Array | None = None, *, most: bool = False) -
     or at coordinates q (nq,).
     """
     period = seen.sample_time
-    if period is None or not seen.robot.motors or seen.config.get("sensors"):
+    if period is None or not seen.robot.motors or seen.reads_sensors:
         return None
     basis = seen.bodies.free_directions()
     q = seen.robot.initial if q is None else q

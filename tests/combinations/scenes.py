@@ -121,7 +121,20 @@ def scene(
         drawn = Scene(levels, seed, draft, folder)
         if not drawn.methods or not _in_a_surface(drawn):
             break
+    _add_wrench_sensor(drawn, draft)
     return drawn
+
+
+def _add_wrench_sensor(drawn: Scene, draft: dict[str, Any]) -> None:
+    """Add a wrench sensor at the joint of a body, which depends on the seed; nothing is drawn for it."""
+    if not drawn.methods:
+        return
+    try:
+        bodies = build_model(drawn.load(drawn.methods[-1])).robot.bodies
+    except DynsimError:
+        return
+    sensor = {"body": bodies[drawn.seed % len(bodies)], "point_m": [0.01, -0.02, 0.03]}
+    draft["sensors"] = {**draft.get("sensors", {}), "wrench": {"probe": sensor}}
 
 
 def _in_a_surface(drawn: Scene) -> bool:

@@ -58,6 +58,7 @@ ARM = {
     "objects": {
         "box": {"mass_kg": 0.5, "size_m": [0.1, 0.1, 0.1], "position_m": [1.0, 1.0, -0.03], "rpy_deg": [5, 0, 0]}
     },
+    "sensors": {"wrench": {"probe": {"body": "link_2", "point_m": [0.01, -0.02, 0.03]}}},
     "record": {"rate_hz": 1000.0},
     "metrics": {"settle_s": 0.0},
 }
@@ -168,6 +169,7 @@ SPOILT: dict[str, tuple[dict[str, Callable[[np.ndarray], np.ndarray]], set[str]]
     "starts moving": ({"v": _shifted(0.01, 0, 1)}, {"start"}),
     "accelerations of other forces": ({"vdot": _times(1.05)}, {"motion"}),
     "current that gives another torque": ({"current": _times(1.05)}, {"equation"}),
+    "other wrench": ({"wrench_torque": _times(1.0001)}, {"wrench"}),
     "turned tangent": ({"contact_force": _turned_tangent}, {"equation", "friction", "momentum"}),
     "outside the cone": ({"contact_force": _stronger_friction}, {"friction"}),
     "other normal force": ({"contact_normal_force": _times(1.01)}, {"touching"}),

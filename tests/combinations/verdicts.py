@@ -115,7 +115,7 @@ def _stop(stop: SimulationStopped, seen: Observed) -> Iterator[str]:
     # There is no separate model of loops with encoders, so only their growth is checked.
     energy = seen.record["energy_kinetic"]
     grows = energy[-1] > 100.0 * energy[: max(1, len(seen) // 2)].max()
-    if UNSTABLE in str(stop) and seen.config.get("sensors") and grows:
+    if UNSTABLE in str(stop) and seen.reads_sensors and grows:
         return
     if reason := STOPS[stop.kind](stop, seen):
         yield f"{text}: {reason}; {str(stop)[:200]}"
@@ -651,7 +651,7 @@ def _jumps(match: Match, seen: Observed) -> str:
 
 
 def _unstable(match: Match, seen: Observed) -> str:
-    if seen.config.get("sensors"):
+    if seen.reads_sensors:
         # There is no separate model of encoders with delay; with true positions it is the slower loop.
         return ""
     from_then_on = re.search(FROM_THEN_ON, match.string)

@@ -19,6 +19,7 @@ from dynsim.hardware.bus.control_table import RAD_PER_TICK
 from dynsim.hardware.errors import ReplayAborted, ReplayInterrupted, ServoMapError, VerificationFailed
 from dynsim.hardware.nudge import ANGLE, PAUSE, SPEED, nudge, swapped
 from dynsim.hardware.replay.output import StopRequest
+from dynsim.hardware.replay.rules import Cause
 from dynsim.hardware.servo_map import load_servo_map, write_into_map
 
 from .conftest import Run

@@ -339,7 +339,7 @@ def test_wrenches_that_a_caller_sets_act_outside(method: str) -> None:
 
 
 def test_torsion_tie_that_begins_again_acts_about_the_axes_of_each_beginning() -> None:
-    """The attitude of the first hold is that of its first sample, that of the last from the table."""
+    """The first hold uses the attitude at its first sample, the last hold the attitude in the table."""
     tie = {"type": "torsion", "body": "link_2", "other": "world", "axis": [0, 0, 1], "stiffness_N_m_per_rad": 0.5}
     arm = scenario(
         [{"axis": "y", "initial_deg": 60}, {"axis": "x", "initial_deg": 70}],
@@ -411,11 +411,15 @@ def test_columns_of_tables_name_sensor_and_component() -> None:
     [
         ({"body": "link_9"}, "body: no body 'link_9'; did you mean"),
         ({"body": "world"}, "body: 'world' has no joint; bodies: "),
-        ({"body": "link_1", "frame": "tool"}, "frame: no body 'tool'; bodies: "),
+        (
+            {"body": "link_1", "frame": "tool"},
+            "frame: 'tool' is not a frame fixed to link_1; remove it, this body has no frames",
+        ),
         (
             {"body": "link_1", "frame": "link_2"},
-            "frame: 'link_2' is not fixed to link_1, but to link_2; change body or frame",
+            "frame: 'link_2' is not a frame fixed to link_1; remove it, this body has no frames",
         ),
+        ({"body": "box", "frame": "tool"}, "frame: 'tool' is not a frame fixed to box; frames: box.grasp"),
         ({"body": "box.grasp"}, "body: 'box.grasp' is a frame fixed to box; use body: box, frame: box.grasp"),
     ],
 )

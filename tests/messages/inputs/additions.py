@@ -27,6 +27,10 @@ def objects(keys: str, name: str = "ball") -> str:
     return f"objects: {{{name}: {{{keys}}}}}\n"
 
 
+def wrench(keys: str) -> str:
+    return f"sensors: {{wrench: {{gauge: {{{keys}}}}}}}\n"
+
+
 def ties(keys: str) -> str:
     return f"ties: {{spring: {{{keys}}}}}\n"
 
@@ -66,6 +70,12 @@ TABLES = [
             ("unknown sensor", "sensors: {camera: {}}\n"),
             ("negative resolution", "sensors: {encoders: {resolution_deg: -1}}\n"),
             ("encoders that are never read", "sensors: {encoders: {rate_hz: 0}}\n"),
+            ("wrench sensor on a body that does not exist", wrench("body: link_3")),
+            ("wrench sensor at the world", wrench("body: world")),
+            ("wrench sensor without a body", wrench("point_m: [0, 0, 0]")),
+            ("wrench sensor with an unknown key", wrench("body: link_1, point: [0, 0, 0]")),
+            ("wrench sensor with a frame of another body", wrench("body: link_1, frame: link_2")),
+            ("wrench sensor on a frame", f"objects: {{pipe: {{{BALL}, grasp: {{}}}}}}\n{wrench('body: pipe.grasp')}"),
         ],
     ),
     Edits(

@@ -88,6 +88,7 @@ TABLES = [
                 "contacts: {points: {nose: {body: head}}}\nsurfaces: {floor: {type: plane}}\n",
             ),
             ("load of a kinematic snake", "loads: {pull: {type: constant, body: head, force_N: [1, 0, 0]}}\n"),
+            ("wrench sensor of a kinematic snake", "sensors: {wrench: {neck: {body: head}}}\n"),
             ("controller of an arm for a snake", "type: task_space", "type: joint_pd"),
             ("snake without a controller", "controller:\n  type: task_space\n", ""),
             (
