@@ -12,16 +12,14 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from dynsim.compile.shapes import touching_points
-from dynsim.config.problems import dotted
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.tree import joints, sweep
-from dynsim.errors import ModelError
 from dynsim.integrators import run as ki
-from dynsim.model.description import WORLD, Array, Load, Robot
+from dynsim.model.description import Array, Load, Robot
 from dynsim.record import Record
-from dynsim.scenario import Scenario
-from dynsim.scenario.schema import LinkSensorConfig
+from dynsim.scenario import Scenario, build
+from dynsim.scenario.build import SensorMount
 
 if TYPE_CHECKING:
     from dynsim.engine.prepare import Prepared
@@ -60,16 +58,9 @@ class LinkMotion:
         return np.asarray(self.origin[:, body] + self.rotation[:, body] @ point)
 
 
-class SensorMount(NamedTuple):
-    """Place of a sensor: index of its link, and axes (3, 3) and point (3,) [m] of the sensor in the link's frame."""
-
-    body: int
-    axes: Array
-    point: Array
-
-    def seen(self, motion: LinkMotion, vectors: Array) -> Array:
-        """Return the components of world vectors (T, 3) in the axes of the sensor."""
-        return np.asarray(np.einsum("tji,tj->ti", motion.rotation[:, self.body] @ self.axes, vectors))
+def seen(mount: SensorMount, motion: LinkMotion, vectors: Array) -> Array:
+    """Return the components of world vectors (T, 3) in the axes of a sensor."""
+    return np.asarray(np.einsum("tji,tj->ti", motion.rotation[:, mount.body] @ mount.axes, vectors))
 
 
 @dataclass(frozen=True)
@@ -92,7 +83,7 @@ def wrench(motion: LinkMotion, mount: SensorMount) -> tuple[Array, Array]:
     """Return force [N] and torque about the sensor's point [N m] of the parent on the link, in axes of the sensor."""
     torque, force = motion.across[:, mount.body, :3], motion.across[:, mount.body, 3:]
     about = torque - np.cross(motion.point(mount.body, mount.point), force)
-    return mount.seen(motion, force), mount.seen(motion, about)
+    return seen(mount, motion, force), seen(mount, motion, about)
 
 
 LINK_SENSORS = {
@@ -115,44 +106,6 @@ class AppliedWrench(NamedTuple):
     values: Array
 
 
-def mounts(scenario: Scenario, robot: Robot) -> dict[str, dict[str, SensorMount]]:
-    """Return the sensors on links of a scenario by kind and name.
-
-    Raises
-    ------
-    ModelError
-        If a body or frame does not exist, or the frame is not fixed to the body.
-    """
-    sensors = scenario.config.sensors
-    configs = {} if sensors is None else {kind: getattr(sensors, kind) or {} for kind in LINK_SENSORS}
-    return {
-        kind: {name: _mount(robot, config, ("sensors", kind, name)) for name, config in named.items()}
-        for kind, named in configs.items()
-        if named
-    }
-
-
-def _mount(robot: Robot, config: LinkSensorConfig, keys: tuple[str, ...]) -> SensorMount:
-    frames, key = {frame.name: frame.body for frame in robot.frames}, "body"
-    try:
-        if config.body == WORLD:
-            raise ModelError(f"'world' has no joint; bodies: {', '.join(robot.bodies)}")
-        robot.attach(config.body, np.zeros(3))
-        if config.body in frames:
-            body = frames[config.body]
-            raise ModelError(f"{config.body!r} is a frame fixed to {body}; use body: {body}, frame: {config.body}")
-        key, frame = "frame", config.body if config.frame is None else config.frame
-        if config.frame is not None and frames.get(config.frame) != config.body:
-            own = [name for name, body in frames.items() if body == config.body]
-            fix = f"frames: {', '.join(own)}" if own else "remove it, this body has no frames"
-            raise ModelError(f"{config.frame!r} is not a frame fixed to {config.body}; {fix}")
-    except ModelError as error:
-        keys = (*keys, key)
-        raise ModelError(f"{dotted(keys)}: {error}", keys=keys) from error
-    index, point = robot.attach(frame, np.array(config.point_m))
-    return SensorMount(index, robot.attached_axes(frame), point)
-
-
 def add_link_sensors(record: Record, scenario: Scenario, prepared: Prepared, pushes: Sequence[AppliedWrench]) -> None:
     """Add the signals of the scenario's sensors on links, from the motion and the forces of the record.
 
@@ -161,7 +114,7 @@ def add_link_sensors(record: Record, scenario: Scenario, prepared: Prepared, pus
     pushes : sequence of AppliedWrench
         Wrenches that the caller of a stepped simulation has set, in the order of time.
     """
-    placed, count = mounts(scenario, prepared.model.robot), len(record)
+    placed, count = build.sensor_mounts(scenario, prepared.model.robot), len(record)
     values = {kind: np.empty((len(LINK_SENSORS[kind].signals), count, len(named), 3)) for kind, named in placed.items()}
     for first in range(0, count if placed else 0, BLOCK):
         rows = slice(first, first + BLOCK)

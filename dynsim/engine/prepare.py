@@ -39,7 +39,6 @@ from dynsim.dynamics.tree import support as ks
 from dynsim.engine import REFERENCES, Progress
 from dynsim.engine.compilation import kernels_logged
 from dynsim.engine.equilibrium import Balance, balanced, pressed, shifted
-from dynsim.engine.link_sensors import mounts
 from dynsim.engine.outcome import check_size
 from dynsim.engine.trace import even_times
 from dynsim.errors import ModelError, ScenarioError, SimulationStopped
@@ -296,7 +295,7 @@ def prepare(
     dry = dry_frictions(robot) if real else []
     watched = real and bool(contacts or stops or dry)
     check_robot(scenario.config, robot)
-    mounts(scenario, robot)  # sensors on links that do not exist are errors
+    build.sensor_mounts(scenario, robot)  # sensors on links that do not exist are errors
     gives = bool(robot.ties) or any(contact.stiffness > 0.0 for contact in contacts)
     sizes = kst.LOSSES if real else 0, 1 if stepped else 0, kst.ELASTIC_SIZE if gives else 0
     layout = state_layout(model.nq, n, robot.circuits, c, len(loads), *sizes)

@@ -41,7 +41,7 @@ from dynsim.dynamics.tree.joints import normalise
 from dynsim.engine import SIMULATION, Progress, Start, stopping
 from dynsim.engine.brakes import Brakes, projection_loss
 from dynsim.engine.linearization import Linearization, linearized
-from dynsim.engine.link_sensors import AppliedWrench, mounts
+from dynsim.engine.link_sensors import AppliedWrench
 from dynsim.engine.operator import EncodedCommands, Operator
 from dynsim.engine.outcome import interrupted, mark_stopped, raise_stopped
 from dynsim.engine.prepare import Prepared, at_start, prepare, sample_times
@@ -205,7 +205,7 @@ class Simulation:
         self._frozen = not math.isfinite(self._references_end)
         self._pushed: set[int] = set()
         # Sensors on links need them; other records have their work only.
-        self._keeps_pushes, self._past_pushes = bool(mounts(scenario, robot)), list[AppliedWrench]()
+        self._keeps_pushes, self._past_pushes = bool(build.sensor_mounts(scenario, robot)), list[AppliedWrench]()
         times = None
         if state is None and self._end == scenario.duration_s and trace is None:
             # Exactly the samples of simulate, including its size limit.

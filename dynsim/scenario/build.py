@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, overload
+from typing import TYPE_CHECKING, Any, NamedTuple, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,7 @@ from dynsim.library import families
 from dynsim.model.description import WORLD, Array, Contact, Foot, Inertia, Load, Robot
 from dynsim.model.surfaces import SURFACES, Surface
 from dynsim.scenario.candidates import candidates
-from dynsim.scenario.schema import ContactPoint, Contacts, Payload, Scenario
+from dynsim.scenario.schema import ContactPoint, Contacts, LinkSensorConfig, Payload, Scenario
 from dynsim.system.memo import recall
 
 if TYPE_CHECKING:
@@ -641,3 +641,53 @@ def require_scenario(scenario: object) -> None:
     """Raise :class:`ScenarioError` if the argument is not a Scenario, e.g. the name of a scenario."""
     if not isinstance(scenario, Scenario):
         raise ScenarioError(f"expected a Scenario, got {brief(scenario)}; load one with load_scenario(name or file)")
+
+
+# Kinds of sensors on links, which are also their keys in ``sensors:``.
+LINK_SENSORS = ("wrench",)
+
+
+class SensorMount(NamedTuple):
+    """Location of a sensor: index of its link, and axes (3, 3) and point (3,) [m] of the sensor in the link's frame."""
+
+    body: int
+    axes: Array
+    point: Array
+
+
+def sensor_mounts(scenario: Scenario, robot: Robot) -> dict[str, dict[str, SensorMount]]:
+    """Return the sensors on links of a scenario by kind and name.
+
+    Raises
+    ------
+    ModelError
+        If a body or frame does not exist, or the frame is not fixed to the body.
+    """
+    sensors = scenario.config.sensors
+    configs = {} if sensors is None else {kind: getattr(sensors, kind) or {} for kind in LINK_SENSORS}
+    return {
+        kind: {name: _mount(robot, config, ("sensors", kind, name)) for name, config in named.items()}
+        for kind, named in configs.items()
+        if named
+    }
+
+
+def _mount(robot: Robot, config: LinkSensorConfig, keys: tuple[str, ...]) -> SensorMount:
+    frames, key = {frame.name: frame.body for frame in robot.frames}, "body"
+    try:
+        if config.body == WORLD:
+            raise ModelError(f"'world' has no joint; bodies: {', '.join(robot.bodies)}")
+        robot.attach(config.body, np.zeros(3))
+        if config.body in frames:
+            body = frames[config.body]
+            raise ModelError(f"{config.body!r} is a frame fixed to {body}; use body: {body}, frame: {config.body}")
+        key, frame = "frame", config.body if config.frame is None else config.frame
+        if config.frame is not None and frames.get(config.frame) != config.body:
+            own = [name for name, body in frames.items() if body == config.body]
+            fix = f"frames: {', '.join(own)}" if own else "remove it, this body has no frames"
+            raise ModelError(f"{config.frame!r} is not a frame fixed to {config.body}; {fix}")
+    except ModelError as error:
+        keys = (*keys, key)
+        raise ModelError(f"{dotted(keys)}: {error}", keys=keys) from error
+    index, point = robot.attach(frame, np.array(config.point_m))
+    return SensorMount(index, robot.attached_axes(frame), point)
