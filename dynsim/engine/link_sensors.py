@@ -175,12 +175,12 @@ def link_motion(record: Record, prepared: Prepared, pushes: Sequence[AppliedWren
 
 
 # Force that acts on a link: its index, the point (T, 3), force and torque there (T, 3), in the world.
-Acting = tuple[int, Array, Array, Array | float]
+ActingForce = tuple[int, Array, Array, Array | float]
 
 
-def _contact_forces(record: Record, prepared: Prepared, motion: LinkMotion, rows: slice) -> list[Acting]:
+def _contact_forces(record: Record, prepared: Prepared, motion: LinkMotion, rows: slice) -> list[ActingForce]:
     robot = prepared.model.robot
-    acting: list[Acting] = []
+    acting: list[ActingForce] = []
     for k, contact in enumerate(prepared.contacts):
         ends = [robot.attach(contact.body, end) for end in (contact.point, contact.tip) if end is not None]
         at, *tip = (motion.point(body, end) for body, end in ends)
@@ -192,9 +192,9 @@ def _contact_forces(record: Record, prepared: Prepared, motion: LinkMotion, rows
 
 def _load_forces(
     record: Record, prepared: Prepared, motion: LinkMotion, pushes: Sequence[AppliedWrench], rows: slice
-) -> list[Acting]:
+) -> list[ActingForce]:
     robot, time = prepared.model.robot, _load_times(record, prepared, pushes)[rows]
-    acting: list[Acting] = []
+    acting: list[ActingForce] = []
 
     def add(body: int, in_body: bool, point: Array, wrenches: Array) -> None:
         parts = wrenches[:, :3], wrenches[:, 3:]
@@ -236,10 +236,10 @@ def _load_times(record: Record, prepared: Prepared, pushes: Sequence[AppliedWren
     return np.asarray(np.maximum(time - (1.0 - run.stepping.theta) * h, began + after))
 
 
-def _tie_forces(record: Record, prepared: Prepared, motion: LinkMotion, rows: slice) -> list[Acting]:
+def _tie_forces(record: Record, prepared: Prepared, motion: LinkMotion, rows: slice) -> list[ActingForce]:
     """Return the forces of ties on both bodies; they act at the point of the second body."""
     unilateral = prepared.system.unilateral
-    acting: list[Acting] = []
+    acting: list[ActingForce] = []
     if unilateral is None or "tie_force" not in record:
         return acting
     for k, tie in enumerate(prepared.model.robot.ties):
