@@ -88,7 +88,7 @@ def test_real_contact_keeps_its_laws(run, name, variant):
 
 
 # All other arms, but for the one that tips over.
-GLUED = [case for case in CASES if case not in REAL and not case[0].startswith("snake_") and case[0] != "mobile_reach"]
+GLUED = [case for case in CASES if case not in REAL and not case[0].startswith(STEPPED) and case[0] != "mobile_reach"]
 
 
 @pytest.mark.parametrize(("name", "variant"), GLUED)
