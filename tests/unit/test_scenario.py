@@ -162,7 +162,7 @@ def test_all_unknown_keys_of_a_file_are_in_one_answer(tmp_path: Path):
     with raises(ScenarioError, "axis", "rate_hz", "integrator", "settle_s") as caught:
         load_scenario(path)
     places = re.findall(rf"{re.escape(str(path))}:\d+: [\w.]+(?: = -1)?", str(caught.value))
-    assert [place.removeprefix(f"{path}:") for place in places] == [
+    assert [start.removeprefix(f"{path}:") for start in places] == [
         "2: plant.chain.0.axs",
         "4: record.rate",
         "3: integrater",
@@ -182,7 +182,7 @@ def test_every_problem_is_told_with_its_place(tmp_path: Path):
         load_scenario(path)
     message = str(caught.value)
     places = [f"{path}:2: plant.chain.0.{key}" for key in ("kind", "axis = 'q'", "length_m = -1")]
-    positions = [message.index(place) for place in (*places, f"{path}:4: surfaces.floor.typ")]
+    positions = [message.index(start) for start in (*places, f"{path}:4: surfaces.floor.typ")]
     assert positions == sorted(positions)
     assert "integrator" not in message
 
