@@ -54,7 +54,7 @@ PHRASES = {
     "not unique": "the motion is not unique",
     "pulls in a step": "would leave its surface",
     "shared": "shared forces",
-    "sinks": "pass below",
+    "sinks": "surfaces hold only the points of contacts",
     "start jumps": "jumps at the start all the same",
     "steps gain": "give way get",
     "stuck": "does not end",
