@@ -54,7 +54,7 @@ PHRASES = {
     "not unique": "the motion is not unique",
     "pulls in a step": "would lift off and land again",
     "shared": "the motion does not determine",
-    "sinks": "below floor",
+    "sinks": "only contact points interact with surfaces",
     "start jumps": "still jumps at the start",
     "steps gain": "the steps themselves add",
     "stuck": "does not end",
