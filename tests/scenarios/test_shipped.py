@@ -41,14 +41,10 @@ def test_runs_shortened(name):
     assert all(map(math.isfinite, numbers))
 
 
-# Snakes stand on compliant tyres and step in time: test_snake_dynamic has their laws. Other scenarios that step in time
-# are in test_answers, and the laws of time stepping in tests/verification.
-STEPPED = ("snake_", "soft_floor", "spring_drawer")
-REAL = [
-    (name, variant)
-    for name, variant in CASES
-    if not name.startswith(STEPPED) and dynsim.load_scenario(name, variant).config.contacts.law == "unilateral"
-]
+# Snakes stand on compliant tyres and step in time: test_snake_dynamic has what holds of them.
+ARMS = {case: dynsim.load_scenario(*case).config for case in CASES if not case[0].startswith("snake_")}
+STEPPED = [case for case, config in ARMS.items() if config.integrator.method == "time_stepping"]
+REAL = [case for case, config in ARMS.items() if config.contacts.law == "unilateral" and case not in STEPPED]
 REAL_FLOOR = "elbow_comparison_floor"
 ON_FLOOR: dict[str, set[int]] = {"elbow_7": {7}, "elbow_4": {4}, "no_elbow": set()}
 
@@ -87,8 +83,37 @@ def test_real_contact_keeps_its_laws(run, name, variant):
         assert (friction - slope * force).max(initial=0.0) <= 1e-7 * max(1.0, total.max(initial=0.0))
 
 
-# All other arms, but for the one that tips over.
-GLUED = [case for case in CASES if case not in REAL and not case[0].startswith(STEPPED) and case[0] != "mobile_reach"]
+@pytest.mark.parametrize(("name", "variant"), STEPPED)
+def test_real_contact_in_fixed_steps_keeps_its_laws(run, name, variant):
+    """Forces push, within the friction cone; rigid contacts do not sink in; the ledger closes to rounding."""
+    record = run(name, variant)
+    summary, contacts = record.summary, ARMS[name, variant].contacts
+    assert record.complete
+    assert summary["energy_residual_relative"] <= 1e-13
+    assert summary["time_stepping"]["dropped_solves"] == summary["time_stepping"]["capped_solves"] == 0
+    force, gap = record["contact_normal_force"], record["contact_gap"]
+    assert force.min(initial=0.0) >= 0.0
+    if contacts.stiffness_N_per_m is None:
+        # A landing within a step of 1 ms is known to h² a, with accelerations of some m/s².
+        assert gap.min(initial=0.0) >= -1e-6
+    else:
+        # The force is the mean of a step.
+        assert -gap.min(initial=0.0) <= 1.05 * force.max(initial=0.0) / contacts.stiffness_N_per_m
+    friction = np.sqrt(np.maximum(np.linalg.norm(record["contact_force"], axis=2) ** 2 - force**2, 0.0))
+    worst = max(value for point in (None, *contacts.points.values()) for value in contacts.coefficients(point))
+    factor = 1.0 if ARMS[name, variant].surface_error is None else ARMS[name, variant].surface_error.friction_factor
+    speed = np.linalg.norm(record["contact_slip_velocity"], axis=2).max(initial=0.0)
+    slope = factor * (worst + contacts.viscous_friction_s_per_m * speed)
+    # The difference of two squares is good to the root of rounding.
+    assert (friction - slope * force).max(initial=0.0) <= 1e-6 * max(1.0, force.max(initial=0.0))
+
+
+# All other arms, but for the one that tips over. No other default test compiles the dense solver.
+GLUED = [
+    pytest.param(*case, marks=[pytest.mark.long] if case == ("sampled_arm", "dense") else [])
+    for case in ARMS
+    if case not in REAL and case not in STEPPED and case[0] != "mobile_reach"
+]
 
 
 @pytest.mark.parametrize(("name", "variant"), GLUED)
