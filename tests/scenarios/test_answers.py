@@ -124,6 +124,8 @@ def test_free_flyer() -> None:
     assert column(cycle, "q", "root.qz")[-1] == pytest.approx(-column(back, "q", "root.qz")[-1], rel=1e-2)
     energies = [energy("free_flyer", each) for each in ("cycle", "quick")]
     assert energies == pytest.approx([19.8, 39.6], **ROUNDED)
+    forces = [np.linalg.norm(record["wrench_force"], axis=2).max() for record in (cycle, quick)]
+    assert forces == pytest.approx([1.43, 5.76], **ROUNDED)
     for record in (cycle, back, quick, empty):
         # The joints are back where they were, but for gear friction over k_p.
         joints = [column(record, "q", joint) for joint in ("rail", "shoulder", "elbow")]

@@ -368,6 +368,10 @@ CHANGES: dict[tuple[str, str], dict[str, Any]] = {
         "plant.friction_N_m": 0.2,
         "plant.friction_N": 4,
         "controller.joints.rail.positions_m": [0.1, 0, 0.1],
+        "sensors.wrench": {"shoulder": {"body": "upper_arm"}},
+        "sensors.wrench.elbow.body": With("carriage", {"sensors.wrench.elbow.frame": None}),
+        "sensors.wrench.elbow.frame": None,
+        "sensors.wrench.elbow.point_m": [0.1, 0, 0],
     },
     ("snake_short", "circle"): {
         "plant.yaw_joints": With(8, ANY_SIZE),
@@ -446,7 +450,7 @@ CHANGES: dict[tuple[str, str], dict[str, Any]] = {
 # Keys that limit a run: a value at which it is refused or stops, and a part of the message.
 LIMITS: dict[tuple[str, str], dict[str, tuple[Any, str]]] = {
     ("sampled_arm", "encoders"): {
-        "controller.hand.tolerance_m": (1e-17, "the hand cannot follow its path"),
+        "controller.hand.tolerance_m": (1e-17, "out of reach"),
         "integrator.wall_limit_s": (1e-4, "integrator.wall_limit_s"),
         "record.size_limit_GB": (1e-6, "record.size_limit_GB"),
     },
