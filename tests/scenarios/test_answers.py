@@ -1,4 +1,4 @@
-"""The answers in the headers of scenarios: what each says about its variants is what they give."""
+"""The headers of scenarios state answers with numbers; the runs of their variants give these numbers."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_sampled_arm() -> None:
     assert currents["coarse"] / currents["ideal"] == pytest.approx(3.8, **ROUNDED)
     assert [hand_error_mm("sampled_arm", each) for each in currents] == pytest.approx([2.0] * 3, abs=0.2)
     assert energy("sampled_arm", "encoders") == pytest.approx(20.0, **ROUNDED)
-    # Beyond its stability the loop is at the limits of voltage.
+    # The unstable loop oscillates between the voltage limits.
     assert energy("sampled_arm", "late") > 15.0 * energy("sampled_arm", "encoders")
     assert any("unstable" in warning for warning in run("sampled_arm", "late").summary["warnings"])
     assert energy("sampled_arm", "servos") == pytest.approx(4.4, **ROUNDED)
@@ -65,7 +65,7 @@ def test_sampled_arm() -> None:
 
 @pytest.mark.long
 def test_sampled_arm_with_the_dense_solver() -> None:
-    """A program of its own. Steps are controlled by both solvers alike, so that only rounding differs."""
+    """Both solvers take the same steps, and only rounding differs. No other default test compiles this solver."""
     np.testing.assert_allclose(
         run("sampled_arm", "dense")["q"], run("sampled_arm", "encoders")["q"], rtol=0, atol=1e-11
     )
