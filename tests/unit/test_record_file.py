@@ -396,14 +396,15 @@ def load_all(folder: Path, contents: list[bytes], written: str = "telling") -> l
         (folder / f"{number}.h5").write_bytes(content)
     code = (
         "import sys; from dynsim.record import Record; from dynsim.errors import RecordError\n"
-        f"sys.path.insert(0, sys.argv[1]); from test_record_file import same, {written}\n"
-        "for number in range(int(sys.argv[2])):\n"
+        f"sys.path[:0] = sys.argv[2:]; from test_record_file import same, {written}\n"
+        "for number in range(int(sys.argv[1])):\n"
         f"    try: print('same' if same(Record.load(f'{{number}}.h5'), {written}()) else 'other', flush=True)\n"
         "    except RecordError as error:\n"
         "        print('refused' if str(error).startswith(f'{number}.h5: ') else repr(error), flush=True)\n"
         "    except BaseException as error: print(repr(error), flush=True)\n"
     )
-    arguments = [sys.executable, "-c", code, str(Path(__file__).parent), str(len(contents))]
+    folders = Path(__file__).parents[:2]
+    arguments = [sys.executable, "-c", code, str(len(contents)), *map(str, folders)]
     child = subprocess.run(arguments, cwd=folder, capture_output=True, text=True, check=False)
     assert child.returncode == 0, child.stderr
     return child.stdout.splitlines()
