@@ -273,7 +273,7 @@ main()
 """
 
 
-SUMMARY, SAVING = ("engine.summary", "module.summarise"), ("record", "module.Record.to_hdf5")
+SUMMARY, SAVING = ("engine.recording", "module.summarise"), ("record", "module.Record.to_hdf5")
 
 
 @pytest.mark.parametrize(
@@ -358,7 +358,7 @@ def test_what_described_older_records_goes_with_them(tmp_path: Path):
     assert subprocess.run([*command, "--set", "duration_s=0.02"], **options).returncode == 0
     out = tmp_path / "out"
     assert list(out.glob("compare_*.png"))
-    code = SIGNALLED.format(module="engine.summary", target="module.summarise", signal="SIGTERM")
+    code = SIGNALLED.format(module="engine.recording", target="module.summarise", signal="SIGTERM")
     again = [sys.executable, "-c", code, *command[3:], "--set", "duration_s=0.03"]
     assert subprocess.run(again, **options).returncode == 128 + signal.SIGTERM
     assert sorted(path.name for path in out.iterdir()) == ["elbow_4", "elbow_7", "no_elbow", "two_elbows"]

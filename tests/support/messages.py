@@ -23,7 +23,7 @@ PHRASES = {
     "interrupted": "interrupted at t",
     "late answers": "earlier requests",
     "no browser": "No browser",
-    "no forces": "carry the motion",
+    "no forces": "the motion needs forces",
     "no posture": "could be projected onto the hand path",
     "output failed": " failed: ",
     "pulls": "pulls on this brace",
