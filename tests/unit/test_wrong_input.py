@@ -238,11 +238,11 @@ def test_a_record_that_lacks_a_signal_is_drawn_without_or_refused(scenario: str,
 
 
 @pytest.mark.long  # draws dozens of figures
-def test_odd_provenance_of_records_is_no_traceback(tmp_path: Path, monkeypatch) -> None:
+def test_odd_provenance_of_records_is_tolerated_or_one_error(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(style, "save", lambda figure, path: path)
     record = dynsim.simulate(load_scenario("single_pendulum", overrides={"duration_s": 0.2, "metrics.settle_s": 0.0}))
     record.provenance = {"scenario": "x"}
-    # Titles do without a name.
+    # A title needs no name.
     assert figures.draw(record, tmp_path)
     assert figures.draw_comparison({"a": record}, tmp_path)
     snake = dynsim.simulate(load_scenario("snake_circle", overrides={"duration_s": 0.2, "record.rate_hz": 50}))
