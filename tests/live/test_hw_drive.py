@@ -348,7 +348,8 @@ def test_hw_stop_releases_a_robot_that_is_driven(drives: Callable[..., Drive], t
             client.drive({"y": 1.0}, 0.3)
             client.until("state", lambda state: state == "driving")
             stopped = dynsim("hw", "stop", "--port", device, "--map", table)
-            assert mentions(stopped.stdout + stopped.stderr, "6")
+            # 3: torque off was sent, but the drive received the answers of some servos.
+            assert stopped.returncode in (0, 3), stopped.stderr
             drive.ended(4)
         finally:
             virtual.kill()
