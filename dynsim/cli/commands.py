@@ -43,7 +43,11 @@ from dynsim.cli.tables import (
     console,
     errors,
     labelled,
+    print_choices,
+    print_comparison,
     print_line,
+    print_starts,
+    print_summary,
     print_written,
     progress,
     record_files,
@@ -101,8 +105,6 @@ def run(
         elif view:
             page = shown.draw()
     if not quiet:
-        from dynsim.cli.tables import print_summary
-
         print_summary(console, record.summary)
         print_written(folder)
     print_page(page, quiet)
@@ -169,8 +171,6 @@ def compare(
                 together = Figures(records, folder, format_, together=True)
                 page = draw_all([together, *wanted], Page(records, folder), quiet)
         if not quiet:
-            from dynsim.cli.tables import print_comparison
-
             print_comparison(console, {name: record.summary for name, record in records.items()})
             print_written(folder)
         if not no_figures:
@@ -197,7 +197,6 @@ def check(
     a path or surface), the gap of each contact, the joints that `initial.on_surface` moved, and the tip margin of a
     mobile base at rest.
     """
-    from dynsim.cli.tables import print_starts
     from dynsim.engine import check as check_scenario
     from dynsim.engine.compilation import watched
     from dynsim.scenario import load_scenario, variant_names
@@ -232,8 +231,6 @@ def check(
 @app.command("list", epilog="Example: dynsim list")
 def list_() -> None:
     """List shipped scenarios, plants, surfaces, controllers, paths and motors."""
-    from dynsim.cli.tables import print_choices
-
     print_choices(console)
     _warn_about_plugins()
 

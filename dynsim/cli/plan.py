@@ -17,7 +17,7 @@ from dynsim.cli.app import (
     VariantOption,
     parsed_overrides,
 )
-from dynsim.cli.tables import plan_progress, print_line, print_written
+from dynsim.cli.tables import plan_progress, print_line, print_plan, print_written
 from dynsim.errors import ScenarioError, UnreachableReference
 from dynsim.system.terminal import escaped
 
@@ -139,8 +139,6 @@ def plan(
         tell("writing", 0.98)
         save_plan(result, folder, figures=not no_figures, kind=format_.value)
     if not quiet:
-        from dynsim.cli.tables import print_plan
-
         print_plan(result)
         print_written(folder)
         if result.best is not None:

@@ -42,7 +42,9 @@ from dynsim.scenario.schema import Encoders
 HALVINGS = 6
 """Bisections of the velocity; each computes one stopping path."""
 ROUNDING = 1e-9
-"""Tolerance of joint rates and accelerations, relative to their limits; tolerance of sample arrival times [s]."""
+"""Tolerance of joint rates and accelerations, relative to their limits."""
+TIME_ROUNDING = 1e-9
+"""Tolerance of the times of samples [s]."""
 _GOVERNOR_STATE = ("target", "velocity", "joints", "rates", "hindrance", "_path")
 
 
@@ -455,7 +457,7 @@ class SampledSensor:
 
     def value(self, time: float) -> Array:
         """Return the last sample that has arrived at a time [s], (k,)."""
-        while len(self._samples) > 1 and self._samples[1][0] <= time + ROUNDING:
+        while len(self._samples) > 1 and self._samples[1][0] <= time + TIME_ROUNDING:
             self._before = self._samples.popleft()[1]
         return self._samples[0][1]
 
@@ -535,7 +537,7 @@ class EncodedCommands:
 
     def add_to(self, record: Record) -> None:
         """Add the measured joint positions, held from tick to tick."""
-        times = np.array([time for time, _ in self._measured]) - ROUNDING
+        times = np.array([time for time, _ in self._measured]) - TIME_ROUNDING
         rows = np.searchsorted(times, record.time, side="right") - 1
         # The run may have stopped before its first tick.
         readings = np.reshape([positions for _, positions in self._measured], (len(times), len(self._joints)))

@@ -313,15 +313,13 @@ class Record:
     @property
     def title(self) -> str:
         """Scenario and variant, or the robot of a measured run; "" if neither is known."""
-        scenario, robot = self.provenance.get("scenario"), self.provenance.get("robot")
-        names = [scenario.get("name"), scenario.get("variant")] if isinstance(scenario, Mapping) else []
+        names, robot = [self.scenario_name, self._scenario.get("variant")], self.provenance.get("robot")
         return " / ".join(str(name) for name in names if name) or (f"{robot}, measured" if robot else "")
 
     @property
     def scenario_name(self) -> str:
         """Name of the scenario; "" if unknown."""
-        scenario = self.provenance.get("scenario")
-        return str(scenario.get("name") or "") if isinstance(scenario, Mapping) else ""
+        return str(self._scenario.get("name") or "")
 
     @property
     def measured(self) -> bool:
@@ -331,9 +329,14 @@ class Record:
     @property
     def settle_time(self) -> float:
         """Time before which tracking errors do not count [s]; 0 if unknown."""
-        scenario = self.provenance.get("scenario")
-        metrics = scenario.get("metrics") if isinstance(scenario, Mapping) else None
+        metrics = self._scenario.get("metrics")
         return float(metrics.get("settle_s", 0.0)) if isinstance(metrics, Mapping) else 0.0
+
+    @property
+    def _scenario(self) -> Mapping[str, Any]:
+        """Scenario in the provenance; empty if unknown."""
+        scenario = self.provenance.get("scenario")
+        return scenario if isinstance(scenario, Mapping) else {}
 
     @property
     def units(self) -> dict[str, str]:

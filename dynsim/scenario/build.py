@@ -643,10 +643,6 @@ def require_scenario(scenario: object) -> None:
         raise ScenarioError(f"expected a Scenario, got {brief(scenario)}; load one with load_scenario(name or file)")
 
 
-# Kinds of sensors on links, which are also their keys in ``sensors:``.
-LINK_SENSORS = ("wrench",)
-
-
 class SensorMount(NamedTuple):
     """Location of a sensor: index of its link, and axes (3, 3) and point (3,) [m] of the sensor in the link's frame."""
 
@@ -664,11 +660,10 @@ def sensor_mounts(scenario: Scenario, robot: Robot) -> dict[str, dict[str, Senso
         If a body or frame does not exist, or the frame is not fixed to the body.
     """
     sensors = scenario.config.sensors
-    configs = {} if sensors is None else {kind: getattr(sensors, kind) or {} for kind in LINK_SENSORS}
     return {
         kind: {name: _mount(robot, config, ("sensors", kind, name)) for name, config in named.items()}
-        for kind, named in configs.items()
-        if named
+        for kind, named in sensors or ()
+        if isinstance(named, dict) and named  # sections of named sensors; the other keys are no sensors on links
     }
 
 

@@ -184,8 +184,6 @@ class DrawnContact:
     ----------
     point : Point
         Point of the scene.
-    friction : float
-        Coefficient of its friction cone, 0 if unknown.
     normal : (T, 3) ndarray
         Unit vectors into the free side.
     force : (T,) ndarray
@@ -199,7 +197,6 @@ class DrawnContact:
     """
 
     point: Point
-    friction: float
     normal: Array
     force: Array
     tangent: Array | None
@@ -229,7 +226,7 @@ def contacts(robot: DrawnRobot, rows: NDArray[np.intp] | slice = slice(None)) ->
         if "contact_force" in record:
             tangent = record["contact_force"][rows, k] - force[:, None] * normal
         shaped = TOUCHING in record and point.name in record.labels[TOUCHING]
-        result.append(DrawnContact(point, point.friction, normal, force, tangent, mode, at if shaped else None))
+        result.append(DrawnContact(point, normal, force, tangent, mode, at if shaped else None))
     return result
 
 

@@ -245,7 +245,7 @@ def _contacts(robot: DrawnRobot, blocks: Blocks) -> list[dict[str, Any]]:
             "surface": point.surface,
             "body": point.body,
             "p": list(point.position),
-            "friction": contact.friction,
+            "friction": contact.point.friction,
             "normal": blocks.add(contact.normal),
             "force": blocks.add(contact.force),
         }
