@@ -13,10 +13,10 @@ NAME = "dynsim/commit.txt"
 
 
 class CommitHook(BuildHookInterface[Any]):
-    """Writes ``dynsim/commit.txt`` into wheels and source distributions, not into the checkout."""
+    """Hook that writes ``dynsim/commit.txt`` into wheels and source distributions, not into the checkout."""
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
-        """See hatchling; an editable install reads the checkout's own commit."""
+        """Add the file to the build (see hatchling); an editable install reads the commit of the checkout."""
         root = Path(self.root)
         if version == "editable" or (root / NAME).is_file():
             return  # the source distribution that is built from already contains it
@@ -28,6 +28,6 @@ class CommitHook(BuildHookInterface[Any]):
             build_data["force_include"][str(file)] = NAME
 
     def finalize(self, version: str, build_data: dict[str, Any], artifact_path: str) -> None:
-        """Remove what the build needed."""
+        """Remove the temporary file of the build."""
         if hasattr(self, "_folder"):
             self._folder.cleanup()

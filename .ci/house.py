@@ -17,7 +17,7 @@ LAYOUT = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, toke
 
 
 def code_lines(source: str) -> int:
-    """Lines without blank ones, comments and docstrings."""
+    """Return the number of lines without blank lines, comments and docstrings."""
     lines: set[int] = set()
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
         if token.type not in LAYOUT:
@@ -32,7 +32,7 @@ def code_lines(source: str) -> int:
 
 
 def imports(modules: dict[str, Path]) -> dict[str, set[str]]:
-    """Modules of the package that each one imports, within functions and for types too."""
+    """Return the modules of the package that each module imports, also within functions and for types."""
     imported: dict[str, set[str]] = {name: set() for name in modules}
     for name, path in modules.items():
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
@@ -48,7 +48,7 @@ def imports(modules: dict[str, Path]) -> dict[str, set[str]]:
 
 
 def circles(graph: dict[str, set[str]]) -> list[list[str]]:
-    """Strongly connected components of more than one module, by reachability."""
+    """Return the strongly connected components of more than one module, by reachability."""
     reached: dict[str, set[str]] = {}
     for start in graph:
         seen, waiting = set[str](), [start]
@@ -62,7 +62,7 @@ def circles(graph: dict[str, set[str]]) -> list[list[str]]:
 
 
 def main() -> int:
-    """Print the sizes; return 1 beyond a limit, or if modules import each other in a circle or upwards."""
+    """Print the sizes; return 1 beyond a limit, or if there are import cycles or upward imports."""
     modules = {
         ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
         for path in sorted(PACKAGE.rglob("*.py"))

@@ -1,12 +1,12 @@
-"""The numbers of README.md and docs/, written from what the studies measured: ``python .ci/pages.py``.
+"""Write the numbers of README.md and docs/ from the results of the studies: ``python .ci/pages.py``.
 
-In a page a number of a sentence stands before ``<!-- = NAME -->``, NAME being a key of :data:`NUMBERS`; a table stands
-between ``<!-- table: NAME -->`` and ``<!-- end -->``, NAME being that of a function here. Both are made of the JSON
-files in results/, which say which version made them; results/README.md has the commands. ``--check`` changes nothing
-and ends with 1 where a page is stale (tests/unit/test_pages.py).
+In a page, ``<!-- = NAME -->`` follows a number in a sentence, and NAME is a key of :data:`NUMBERS`; a table is between
+``<!-- table: NAME -->`` and ``<!-- end -->``, and NAME is a function in this file. Both come from the JSON files in
+results/, which contain the version of dynsim that made them; results/README.md has the commands. ``--check`` changes
+nothing and exits with 1 if a page is stale (tests/unit/test_pages.py).
 
-Times are those of the last ``PYTHONPATH=tests python -m studies.bench`` and ``… -m studies.start_up``; other numbers
-are the same on every machine, to the digits shown.
+Times come from the last ``PYTHONPATH=tests python -m studies.bench`` and ``… -m studies.start_up``; other numbers are
+the same on every machine, to the digits shown.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def overturning() -> Any:
 
 
 def number(value: float | None, digits: int = 4) -> str:
-    """With so many digits, without an exponent; 0 where it is zero."""
+    """Return a value with ``digits`` significant digits and no exponent; 0 for zero."""
     if not value:
         return NONE if value is None else "0"
     places = max(0, digits - 1 - math.floor(math.log10(abs(value))))
@@ -98,7 +98,7 @@ def number(value: float | None, digits: int = 4) -> str:
 
 
 def small(value: float | None, digits: int = 1) -> str:
-    """As in 3.0e-10."""
+    """Return a value as in 3.0e-10."""
     if value is None:
         return NONE
     mantissa, _, power = f"{value:.{digits}e}".partition("e")
@@ -119,7 +119,7 @@ def grouped(value: int) -> str:
 
 
 def lines(heads: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1) -> str:
-    """A table of Markdown with the first columns to the left, the others to the right."""
+    """Return a Markdown table with the first ``left`` columns left-aligned and the others right-aligned."""
     return ruled(heads, ["---"] * left + ["---:"] * (len(heads) - left), rows)
 
 
@@ -273,7 +273,7 @@ def _demand(value: float | None) -> str:
 
 
 def _spans(spans: list[list[float]]) -> str:
-    """Milliseconds, to the sample; what lasts to the end of the fine run goes on."""
+    """Return spans in milliseconds, to the sample; a span that lasts to the end of the fine run has no end."""
     first = f"{1e3 * spans[0][0] - 0.05:.1f}–{1e3 * spans[0][1]:.1f}"
     return first + (f", and from {1e3 * spans[1][0]:.0f} on" if len(spans) > 1 else "")
 
@@ -364,7 +364,7 @@ def right_hand_side() -> str:
 
 
 def by_links() -> tuple[list[int], dict[tuple[int, str], float]]:
-    """Numbers of links, and microseconds of a right-hand side by them and program."""
+    """Return the numbers of links, and microseconds of a right-hand side by number of links and program."""
     times = {(row["links"], row["program"]): row["median_us"] for row in bench()["right_hand_side"]}
     return list(dict.fromkeys(n for n, _ in times)), times
 
@@ -425,7 +425,7 @@ def precision() -> str:
 
 
 def _error(value: float) -> str:
-    # A block that rests is off by rounding.
+    # The error of a block at rest is rounding.
     return small(value, 0) if value > 1e-15 else "0"
 
 
@@ -437,25 +437,25 @@ def sweeps() -> str:
 
 @cache
 def swept(name: str) -> dict[tuple[str, float], dict[str, str]]:
-    """Rows of a sweep over one key, by variant and value."""
+    """Return the rows of a sweep over one key, by variant and value."""
     rows = table_of(f"sweeps/{name}/sweep.csv")
     key = list(rows[0])[2]
     return {(row["variant"], float(row[key])): row for row in rows}
 
 
 def over_friction(variant: str, column: str, which: Callable[[list[float]], float]) -> float:
-    """Least or largest number of a configuration over all frictions."""
+    """Return the minimum or maximum (``which``) of a number of a configuration over all frictions."""
     return which([float(row[column]) for (name, _), row in swept("friction").items() if name == variant])
 
 
 def energy_share(friction: float) -> str:
-    """Energy of the arm on two elbows over that of the free one [%]."""
+    """Return the energy of the arm on two elbows relative to the free arm [%]."""
     two, free = (float(swept("friction")[name, friction]["electrical_energy_J"]) for name in ("two_elbows", "no_elbow"))
     return fixed(100 * two / free, 1)
 
 
 def voltage_needed(*variants: str) -> int:
-    """Least whole voltage from which on the hand is off by at most 2 % more than at 24 V."""
+    """Return the lowest integer voltage from which on the hand error is at most 2 % larger than at 24 V."""
     error = {point: float(row["hand_error_rms_m"]) for point, row in swept("voltage").items() if point[0] in variants}
     enough = {(name, volt) for (name, volt), off in error.items() if off <= 1.02 * error[name, 24.0]}
     return min(
@@ -464,13 +464,13 @@ def voltage_needed(*variants: str) -> int:
 
 
 def of_masses(number: str, key: str, scale: float = 1.0) -> float:
-    """Statistics of a number of the summary over random masses of links."""
+    """Return a statistic of a number of the summary over random masses of links."""
     statistics = data("sweeps/tolerance/statistics.json")[0]["numbers"][number]
     return scale * float(statistics["mean_high"] - statistics["mean"] if key == "interval" else statistics[key])
 
 
 def last_link_effect() -> float:
-    """What one standard deviation of the last link's mass does, which is the most that any link does [J]."""
+    """Return the effect of one standard deviation of the last link's mass, the largest effect of any link [J]."""
     effect: dict[str, float] = data("sweeps/tolerance/statistics.json")[0]["numbers"]["electrical_energy_J"]["effect"]
     largest = max(effect, key=lambda key: abs(effect[key]))
     assert largest == "plant.chain.9.mass_kg", largest
@@ -492,13 +492,13 @@ def snake_bench() -> str:
 
 
 def of_snake(key: str, k: int) -> float:
-    """Of program k over that of dynsim, which is the first."""
+    """Return the ratio of a number of program k to the number of dynsim, which is the first program."""
     own, peer = bench()["snake"][0], bench()["snake"][k]
     return float(peer[key] / own[key])
 
 
 def between_snakes(k: int, coordinate: int) -> float:
-    """Rms of what displacements of the head differ by, of program k from dynsim's."""
+    """Return the rms difference of the head displacements between program k and dynsim."""
     own, peer = (bench()["snake"][n]["displacements"] for n in (0, k))
     return math.hypot(*(a[coordinate] - b[coordinate] for a, b in zip(own, peer, strict=True))) / math.sqrt(len(own))
 
@@ -514,7 +514,7 @@ def comparison() -> str:
 
 
 def combinations() -> str:
-    """Which contact laws and methods support a feature that not all of them support, and why."""
+    """Return the contact laws and methods that support each feature that not all of them support, and why."""
 
     def supported(names: tuple[str, ...], all_of_them: tuple[str, ...]) -> str:
         return "all" if names == all_of_them else ", ".join(f"`{name}`" for name in names)
@@ -531,28 +531,28 @@ def faults() -> str:
 
 
 def planned_sizes(file: str) -> dict[int, float]:
-    """Heat of the published arm by number of braces [W]."""
+    """Return the heat of the published arm by number of braces [W]."""
     return {size["count"]: size["heat_W"] for size in data(f"planner/{file}.json")}
 
 
 def planned_heat(count: int) -> str:
-    """Of the published arm with so many braces [W]."""
+    """Return the heat of the published arm with ``count`` braces [W]."""
     return fixed(planned_sizes("published")[count], 2)
 
 
 def planned_saving(count: int) -> str:
-    """What a brace more saves of the heat of the published arm with one less [%]."""
+    """Return the share of the heat of the published arm with ``count`` − 1 braces that one more brace saves [%]."""
     heat = planned_sizes("published")
     return fixed(100.0 * (1.0 - heat[count] / heat[count - 1]), 0)
 
 
 def posture_heat(friction: float) -> float:
-    """Least heat of the published posture at rest, with both elbows pressed [W]."""
+    """Return the least heat of the published posture at rest, with both elbows pressed [W]."""
     return next(row["heat_W"] for row in data("planner/posture.json") if row["friction"] == friction)
 
 
 def planned_arm() -> str:
-    """The published arm: braces with friction and without."""
+    """Return the plans of the published arm, for braces with friction and without."""
     rows = []
     for friction, file in (("0.1", "published"), ("0", "frictionless")):
         for size in data(f"planner/{file}.json"):
@@ -568,7 +568,7 @@ def planned_arm() -> str:
 
 
 def beside_best_known(scene: dict[str, Any]) -> dict[int, float]:
-    """By number of braces, the least heat that a search has found over the least that is known of the scene."""
+    """Return the least heat found by a search over the least known heat of the scene, by number of braces."""
     long = next(entry for entry in data("planner/reference.json") if entry["seed"] == scene["seed"])
     known = {size["count"]: size["heat_W"] for size in long["sizes"]}
     ratios = {}
@@ -580,14 +580,14 @@ def beside_best_known(scene: dict[str, Any]) -> dict[int, float]:
 
 
 def best_beside_best_known(scene: dict[str, Any], known: str = "heat_W") -> float:
-    """The same of the best number of braces of each; ``searched_W``: over what the long search has found."""
+    """Return the same ratio for the best number of braces; ``searched_W``: over the result of the long search."""
     long = next(entry for entry in data("planner/reference.json") if entry["seed"] == scene["seed"])
     own = min(size["least_W"] for size in scene["sizes"] if size["least_W"] is not None)
     return float(own / min(own, *(size[known] for size in long["sizes"] if size[known] is not None)))
 
 
 def planned_share(limit: float, each: bool = False, known: str = "heat_W") -> str:
-    """How many scenes, or numbers of braces of each, are within a ratio of the best known."""
+    """Return how many scenes, or numbers of braces of each scene, are within a ratio of the best known heat."""
     scenes = data("planner/scenes.json")
     if each:
         ratios = [ratio for scene in scenes for ratio in beside_best_known(scene).values()]
@@ -597,24 +597,24 @@ def planned_share(limit: float, each: bool = False, known: str = "heat_W") -> st
 
 
 def planned_answers() -> list[dict[str, Any]]:
-    """The best answer of each scene."""
+    """Return the best answer of each scene."""
     scenes = data("planner/scenes.json")
     return [size for scene in scenes for size in scene["sizes"] if size["count"] == scene["best"]]
 
 
 def planned_change(other: str) -> float:
-    """Greatest change of the heat of the best answers to another number [%]."""
+    """Return the largest change from the heat of the best answers to another of their numbers [%]."""
     sizes = [size for size in planned_answers() if size[other] is not None]
     return max(100.0 * abs(size[other] / size["heat_W"] - 1.0) for size in sizes)
 
 
 def planned_nominal() -> list[float]:
-    """Heat of the runs as planned of the best answers over the planned heat."""
+    """Return the simulated heat of the best answers, run as planned, over the planned heat."""
     return [size["simulated_W"] / size["heat_W"] for size in planned_answers()]
 
 
 def planned_gains() -> str:
-    """What plans cost on surfaces that are 5 mm off, by gain."""
+    """Return the cost of plans on surfaces displaced by 5 mm, by gain."""
     rows = []
     for row in data("planner/gains.json"):
         arm = "published" if row["scene"].startswith("pressing") else row["scene"].replace("_", " ")
@@ -629,7 +629,7 @@ def planned_gains() -> str:
 
 
 def planned_scenes() -> str:
-    """Scenes of the planner: the answer of each."""
+    """Return the answer of each scene of the planner."""
     rows = []
     for scene in data("planner/scenes.json"):
         free = scene["sizes"][0]["heat_W"]
@@ -650,7 +650,7 @@ def planned_scenes() -> str:
 
 
 def snake_table_iii() -> str:
-    """Table III of the paper on the snake, and the same simulated."""
+    """Return Table III of the paper on the snake, with the simulated values."""
     shown = ("paper_mean", "paper_sd", "kinematic", "dynamic", "measured")
     heads = ["moved", "quantity", "[T] mean", "[T] SD", "kinematic", "dynamic", "measured"]
     rows = [
@@ -662,7 +662,7 @@ def snake_table_iii() -> str:
 
 
 def snake_pushes(file: str) -> str:
-    """Table IV or V of the paper on the snake, and the same simulated."""
+    """Return Table IV or V of the paper on the snake, with the simulated values."""
     heads = ("posture", "direction", "[T] mean [N]", "[T] SD [N]", "simulated [N]", "target in the plate [mm]")
     rows = [
         (
@@ -687,12 +687,12 @@ def steps() -> Any:
 
 
 def observed(key: str) -> Any:
-    """A part of what the dynamic snake was observed to do."""
+    """Return one of the observations of the dynamic snake."""
     return data("snake/observations.json")[key]
 
 
 def snake_tasks() -> str:
-    """What came of each task, by level; forces and torques of the gripper, and energy, on the dynamic one."""
+    """Return the result of each task by level; gripper forces and torques, and energy, at the dynamic level."""
     runs = data("snake/tasks.json")["runs"]
     lines = [
         "| task | kinematic | dynamic | gripper, largest | supplied |",
@@ -710,23 +710,23 @@ def snake_tasks() -> str:
 
 
 def converged(key: str) -> float:
-    """Largest error of the head with measured feedback, of both runs."""
+    """Return the largest error of the head with measured feedback, over both runs."""
     return max(run[key] for run in observed("measured_feedback").values())
 
 
 def wheel_heights(which: int) -> list[float]:
-    """Heights of the lower (0) or the higher (1) wheel of all lifted pairs [mm]."""
+    """Return the heights of the lower (0) or the higher (1) wheel of all lifted pairs [mm]."""
     return [pair[which] for pair in observed("lifted_wheels_mm").values()]
 
 
 def end_value_mm(moved: str, column: int) -> float:
-    """Where the head ends by the shortest step, of a manoeuvre of Table III."""
+    """Return the displacement of the head with the shortest step, in a manoeuvre of Table III [mm]."""
     return 1e3 * steps()["end_values"][moved][0][column]
 
 
 @cache
 def bases() -> dict[tuple[float, float, float], dict[str, tuple[bool, float]]]:
-    """Of each base of the sweep (mass, track, caster), by variant: whether it stands, and its settled tip margin."""
+    """Return whether each base (mass, track, caster) of the sweep stands, and its settled tip margin, by variant."""
     outcomes: dict[tuple[float, float, float], dict[str, tuple[bool, float]]] = {}
     for row in table_of("overturning/sweep.csv"):
         base = float(row["mass_kg"]), float(row["track_m"]), float(row["caster_m"])
@@ -740,9 +740,9 @@ def standing(variant: str) -> int:
 
 
 def least_standing(variant: str, axis: int, **fixed_at: float) -> tuple[float, float]:
-    """Along one axis of the sweep: the largest value at which the base falls, and the next, at which it stands.
+    """Return the largest value along an axis of the sweep at which the base falls, and the next, at which it stands.
 
-    ``fixed_at`` : the other two, by name
+    ``fixed_at`` : values of the other two axes
     """
     names = ("mass", "track", "caster")
     line = {
@@ -763,7 +763,7 @@ def lifted_wheels() -> Any:
 
 
 def of_kinematic(name: str, variant: str = "") -> dict[str, Any]:
-    """A run of the kinematic snake in numbers."""
+    """Return the numbers of a run of the kinematic snake."""
     numbers: dict[str, Any] = kinematic()["runs"][name][variant]
     return numbers
 
@@ -773,7 +773,7 @@ def both(run: dict[str, Any], first: str, second: str) -> str:
 
 
 def snake_positioning() -> str:
-    """What is left of the way in each direction, beside what the paper measured."""
+    """Return the remaining error in each direction, next to the error measured in the paper."""
     symbols = {"alpha": "α", "beta": "β", "gamma": "γ"}
     rows = [
         (
@@ -790,7 +790,7 @@ def snake_positioning() -> str:
 
 
 def snake_limits() -> str:
-    """Policies of modes and limits, and the costs."""
+    """Return the results for each policy of modes and limits, and for each cost."""
     rows = [
         (
             f"`{variant}`",
@@ -806,7 +806,7 @@ def snake_limits() -> str:
 
 
 def snake_ways() -> str:
-    """Forward and backward: how long the target waited."""
+    """Return how long the target waited, forward and backward."""
     rows = []
     for name in ("snake_circle", "snake_circle_backward", "snake_door_arc"):
         for variant, run in kinematic()["runs"][name].items():
@@ -817,7 +817,7 @@ def snake_ways() -> str:
 
 
 def snake_circles() -> str:
-    """The circle backward with less time or another least margin."""
+    """Return the results of the circle backward with less time or another least margin."""
     rows = [
         (f"{circle['path_s']:g} s", f"{1e3 * circle['least_margin_m']:g} mm", f"{fixed(abs(circle['turned_deg']), 1)}°")
         for circle in kinematic()["circles"]
@@ -826,7 +826,7 @@ def snake_circles() -> str:
 
 
 def snake_order() -> str:
-    """In which order the joints of the base come below half of their first angle."""
+    """Return the order in which the joints of the base fall below half of their initial angle."""
     rows = []
     for entry in kinematic()["order"]:
         times = sorted((time, name) for name, time in entry["halved_s"].items() if time is not None)
@@ -836,7 +836,7 @@ def snake_order() -> str:
 
 
 def snake_areas() -> str:
-    """Support area and straightness that the costs lead to."""
+    """Return the support area and straightness to which each cost leads."""
     names = {"cyclic": "eq 19", "eq20": "eq 20 as printed", "eq20_min": "1/min d"}
     rows = []
     for variant, title in names.items():
@@ -846,7 +846,7 @@ def snake_areas() -> str:
 
 
 def snake_on_servos() -> str:
-    """What the check before a replay says of the kinematic records, with the shipped map and with a wider one."""
+    """Return the result of the check before a replay for each kinematic record, with the shipped and a wider map."""
     rows: dict[tuple[str, ...], list[str]] = {}
     for name, variants in kinematic()["servos"].items():
         for variant, said in variants.items():
@@ -857,7 +857,7 @@ def snake_on_servos() -> str:
 
 
 def reason(refusal: str) -> str:
-    """In short why a replay is refused."""
+    """Return a short reason why a replay is refused."""
     if not refusal:
         return "passes"
     first, *entries = refusal.splitlines()
@@ -870,23 +870,23 @@ def reason(refusal: str) -> str:
 
 
 def backward_circle() -> dict[str, Any]:
-    """The circle backward that is completed."""
+    """Return the numbers of the circle backward that is completed."""
     return of_kinematic("snake_circle_backward")
 
 
 def turned(name: str, variant: str, digits: int = 1) -> str:
-    """Yaw of the head from start to end [deg]."""
+    """Return the yaw of the head from start to end [deg]."""
     return fixed(abs(of_kinematic(name, variant)["turned_deg"]), digits)
 
 
 def fall_order(theta: str) -> str:
-    """By what half the step divides the error of the falling head, of two halvings."""
+    """Return the factor by which halving the step reduces the error of the falling head, from two halvings."""
     coarse, _, fine = steps()["fall_errors_m"][theta]
     return fixed(math.sqrt(coarse / fine), 1)
 
 
 def sag_error(quantity: str) -> float:
-    """Root mean square of what the dynamic snake is off the paper in a quantity, over the six manoeuvres."""
+    """Return the rms deviation of the dynamic snake from the paper in a quantity, over the six manoeuvres."""
     off = [
         float(row["dynamic"]) - float(row["paper_mean"])
         for row in table_of("snake/table_iii.csv")
@@ -966,34 +966,34 @@ def event(variant: str, kind: str, which: int = 0) -> float:
 
 
 def stuck(which: int) -> float:
-    """How long elbow 7 does not move, with both elbows on a real floor [s]."""
+    """Return how long elbow 7 does not move, with both elbows on a real floor [s]."""
     starts = [event("two_elbows", "slip_start", k) for k in (1, 2)]
     return starts[which] - event("two_elbows", "slip_stop", which)
 
 
 def brush() -> dict[str, Any]:
-    """The run of an arm without elbows whose links may touch."""
+    """Return the run of an arm without elbows whose links may touch."""
     numbers: dict[str, Any] = contact()["elbow_comparison_links"]["no_elbow"]
     return numbers
 
 
 def of_each(key: str) -> list[float]:
-    """A number of the four configurations."""
+    """Return a number of each of the four configurations."""
     return [float(summary[key]) for summary in validation()["elbows"].values()]
 
 
 def at_the_start(key: str) -> float:
-    """Of the glued elbows, and when they pull."""
+    """Return a number of the forces on the glued elbows at the start."""
     return float(validation()["forces_with_two_elbows"][key])
 
 
 def apart(which: str, key: str) -> float:
-    """How far two runs differ."""
+    """Return the difference between two runs."""
     return float(validation()["differences"][which][key])
 
 
 def assumed(case: str) -> dict[str, float]:
-    """Two elbows with one assumption changed."""
+    """Return the results of two elbows with one assumption changed."""
     numbers: dict[str, float] = data("reference/assumptions.json")["cases"][case]["two_elbows"]
     return numbers
 
@@ -1003,7 +1003,7 @@ def dissipative_energy() -> float:
 
 
 def on_floor(first: str, second: str, key: str) -> float:
-    """Ratio of two configurations on a real floor."""
+    """Return the ratio of two configurations on a real floor."""
     return float(contact()["elbow_comparison_floor"][first][key] / contact()["elbow_comparison_floor"][second][key])
 
 
@@ -1012,7 +1012,7 @@ def real_less_glued(variant: str, key: str) -> float:
 
 
 def longest_below_zero_ms() -> float:
-    """How long the tip margin of a base that is braced is below zero at the start."""
+    """Return the longest time for which the tip margin of a braced base is below zero at the start [ms]."""
     spans = [
         summary["margin_below_zero_s"][0]
         for variant, summary in overturning()["mobile_elbow_comparison"].items()
@@ -1022,7 +1022,7 @@ def longest_below_zero_ms() -> float:
 
 
 def explicit_over_implicit() -> list[float]:
-    """Time of dopri5 over that of radau5 at each tolerance, for the published arm."""
+    """Return the time of dopri5 over the time of radau5 at each tolerance, for the published arm."""
     time = {
         (row["method"], row["rtol"]): row["cpu_minimum_s"]
         for row in bench()["precision"]
@@ -1032,7 +1032,7 @@ def explicit_over_implicit() -> list[float]:
 
 
 def battery(column: str) -> list[float]:
-    """What the dynamic snake draws, by manoeuvre."""
+    """Return a column of the energy table of the dynamic snake, by manoeuvre."""
     return [float(row[column]) for row in table_of("snake/energy.csv")]
 
 
@@ -1295,19 +1295,19 @@ NUMBERS |= {
 
 
 def written(page: str) -> str:
-    """A page with its numbers as they are now.
+    """Return a page with its present numbers.
 
     Raises
     ------
     KeyError
-        It has a mark of a number or table that is not known.
+        If the page has a mark of an unknown number or table.
     """
     page = TABLE.sub(lambda match: f"{match[1]}{match[2]}{TABLES[match[1]]()}", page)
     return NUMBER.sub(lambda match: NUMBERS[match[1]](), page)
 
 
 def stale() -> dict[str, list[str]]:
-    """Lines that should be otherwise, by page, as they should be."""
+    """Return the correct lines of each stale page that the page does not contain."""
     changed = {}
     for path in PAGES:
         before = path.read_text(encoding="utf-8")

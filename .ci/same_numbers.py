@@ -1,6 +1,6 @@
 """Comparison of two result folders, bit for bit: ``python .ci/same_numbers.py FIRST SECOND``.
 
-Every signal of every record, and every summary but its wall times.
+Compares every signal of every record, and every summary except its wall times.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ TIMINGS = ("integration_wall_s", "real_time_factor")
 
 
 def differences(first: Path, second: Path) -> list[str]:
-    """Signals and keys of the summary in which two records differ."""
+    """Return the signals and keys of the summary in which two records differ."""
     a, b = Record.load(first), Record.load(second)
     unequal = [f"signals {sorted(set(a) ^ set(b))} are in one only"] if set(a) != set(b) else []
     if a.time.tobytes() != b.time.tobytes():
@@ -25,7 +25,7 @@ def differences(first: Path, second: Path) -> list[str]:
 
 
 def main(first: Path, second: Path) -> int:
-    """Print the differences; 1 if there are any, or if there is nothing to compare."""
+    """Print the differences; return 1 if there are any, or if there is nothing to compare."""
     records = [path.relative_to(first) for path in sorted(first.rglob("record.h5"))]
     missing = {path.relative_to(second) for path in second.rglob("record.h5")} ^ set(records)
     unequal = {record: differences(first / record, second / record) for record in records if record not in missing}

@@ -1,8 +1,9 @@
 """Words of docs, docstrings, comments, messages and help that a native reader would stumble over, against limits.
 
 `python .ci/words.py` compares every folder with its limits: messages, help and public docstrings, and the first pages,
-may have 1.5 such places per 1000 words; comments and private docstrings 5; all other texts as many as in words.txt,
-which `--update` lowers. `--list PATH…` prints the places. The patterns find about half of what a reader finds.
+may have 1.5 such places per 1000 words; comments and private docstrings 5; all other texts the number that words.txt
+lists and `--update` lowers. `--list PATH…` prints the places. The patterns find about half of the places that a reader
+would find.
 """
 
 from __future__ import annotations

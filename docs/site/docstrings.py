@@ -13,7 +13,7 @@ _ROLE = re.compile(r":\w+:`~?(?:[\w.]+\.)?([\w ]+)`")
 
 
 class Plain(griffe.Extension):
-    """Converts roles to names, and sessions before the first section to code; griffe reads the sections of numpydoc."""
+    """Extension that converts roles to names, and sessions before the first section to code; griffe reads sections."""
 
     def on_object(self, *, obj: griffe.Object, **kwargs: Any) -> None:
         """Convert the docstring of one object."""

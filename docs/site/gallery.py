@@ -1,7 +1,7 @@
 """Films, tables and viewer pages of shipped scenarios: ``python docs/site/gallery.py [--short] [SCENARIO…]``.
 
-Writes to build/gallery/NAME, from where the site takes them; what is there already is kept. ``--short``: a still
-instead of a film, of the first variant and its first second alone, for checks.
+Writes to build/gallery/NAME, where the site finds them; existing results are kept. ``--short``: a still instead of a
+film, of only the first second of the first variant, for checks.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ MOST = 6
 
 
 def build(name: str, short: bool) -> None:
-    """Run a scenario, all its variants unless it is to be short; keep its page, its table and a film."""
+    """Run all variants of a scenario, or only the first if ``short``; save its page, its table and a film."""
     folder = BUILT / name
     if (folder / TABLE).exists() and (short or (folder / FILM).exists()):
         return
@@ -49,7 +49,7 @@ def build(name: str, short: bool) -> None:
         if not short:
             dynsim.film.write(filmed, folder / FILM, size=SIZE, fps=FPS)
         dynsim.view.write(records, folder / VIEW)
-    except RecordError as error:  # nothing to be seen, or a film that is too long
+    except RecordError as error:  # nothing to show, or a film that is too long
         print(f"{name}: {error}")
     (folder / TABLE).write_text(text.getvalue(), encoding="utf-8")
 
@@ -60,14 +60,14 @@ def _run(name: str, variant: str | None, short: bool) -> dynsim.Record:
         scenario = dynsim.load_scenario(name, variant, {"duration_s": SHORT_S})
     try:
         return dynsim.simulate(scenario)
-    except SimulationStopped as stop:  # as one that shows how it tips over
+    except SimulationStopped as stop:  # as in a scenario that shows how a base tips over
         if stop.record is None:
             raise
         return stop.record
 
 
 def page() -> str:
-    """The page of the gallery, with what has been built."""
+    """Return the page of the gallery, with the results built so far."""
     parts = [
         "# Gallery\n\nEvery shipped scenario, with the command that runs it. The table has what a run gives, and what "
         "it takes: the time of the integration, without the start of the program. Films, tables and pages that turn in "

@@ -17,7 +17,7 @@ sys.path[:0] = [str(ROOT), str(SITE)]
 import gallery  # noqa: E402
 import reference  # noqa: E402
 
-# Pages of the repository's root, and where they are on the site.
+# Pages in the root of the repository, and their places on the site.
 OUTSIDE = {
     "CHANGELOG.md": "dev/changelog.md",
     "CONTRIBUTING.md": "dev/contributing.md",
@@ -25,8 +25,8 @@ OUTSIDE = {
 }
 WORKER = "iframe-worker.js"
 _EQUATION = re.compile(r"^```math\n(.*?)^```$", flags=re.MULTILINE | re.DOTALL)
-# A symbol of one letter with an index. The first alternatives match what must not change: code, headings, link targets,
-# HTML tags.
+# A symbol of one letter with an index. The first alternatives match text that must not change: code, headings, link
+# targets, HTML tags.
 _INDEX = re.compile(
     r"(?P<kept>^```.*?^```$|^ {4}.*?$|^#.*?$|`[^`]*`|\]\([^)]*\)|<[a-z!/][^>]*>)"
     r"|(?<![\w-])(?P<letter>[^\W\d_][\u0300-\u036f]*)_(?P<index>[^\W_]{1,8})(?![\w*_])",
@@ -37,7 +37,7 @@ _PICTURE = re.compile(r"\]\((?:\.\./)*(results/[\w/.-]+\.(?:png|gif))\)")
 
 
 def on_files(files: Files, config: Any) -> Files:
-    """Add what is generated, and what pages show of the repository."""
+    """Add generated files, and files of the repository that pages show."""
     files.append(File.generated(config, "reference/scenario-keys.md", content=reference.scenario_page()))
     files.append(File.generated(config, "reference/servo-map-keys.md", content=reference.servo_map_page()))
     files.append(File.generated(config, "reference/commands.md", content=reference.cli_page()))
@@ -56,7 +56,7 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str:
-    """Equations as MathML, which browsers typeset themselves; links to files of the repository as links of the site."""
+    """Convert equations to MathML, which browsers typeset, and links to repository files to links of the site."""
     markdown = _EQUATION.sub(_typeset, markdown)
     markdown = _INDEX.sub(lambda match: match["kept"] or f"{match['letter']}<sub>{match['index']}</sub>", markdown)
     up = "../" * page.file.src_uri.count("/")

@@ -1,4 +1,4 @@
-"""Pages of the reference that are generated: keys of files from their schemas, commands from the application."""
+"""Generated pages of the reference: keys of files from their schemas, commands from the application."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ the schema for editors.
 
 
 def scenario_page() -> str:
-    """The page on the keys of scenarios."""
+    """Return the page on the keys of scenarios."""
     from dynsim.scenario import ScenarioConfig
 
     return _page(SCENARIO_INTRODUCTION, ScenarioConfig.model_json_schema())
 
 
 def servo_map_page() -> str:
-    """The page on the keys of servo maps."""
+    """Return the page on the keys of servo maps."""
     from dynsim.hardware.servo_map import json_schema
 
     return _page(SERVO_MAP_INTRODUCTION, json_schema())
@@ -51,7 +51,7 @@ def _page(introduction: str, schema: Schema) -> str:
 
 
 def _title(name: str) -> str:
-    """Heading of a definition: that of a member is its family and type."""
+    """Return the heading of a definition; for a member, its family and type."""
     member = re.fullmatch(r"dynsim__library__(\w+?)__(\w+)__Config", name)
     if member:
         return f"{member[1].replace('_', ' ').rstrip('s').capitalize()} {member[2]}"
@@ -59,7 +59,7 @@ def _title(name: str) -> str:
 
 
 def _keys(schema: Schema, named: dict[str, str]) -> str:
-    """The table of an object's keys; what a definition is that is no object."""
+    """Return the table of the keys of an object, or the type of a definition that is not an object."""
     if "properties" not in schema:
         return f"{_kind(schema, named)}\n"
     required = schema.get("required", ())
@@ -86,7 +86,7 @@ def _default(value: Schema) -> str:
 
 
 def _kind(value: Schema, named: dict[str, str]) -> str:
-    """Type and bounds of a value, with links to definitions."""
+    """Return type and bounds of a value, with links to definitions."""
     if "$ref" in value:
         title = named[value["$ref"].rsplit("/", 1)[1]]
         return f"[{title}](#{title.lower().replace(' ', '-')})"
@@ -115,18 +115,18 @@ def _kind(value: Schema, named: dict[str, str]) -> str:
 
 
 def _plain(text: str) -> str:
-    """Text of a docstring without the roles of its markup, safe in a table."""
+    """Return the text of a docstring without the roles of its markup, safe in a table."""
     return without_roles(text).replace("|", "\\|").strip()
 
 
 def without_roles(text: str) -> str:
-    """``:class:`~a.b.C``` as `C`, and double backticks as single ones."""
+    """Convert ``:class:`~a.b.C``` to `C`, and double backticks to single ones."""
     text = re.sub(r":\w+:`~?(?:[\w.]+\.)?([\w ]+)`", r"`\1`", text)
     return text.replace("``", "`")
 
 
 def cli_page() -> str:
-    """The page on the commands, as Typer describes them."""
+    """Return the page on the commands, as Typer describes them."""
     import typer
     from typer.cli import get_docs_for_click
 
@@ -135,5 +135,5 @@ def cli_page() -> str:
     command = typer.main.get_command(app)
     context = command.context_class(command, info_name="dynsim")
     text = get_docs_for_click(obj=command, ctx=context, name="dynsim", title="Commands")
-    # Angle brackets outside of code are tags.
+    # Angle brackets outside of code would be tags.
     return re.sub(r"^Example: (.*)$", r"Example: `\1`", text, flags=re.MULTILINE)

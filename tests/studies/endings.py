@@ -358,7 +358,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--first", type=int, default=0, help="number of the first")
     parser.add_argument("--jobs", type=int, default=2, help="processes")
     parser.add_argument("--out", type=Path, default=FILE, help="file for the result")
-    parser.add_argument("--journal", type=Path, help="file with a line for each scene; those that have one are not run")
+    parser.add_argument("--journal", type=Path, help="file with a line for each scene; scenes in it are not run again")
     return parser.parse_args()
 
 
@@ -397,7 +397,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    # Imported by name, because other processes look it up by this name.
+    # Import the module under its full name, by which other processes find it.
     from studies import endings as module
 
     module.main()

@@ -415,7 +415,7 @@ def _ends(cell: dict[str, Any]) -> str:
 def main() -> None:
     """Run the table, print it, and save it."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--runs", type=int, default=100, help="of each cell [100]")
+    parser.add_argument("--runs", type=int, default=100, help="number of runs for each cell [100]")
     parser.add_argument("--out", type=Path, help="keep the numbers there (JSON)")
     parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="processes [all processors]")
     arguments = parser.parse_args()

@@ -215,7 +215,7 @@ def best_known(seed: int, effort: int) -> dict[str, Any]:
 def least_of(row: dict[str, Any], before: dict[str, Any]) -> dict[str, Any]:
     """Return a reference with the lesser heat of each number of braces, from this row or the previous one.
 
-    Both heats are for dense references on hand path and surfaces, from whichever search; ``searched_W`` is its own.
+    Both heats are for dense references on hand path and surfaces; ``searched_W`` is always the heat of this row.
     """
     known = {size["count"]: size for size in before["sizes"] if size["heat_W"] is not None}
     sizes = [
@@ -289,7 +289,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("--out", type=Path, default=Path("results/planner"), metavar="FOLDER")
     parser.add_argument("--study", choices=("scenes", "reference", "gains", "posture"), default="scenes")
-    parser.add_argument("--effort", type=int, default=100, metavar="N", help="of the reference, times the usual rounds")
+    parser.add_argument("--effort", type=int, default=100, metavar="N", help="multiple of the usual rounds")
     parser.add_argument("--scenes", type=int, nargs=2, default=(1, 20), metavar=("FIRST", "LAST"))
     chosen = parser.parse_args()
     first, last = chosen.scenes

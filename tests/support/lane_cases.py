@@ -162,7 +162,7 @@ def driven(t: float, t_step: float = 0.0) -> Case:
 
 
 def limited() -> Case:
-    """Return motors of which some lanes are at their limits."""
+    """Return motors that are at their limits in some lanes."""
     rng = np.random.default_rng(6)
     robot = random_robot(rng, 6)
     motors = [replace(motor, voltage_limit=15.0) for motor in robot.motors]
@@ -240,8 +240,8 @@ CASES: dict[str, Callable[[], Case]] = {
     "rubbing": rubbing,
 }
 TIMED = {
-    "times of their own": lambda: driven(0.7, 0.01),
-    "times of their own, at the end": lambda: driven(3.0, 0.01),
+    "different times": lambda: driven(0.7, 0.01),
+    "different times, at the end": lambda: driven(3.0, 0.01),
 }
 
 

@@ -22,7 +22,7 @@ from studies.bench.programs import DYNSIM_RADAU5, MUJOCO_EULER, MUJOCO_IMPLICIT,
 
 Array = NDArray[np.float64]
 
-SPHERE_RADIUS = 100.0  # of spherical surfaces in place of the floor where MuJoCo holds points by tendons [m]
+SPHERE_RADIUS = 100.0  # radius of the spheres that replace the floor if MuJoCo holds points by tendons [m]
 
 
 @dataclass(frozen=True)
@@ -32,11 +32,11 @@ class Case:
     Attributes
     ----------
     variant : str
-        Of elbow_comparison.
+        Variant of elbow_comparison.
     mujoco_contacts : str
         ``contacts`` of :func:`studies.bench.mujoco_peer.build_mujoco`.
     same_physics : bool
-        Whether the programs solve the same equations; where not, MuJoCo's rows are marked.
+        Whether the programs solve the same equations; if not, the rows of MuJoCo are marked.
     """
 
     variant: str
@@ -46,7 +46,7 @@ class Case:
 
 CASES = {
     "free arm": Case("no_elbow", "none"),
-    # Both hold the elbows to spheres; MuJoCo softly.
+    # Both hold the elbows on spheres; MuJoCo with soft constraints.
     "two elbows held, no friction": Case("two_elbows", "equality"),
     # dynsim: the paper's bilateral law; MuJoCo: its soft unilateral contact.
     "two elbows, friction": Case("two_elbows", "soft", same_physics=False),
@@ -64,7 +64,7 @@ class Outcome(NamedTuple):
 
 
 def measure(case_name: str, rounds: int, *, with_mujoco: bool) -> list[dict[str, Any]]:
-    """CPU time and error of the 10 s run for every program; the reference is dynsim at rtol 1e-11."""
+    """Measure CPU time and error of the 10 s run for every program; the reference is dynsim at rtol 1e-11."""
     case = CASES[case_name]
     reference = prepare_case(case, _TIGHT)
     exact = _run_dynsim(reference)
@@ -73,7 +73,7 @@ def measure(case_name: str, rounds: int, *, with_mujoco: bool) -> list[dict[str,
     if with_mujoco:
         programs[MUJOCO_EULER] = partial(_run_mujoco, case, "euler", reference)
         programs[MUJOCO_IMPLICIT] = partial(_run_mujoco, case, "implicitfast", reference)
-    # They take turns, so that a busy moment of the machine meets all of them; the first one warms the caches.
+    # They take turns, so that other load on the machine affects all of them; the first runs warm the caches.
     outcomes = {name: run() for name, run in programs.items()}
     cpu: dict[str, list[float]] = {name: [] for name in programs}
     for _ in range(rounds):
@@ -97,7 +97,7 @@ def measure(case_name: str, rounds: int, *, with_mujoco: bool) -> list[dict[str,
 
 
 def measure_variants(rounds: int) -> list[dict[str, Any]]:
-    """Least CPU time of each variant as it is shipped, by dynsim alone."""
+    """Return the minimum CPU time of each shipped variant, for dynsim only."""
     return [
         {
             "variant": variant,
@@ -108,7 +108,7 @@ def measure_variants(rounds: int) -> list[dict[str, Any]]:
 
 
 def prepare_case(case: Case, options: dict[str, Any]) -> Prepared:
-    """The case compiled for dynsim at its initial state; ``options`` are overrides of the scenario."""
+    """Return the case compiled for dynsim at its initial state; ``options`` are overrides of the scenario."""
     overrides = dict(options)
     if case.mujoco_contacts == "equality":
         model = load_scenario(SCENARIO, case.variant)
@@ -126,9 +126,9 @@ def prepare_case(case: Case, options: dict[str, Any]) -> Prepared:
 
 
 def integrate(prepared: Prepared) -> float:
-    """Integrate from start to end; CPU seconds of that alone."""
+    """Integrate from start to end; return the CPU seconds of the integration only."""
     run = prepared.run
-    # Loading the kernels is no integration time.
+    # Loading the kernels does not count as integration time.
     advance(prepared.system, prepared.workspace, run, 0)
     started = time.thread_time()
     while run.count[ki.STATUS] == ki.RUNNING:
@@ -161,6 +161,6 @@ def _run_mujoco(case: Case, integrator: Literal["euler", "implicitfast"], refere
 
 
 def _hand_path(prepared: Prepared, q: Array) -> Array:
-    """Hand positions for joint positions q, (T, n) → (T, 3) [m]."""
+    """Return hand positions for joint positions q, (T, n) → (T, 3) [m]."""
     model = prepared.model
     return np.array([model.point_position(*model.robot.hand, row) for row in q])

@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 # Radius of a sphere about the contact point, which rests on a plane that is lower by this [m].
 FOOT_RADIUS = 0.01
-# Constraint impedance close to one: the least softness that MuJoCo's solver accepts.
+# Constraint impedance close to one: the minimum softness that MuJoCo's solver accepts.
 STIFFEST = [0.9999, 0.9999, 0.001, 0.5, 2.0]
 
 
@@ -32,23 +32,23 @@ def build_mujoco(
     contacts: Literal["none", "soft", "equality"] = "none",
     cone: Literal["pyramidal", "elliptic"] = "pyramidal",
 ) -> Any:
-    """The bodies, motors and contacts of ``system`` as a ``mujoco.MjModel``.
+    """Return the bodies, motors and contacts of ``system`` as a ``mujoco.MjModel``.
 
     Parameters
     ----------
     step : time step [s]
-    motors : with ``dcmotor`` actuators and their PD (see :func:`setpoints`), or bodies alone
+    motors : with ``dcmotor`` actuators and their PD (see :func:`setpoints`), or bodies only
     contacts : {"none", "soft", "equality"}
         "soft": MuJoCo's own contact of a small sphere with the floor z = 0: unilateral, with its soft friction.
         "equality": the point is held at its distance from the centre of a sphere surface by an equality constraint
-        on the length of a tendon, the one-row bilateral constraint that MuJoCo has; without friction.
-    cone : of the friction; MuJoCo's default, which is faster, or the one that is Coulomb's
+        on the length of a tendon, MuJoCo's one-row bilateral constraint; without friction.
+    cone : friction cone: MuJoCo's default, which is faster, or Coulomb's cone
 
     Notes
     -----
-    The controller of ``dcmotor`` asks for a torque and drives u = (R/K) τ + K v, compensating the back-EMF. With the
-    torque gains k_p K/R and (k_d + K) K/R and a velocity set-point scaled by k_d/(k_d + K) that is exactly
-    u = k_p (q_d − q) + k_d (v_d − v). Gear ratios are in K_m, J_m and D_m already.
+    The controller of ``dcmotor`` requests a torque and applies u = (R/K) τ + K v, compensating the back-EMF. With the
+    torque gains k_p K/R and (k_d + K) K/R and a velocity set-point scaled by k_d/(k_d + K) this is exactly
+    u = k_p (q_d − q) + k_d (v_d − v). K_m, J_m and D_m already include gear ratios.
     """
     import mujoco
 
@@ -74,14 +74,14 @@ def build_mujoco(
         elif contacts == "equality":
             radii.append(_add_tendon(spec, body, k, point, solref))
     model = spec.compile()
-    # The equality counts from the tendon's length at q = 0, which only the compiled model knows.
+    # The equality refers to the tendon's length at q = 0, which only the compiled model contains.
     for k, radius in enumerate(radii):
         model.eq_data[k, 0] = radius - model.tendon_length0[k]
     return model
 
 
 def state_of(model: Any, q: Array) -> Array:
-    """MuJoCo's full physics state (time, q, v, activations) at rest at q without currents."""
+    """Return MuJoCo's full physics state (time, q, v, activations) for rest in posture q without currents."""
     import mujoco
 
     data = mujoco.MjData(model)
@@ -92,7 +92,7 @@ def state_of(model: Any, q: Array) -> Array:
 
 
 def setpoints(system: System, times: Array) -> Array:
-    """Controls of the ``dcmotor`` actuators at the given times, (T, 2 na): position and scaled velocity per motor."""
+    """Return controls of the ``dcmotor`` actuators at times, (T, 2 na): position and scaled velocity per motor."""
     position, rate = references(system, times)
     motor = system.drives.motor
     k_d = motor[:, ka.K_D]
@@ -103,7 +103,7 @@ def setpoints(system: System, times: Array) -> Array:
 
 
 def references(system: System, times: Array) -> tuple[Array, Array]:
-    """Joint references q_d and v_d of all motors, (T, na) [rad, rad/s], from the spline table of the kernels."""
+    """Return joint references q_d and v_d of all motors, (T, na) [rad, rad/s], from the spline table of the kernels."""
     reference = system.reference
     start, spacing = reference.grid
     coefficients = reference.coefficients
@@ -137,7 +137,7 @@ def roll_out(model: Any, data: Any, start: Array, controls: Array) -> tuple[Arra
 
 
 def steps_call(model: Any, q: Array, batch: int, steps: int) -> Callable[[], Any]:
-    """A call that runs ``batch`` short runs of ``steps`` steps from rest at q natively: contacts stay as they start."""
+    """Return a native call of ``batch`` short runs from rest at q, of ``steps`` steps: contacts do not change."""
     import mujoco
     from mujoco import rollout
 

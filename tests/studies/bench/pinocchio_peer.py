@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 
 
 def build_pinocchio(arrays: ka.ModelArrays) -> Any:
-    """The tree of bodies as a ``pinocchio.Model``, joint i + 1 being link i; rotor inertias are its armature."""
+    """Return the tree of bodies as a ``pinocchio.Model``; joint i + 1 is link i, rotor inertias are its armature."""
     import pinocchio
 
     tree, body = arrays.tree, arrays.body
@@ -45,7 +45,7 @@ def build_pinocchio(arrays: ka.ModelArrays) -> Any:
 
 
 def native_aba(model: Any, q: Array, v: Array, batch: int) -> Callable[[], Any]:
-    """A call that runs ``batch`` articulated-body solves one after the other inside Pinocchio (one thread)."""
+    """Return a call that runs ``batch`` articulated-body solves one after the other inside Pinocchio (one thread)."""
     import pinocchio
 
     # With one column (or one row) the binding cannot tell the order of the matrix and reads out of bounds.
@@ -58,7 +58,7 @@ def native_aba(model: Any, q: Array, v: Array, batch: int) -> Callable[[], Any]:
 
 
 def python_aba(model: Any, data: Any, q: Array, v: Array) -> Callable[[], Any]:
-    """One articulated-body solve per Python call."""
+    """Return a call of one articulated-body solve, from Python."""
     import pinocchio
 
     tau = np.zeros(model.nv)
@@ -66,7 +66,7 @@ def python_aba(model: Any, data: Any, q: Array, v: Array) -> Callable[[], Any]:
 
 
 def constrained(model: Any, data: Any, algorithm: str, links: list[int], q: Array, v: Array) -> Callable[[], Any]:
-    """One constrained solve per Python call, with the origins of ``links`` pinned by three rows each.
+    """Return a call of one constrained solve, from Python, with the origins of ``links`` pinned by three rows each.
 
     ``algorithm`` is "constraintDynamics" (sparse Cholesky) or "lcaba" (O(n)). Pinocchio has neither one-row contacts
     nor friction in these. One proximal iteration: the fastest setting, which still meets the rows to 1e-8 m/s².

@@ -20,19 +20,19 @@ RTOLS = (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9)
 REFERENCE = "dopri5", 1e-12
 ATOL_PER_RTOL = 1e-2
 ANGLE_MIN = 1e-3
-"""Errors of a joint are relative to its largest position, or to this if that is less [rad, m]."""
+"""Errors of a joint are relative to its largest position, or to this value if that is smaller [rad, m]."""
 
 
 class _Run(NamedTuple):
     cpu: float  # [s]
     q: NDArray[np.float64]  # (T, nq)
     evaluations: int
-    ledger: float  # of the turnover
+    ledger: float  # relative to the turnover
     finished: bool
 
 
 def scenarios() -> Iterator[str]:
-    """Shipped scenarios of arms that are integrated in time; each with its first variant."""
+    """Yield the shipped scenarios of arms that are integrated in time; each with its first variant."""
     for file in shipped_scenarios():
         scenario = load_scenario(file)
         if scenario.engine == "dynamics" and scenario.plant.type != "snake":
@@ -40,20 +40,20 @@ def scenarios() -> Iterator[str]:
 
 
 def measure(name: str, rounds: int) -> list[dict[str, Any]]:
-    """Time, error and ledger of one shipped scenario by method and tolerance.
+    """Measure time, error and ledger of one shipped scenario by method and tolerance.
 
     Returns
     -------
     list of dict
-        ``scenario``, ``method``, ``rtol``, ``cpu_minimum_s`` (integration only, least of the rounds), ``error`` (the
-        largest of any joint over its own largest angle, see ``ANGLE_MIN``, against ``REFERENCE``), ``ledger`` (largest
+        ``scenario``, ``method``, ``rtol``, ``cpu_minimum_s`` (integration only, minimum of the rounds), ``error`` (the
+        largest of any joint over its largest angle, see ``ANGLE_MIN``, against ``REFERENCE``), ``ledger`` (largest
         residual over the turnover), ``evaluations``, ``finished``.
     """
     reference = _integrate(name, *REFERENCE)
     scale = np.maximum(np.abs(reference.q).max(axis=0), ANGLE_MIN)
     rows: list[dict[str, Any]] = []
     for rtol in RTOLS:
-        # The methods take turns, so that a busy moment of the machine meets all of them.
+        # The methods take turns, so that other load on the machine affects all of them.
         runs = [(method, _integrate(name, method, rtol)) for _ in range(rounds) for method in METHODS]
         for method, run in runs[: len(METHODS)]:
             common = min(len(run.q), len(reference.q))

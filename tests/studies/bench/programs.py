@@ -1,7 +1,7 @@
 """Names of the measured programs, and helpers shared by all benchmarks."""
 
 SCENARIO = "elbow_comparison"
-STEP = 1e-3  # MuJoCo's, in the whole job [s]
+STEP = 1e-3  # step of MuJoCo in the whole job [s]
 
 DYNSIM_FREE, DYNSIM_CONTACTS = "dynsim", "dynsim, 2 contacts"
 ABA, CONSTRAINT_DYNAMICS, LCABA = "Pinocchio ABA", "Pinocchio constraintDynamics", "Pinocchio lcaba"

@@ -32,7 +32,7 @@ from studies.bench.programs import (
 
 Array = NDArray[np.float64]
 Contender = tuple[Callable[[], Any], int]
-"""A call, and the number of evaluations in it."""
+"""A call, and its number of evaluations."""
 
 # Memory of Pinocchio's Data grows with the square of the number of links: 0.85 GB at 300.
 PINOCCHIO_LINKS_MAX = 300
@@ -41,7 +41,7 @@ _PYTHON_ABA = "Pinocchio ABA, one Python call each"
 
 @kernel
 def repeat_derivative(system: System, y: Array, ws: ka.Workspace, dy: Array, count: int) -> float:
-    """``count`` right-hand sides at slightly different states; returns a sum, so that none can be left out."""
+    """Evaluate ``count`` right-hand sides at slightly different states; return a sum, so that none is omitted."""
     total = 0.0
     first = y[0]
     for k in range(count):
@@ -55,7 +55,7 @@ def repeat_derivative(system: System, y: Array, ws: ka.Workspace, dy: Array, cou
 def measure(
     sizes: Sequence[int], rounds: int, share: float, *, with_mujoco: bool, with_pinocchio: bool
 ) -> list[dict[str, Any]]:
-    """Median microseconds by links and program, of ``rounds`` samples of about ``share`` seconds each."""
+    """Return median microseconds by links and program, over ``rounds`` samples of about ``share`` seconds each."""
     rows, python_call = [], 0.0
     for n in sizes:
         arms = {contacts: prepare(_arm(n, contacts)) for contacts in (False, True)}
@@ -64,7 +64,7 @@ def measure(
             contenders |= _pinocchio_contenders(arms[True])
         if with_mujoco:
             contenders |= _mujoco_contenders(arms[True])
-        # What a call from Python costs does not depend on the size; where the work is least, it is seen best.
+        # The cost of a call from Python does not depend on the size; it is measured best with the least work.
         if n != sizes[0]:
             contenders.pop(_PYTHON_ABA, None)
         seconds = {name: median(samples) for name, samples in take_turns(contenders, rounds, share).items()}
@@ -77,25 +77,25 @@ def measure(
 
 
 def take_turns(contenders: dict[str, Contender], rounds: int, share: float) -> dict[str, list[float]]:
-    """Seconds per unit of work of every contender, one sample per round, the contenders interleaved.
+    """Return seconds per unit of work of every contender, one sample per round, the contenders interleaved.
 
-    CPU time of this thread, in which all of them run: what other processes take does not count.
+    CPU time of this thread, in which all of them run: time of other processes does not count.
     """
     timers = {name: Timer(call, timer=time.thread_time) for name, (call, _) in contenders.items()}
-    # The first of the calls warms the caches.
+    # The first calls warm the caches.
     calls = {name: max(1, int(share / min(timer.repeat(4, 1)))) for name, timer in timers.items()}
     samples: dict[str, list[float]] = {name: [] for name in timers}
     for k in range(rounds):
         for name, timer in timers.items():
             units = calls[name] * contenders[name][1]
-            # A contender that takes far longer than a sample should gets fewer of them.
+            # A contender that takes much longer than a sample should gets fewer samples.
             if k < 3 or sum(samples[name]) * units < 4.0 * rounds * share:
                 samples[name].append(timer.timeit(calls[name]) / units)
     return samples
 
 
 def _arm(n: int, contacts: bool) -> Any:
-    """The published arm with n links: links beyond the tenth are copies, bent to and fro, and all hold still."""
+    """Return the published arm with n links, all stationary; links beyond the tenth are copies, bent alternately."""
     overrides: dict[str, Any] = {}
     if n != 10:
         angles = load_scenario(SCENARIO).plant.initial_deg
@@ -126,7 +126,7 @@ def _pinocchio_contenders(prepared: Prepared) -> dict[str, Contender]:
         CONSTRAINT_DYNAMICS: (pinocchio_peer.constrained(model, data, "constraintDynamics", links, q, v), 1),
         LCABA: (pinocchio_peer.constrained(model, data, "lcaba", links, q, v), 1),
     }
-    # Not where Pinocchio is built without threads.
+    # Not if Pinocchio is built without threads.
     if hasattr(pinocchio, "abaInParallel"):
         contenders[ABA] = pinocchio_peer.native_aba(model, q, v, batch), batch
     return contenders

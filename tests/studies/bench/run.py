@@ -30,14 +30,14 @@ def run_bench(quick: bool = False, tell: Callable[[str], object] = lambda text: 
     Returns
     -------
     dict, ready for JSON
-        ``machine``, ``versions``, ``method`` (how it was measured), ``unavailable`` (what is missing and why), and
+        ``machine``, ``versions``, ``method`` (how it was measured), ``unavailable`` (missing programs and why), and
         lists of dicts: ``right_hand_side`` (by links and program), ``job`` (by case and program: time and errors),
         ``variants`` (time), ``snake`` (by program: time, distance from the paper), ``sweeps`` (by number of runs and of
         processes: wall time), ``precision`` (by shipped scenario, method and tolerance: time, error, ledger).
     """
     missing = {name: why for name, why in (("mujoco", _why_no_mujoco()), ("pinocchio", _why_no_pinocchio())) if why}
     with_mujoco, with_pinocchio = "mujoco" not in missing, "pinocchio" not in missing
-    # Many short samples: the median then leaves out those in which another process had the core.
+    # Many short samples: the median then excludes samples in which another process had the core.
     rounds, share = (25, 2e-3) if quick else (101, 5e-3)
     tell("right-hand sides")
     sizes = right_hand_side.measure(
@@ -67,8 +67,8 @@ def run_bench(quick: bool = False, tell: Callable[[str], object] = lambda text: 
             "mujoco_step_s": STEP,
             "dynsim": "right-hand side with motors, references, friction and all energy integrals, in a compiled loop",
             "pinocchio": "bodies and rotor inertia only; ABA in its own native loop (abaInParallel, one thread); "
-            "constraintDynamics and lcaba from Python with 2 x 3 rows and no friction, less the cost of a Python call, "
-            "which is that of ABA called from Python less that of ABA in the native loop",
+            "constraintDynamics and lcaba from Python with 2 x 3 rows and no friction, less the cost of a Python call: "
+            "the time of ABA called from Python less the time of ABA in the native loop",
             "mujoco": "bodies, rotor inertia and damping, no motors; mj_step in mujoco.rollout (one thread)",
         },
         "right_hand_side": sizes,
@@ -82,7 +82,7 @@ def run_bench(quick: bool = False, tell: Callable[[str], object] = lambda text: 
 
 
 def _why_no_mujoco() -> str:
-    """Why MuJoCo cannot take part; empty when it can."""
+    """Return why MuJoCo cannot take part, or an empty text."""
     try:
         import mujoco
     except ImportError:
@@ -93,14 +93,14 @@ def _why_no_mujoco() -> str:
 
 
 def _why_no_pinocchio() -> str:
-    """Why Pinocchio cannot take part; empty when it can."""
+    """Return why Pinocchio cannot take part, or an empty text."""
     if importlib.util.find_spec("pinocchio") is None:
         return "pinocchio is not installed (pip install 'dynsim[bench]'; it has no wheels for Windows)"
     return ""
 
 
 def machine() -> dict[str, Any]:
-    """Processor, number of its cores, and system."""
+    """Return the processor, its number of cores, and the system."""
     model = platform.processor() or platform.machine()
     with suppress(OSError):
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
@@ -109,7 +109,7 @@ def machine() -> dict[str, Any]:
 
 
 def versions() -> dict[str, str]:
-    """Of dynsim, with its commit, of Python and of the other programs."""
+    """Return the versions of dynsim, with its commit, of Python and of the other programs."""
     known = {"dynsim": __version__, "commit": commit(), "python": platform.python_version()}
     for package in ("numba", "numpy", "pin", "mujoco"):
         try:

@@ -1,7 +1,7 @@
-"""Benchmark of the dynamic snake beside MuJoCo: time, and agreement with Table III of [T].
+"""Benchmark of the dynamic snake against MuJoCo: time, and agreement with Table III of [T].
 
 MuJoCo gets the exported tree of bodies, the voltage laws of the servos, and the piecewise linear references that the
-controller gave in dynsim's run. So the commands are the same; forces, friction and contacts are MuJoCo's.
+controller produced in dynsim's run. The commands are therefore the same; MuJoCo computes forces, friction and contacts.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 
 SCENARIO = "snake_positioning_dynamic"
 DYNSIM = "dynsim 2.5 ms, with its controller"
-# Step [s], and whether dry friction has the greatest stiffness that MuJoCo accepts; at 2.5 ms that is not stable.
+# Step [s], and whether dry friction has the maximum stiffness that MuJoCo accepts; at 2.5 ms it is unstable.
 MUJOCO = {
     "MuJoCo 2.5 ms": (2.5e-3, False),
     "MuJoCo 2 ms, stiff friction": (2e-3, True),
@@ -47,7 +47,7 @@ class Manoeuvre(NamedTuple):
 
 
 class Commands(NamedTuple):
-    """What dynsim has run, coordinates at its start, and lines of all motors from each tick on, (T, na, 2)."""
+    """System that dynsim ran, its initial coordinates, and lines of all motors from each tick on, (T, na, 2)."""
 
     prepared: Prepared
     q: Array
@@ -56,12 +56,12 @@ class Commands(NamedTuple):
 
 
 def build_snake(prepared: Prepared, step: float, stiff: bool = False) -> Any:
-    """A compiled scenario of the dynamic snake as a ``mujoco.MjModel``, with servos and a floor.
+    """Return a compiled scenario of the dynamic snake as a ``mujoco.MjModel``, with servos and a floor.
 
     A servo's torque is K/R (u − K v) with u = k_p (q_d − q), or u = k_v (v_d − v) + K v, within ±U. Here K²/R is the
-    damping of the joint, and the rest an actuator whose force is within ±K U/R: the same law, all of it implicit.
-    Friction of gears is MuJoCo's ``frictionloss``, which is soft, and less so with ``stiff``; wheels touch the floor as
-    stiffly as the step allows.
+    damping of the joint, and the rest is an actuator whose force is within ±K U/R: the same law, fully implicit.
+    MuJoCo's ``frictionloss`` is the friction of gears: it is soft, and less so with ``stiff``. Wheels touch the floor
+    as stiffly as the step allows.
     """
     import mujoco
 
@@ -107,13 +107,13 @@ def positions(model: Any, robot: Robot, q: Array) -> Array:
 
 
 def measure(rounds: int, *, with_mujoco: bool) -> list[dict[str, Any]]:
-    """Time and distance from the paper by program, over the six manoeuvres of Table III.
+    """Measure time and distance from the paper by program, over the six manoeuvres of Table III.
 
     Returns
     -------
     list of dict
-        ``program``, ``us_per_step`` and ``times_real_time`` (least CPU time of the rounds), ``z_rms_m`` and
-        ``beta_rms_rad`` (rms of what Δz and Δβ of the head are off from the paper's means), ``displacements`` (6, 6)
+        ``program``, ``us_per_step`` and ``times_real_time`` (minimum CPU time of the rounds), ``z_rms_m`` and
+        ``beta_rms_rad`` (rms deviation of Δz and Δβ of the head from the paper's means), ``displacements`` (6, 6)
     """
     outcomes: dict[str, list[Manoeuvre]] = {}
     duration = 0.0
@@ -144,12 +144,12 @@ def measure(rounds: int, *, with_mujoco: bool) -> list[dict[str, Any]]:
 
 
 def run_dynsim(scenario: Scenario, rounds: int) -> tuple[Commands, Manoeuvre]:
-    """A run by dynsim, timed in runs of their own, and what it commands."""
+    """Run a scenario in dynsim; return its commands and its result, timed in separate runs."""
     simulation, seconds = Simulation(scenario, duration=math.inf), math.inf
     assert simulation.operator is not None
     q, lines, period = simulation.state.q, [], simulation.operator.period
     for k in range(round(scenario.duration_s / period)):
-        # Past the tick; steps are not cut there.
+        # After the tick; steps are not cut at this time.
         simulation.advance((k + 0.5) * period)
         lines.append(simulation._prepared.system.drives.input[:, ka.LINE_START : ka.LINE_RATE + 1].copy())
     simulation.advance(scenario.duration_s)
@@ -164,11 +164,11 @@ def run_dynsim(scenario: Scenario, rounds: int) -> tuple[Commands, Manoeuvre]:
 
 
 def run_mujoco(model: Any, commands: Commands, duration: float, rounds: int) -> Manoeuvre:
-    """The same commands, from the same posture at rest."""
+    """Run the same commands in MuJoCo, from the same posture at rest."""
     import mujoco
 
     step = model.opt.timestep
-    # In the middle of each step, as dynsim takes them.
+    # In the middle of each step, as in dynsim.
     at = (np.arange(round(duration / step)) + 0.5) * step
     k = (at / commands.period).astype(int)
     controls = commands.lines[k, :, 0] + commands.lines[k, :, 1] * (at - k * commands.period)[:, None]

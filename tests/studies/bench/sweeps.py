@@ -17,7 +17,7 @@ RUNS = (250, 500, 1000)
 
 
 def measure(quick: bool) -> list[dict[str, Any]]:
-    """Wall seconds of sweeps of 10 s runs over friction, by one process and by as many as there are cores."""
+    """Return the wall seconds of sweeps of 10 s runs over friction, with one process and with one per core."""
     file = read_scenario(SCENARIO)
     law = Law.parse("contacts.friction=normal(0.1,0.005)")
     rows = []

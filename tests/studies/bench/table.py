@@ -19,12 +19,12 @@ SNAKE_COLUMNS = {
     "Δz mm": ("z_rms_m", 1e3),
     "Δβ mrad": ("beta_rms_rad", 1e3),
 }
-# As many tolerances as fit; all are in the JSON.
+# The tolerances that fit; all are in the JSON.
 _RTOLS = precision.RTOLS[::2]
 
 
 def format_table(result: dict[str, Any]) -> list[Table]:
-    """The result as tables that fit 80 columns; dashes for what was not measured."""
+    """Return the result as tables that fit 80 columns; dashes for missing measurements."""
     columns: dict[str, Callable[[Row], str]] = {
         "CPU ms": lambda row: _number(row["cpu_median_s"], 1e3),
         "hand mm": lambda row: _number(row["hand_error_max_m"], 1e3),
@@ -96,7 +96,7 @@ def _table(
     down: Iterable[str] | None = None,
     across: Iterable[str] | None = None,
 ) -> Table:
-    """Cells by row and column; those of all cells, in their order, where no others are asked for."""
+    """Return a table of cells by row and column; by default all rows and columns of the cells, in their order."""
     heads = list(across or dict.fromkeys(column for _, column in cells))
     table = Table(title=title, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), title_justify="left")
     table.add_column("", no_wrap=True)
@@ -108,6 +108,6 @@ def _table(
 
 
 def _number(value: float, scale: float = 1.0) -> str:
-    """Three significant digits."""
+    """Return a value with three significant digits."""
     value *= scale
     return f"{value:.0f}" if 1e3 <= abs(value) < 1e6 else f"{value:.3g}"
