@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dynsim.compile.references.plane_curve import coordinates, quintic_coefficients, rolled
+from dynsim.compile.references.splines import coordinates, quintic_coefficients, rolled
 from dynsim.compile.references.teleop import TeleopOptions
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.tables import ReferenceArrays

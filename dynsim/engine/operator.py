@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from dynsim.compile.model import Model
 from dynsim.compile.reaching import path_arrays
-from dynsim.compile.references.plane_curve import wheel_angles
+from dynsim.compile.references.splines import wheel_angles
 from dynsim.compile.references.teleop import BASE, HAND, VELOCITIES, TeleopOptions, VelocitySource
 from dynsim.dynamics import inverse_kinematics as kik
 from dynsim.dynamics.tables import workspace

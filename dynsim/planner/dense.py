@@ -10,7 +10,7 @@ from scipy.interpolate import CubicSpline
 
 from dynsim.compile.clearance import axis_ends, gaps
 from dynsim.compile.references.inverse_kinematics import pressing
-from dynsim.compile.references.plane_curve import clamped_cubic, quintic_rates
+from dynsim.compile.references.splines import clamped_cubic, quintic_rates
 from dynsim.dynamics.contact.braces import statics as kb
 from dynsim.errors import ModelError
 from dynsim.jit.kernel import reals

@@ -14,7 +14,7 @@ from support.messages import raises
 from dynsim.compile.control import JointControl
 from dynsim.compile.model import Model
 from dynsim.compile.protocols import BuildContext
-from dynsim.compile.references.plane_curve import rolled
+from dynsim.compile.references.splines import rolled
 from dynsim.engine.prepare import prepare
 from dynsim.errors import ModelError, ScenarioError, UnreachableReference
 from dynsim.library.controllers import joint_pd

@@ -9,7 +9,7 @@ from support.messages import raises
 
 from dynsim.compile.model import Model
 from dynsim.compile.references.inverse_kinematics import follow
-from dynsim.compile.references.plane_curve import clamped_cubic, quintic_coefficients, quintic_rates
+from dynsim.compile.references.splines import clamped_cubic, quintic_coefficients, quintic_rates
 from dynsim.draw.geometry.shapes import outline
 from dynsim.dynamics.banded import solve_banded
 from dynsim.errors import UnreachableReference

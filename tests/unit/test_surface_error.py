@@ -9,7 +9,7 @@ import pytest
 from support.messages import raises
 
 import dynsim
-from dynsim.compile.references.plane_curve import clamped_cubic
+from dynsim.compile.references.splines import clamped_cubic
 from dynsim.errors import ModelError, ScenarioError
 from dynsim.model.surfaces import Box, HeightField, Quadric
 from dynsim.scenario import build

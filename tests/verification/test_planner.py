@@ -15,7 +15,7 @@ from support.messages import check_message, lines_with, mentions, raises, says
 
 import dynsim
 from dynsim.compile.bracing import Brace
-from dynsim.compile.references.plane_curve import clamped_cubic, quintic_rates
+from dynsim.compile.references.splines import clamped_cubic, quintic_rates
 from dynsim.errors import ModelError, ScenarioError
 from dynsim.jit.kernel import integers, reals
 from dynsim.model.surfaces import Box, HeightField, Quadric, shape_arrays

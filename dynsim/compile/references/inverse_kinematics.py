@@ -12,7 +12,7 @@ from dynsim.compile.bracing import MIN_N, BracePlanner, brace_rows
 from dynsim.compile.hand_posture import hand_posture
 from dynsim.compile.model import Model
 from dynsim.compile.reaching import path_arrays
-from dynsim.compile.references.plane_curve import quintic_rates
+from dynsim.compile.references.splines import quintic_rates
 from dynsim.compile.tables import format_quantity
 from dynsim.dynamics import inverse_kinematics as kik
 from dynsim.dynamics.contact.braces import statics as kb

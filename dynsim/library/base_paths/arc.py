@@ -10,7 +10,7 @@ from pydantic import Field
 
 from dynsim.compile.control import BasePath
 from dynsim.compile.protocols import BuildContext
-from dynsim.compile.references.plane_curve import minimum_jerk
+from dynsim.compile.references.splines import minimum_jerk
 from dynsim.config.base import NonNegative, Positive, StrictConfig
 
 

@@ -15,7 +15,7 @@ from dynsim.compile.control import PLANNED, BasePath, HandPath, JointControl, ta
 from dynsim.compile.model import Model
 from dynsim.compile.protocols import BuildContext
 from dynsim.compile.references.inverse_kinematics import follow, planned_voltages
-from dynsim.compile.references.plane_curve import clamped_cubic, quintic_coefficients, rolled, wheel_angles
+from dynsim.compile.references.splines import clamped_cubic, quintic_coefficients, rolled, wheel_angles
 from dynsim.compile.references.teleop import TeleopOptions
 from dynsim.config.base import NonNegative, Positive, StrictConfig, Vector3, check_waypoints, error_at
 from dynsim.config.problems import suggest

@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 
 from dynsim.compile.control import HandPath
 from dynsim.compile.protocols import BuildContext
-from dynsim.compile.references.plane_curve import clamped_cubic
+from dynsim.compile.references.splines import clamped_cubic
 from dynsim.config.base import StrictConfig, Vector3, check_waypoints
 
 
