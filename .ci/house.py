@@ -79,7 +79,7 @@ def main() -> int:
         if module != "dynsim" and other != "dynsim" and height.get(_room(module), -1) > height.get(_room(other), 99)
     ]
     loose = [path.name for path in PACKAGE.glob("*.py")]
-    print(f"{sum(lines.values())} lines of code in {len(modules)} modules, {len(loose)} beside the rooms")
+    print(f"{sum(lines.values())} lines of code in {len(modules)} modules, {len(loose)} outside the folders")
     print(f"{len(circles(graph))} circles of imports, {len(upward)} imports upwards")
     for module in (*circles(graph), *upward):
         print(f"  {' '.join(module)}")

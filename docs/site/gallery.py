@@ -69,9 +69,9 @@ def _run(name: str, variant: str | None, short: bool) -> dynsim.Record:
 def page() -> str:
     """Return the page of the gallery, with the results built so far."""
     parts = [
-        "# Gallery\n\nEvery shipped scenario, with the command that runs it. The table has what a run gives, and what "
-        "it takes: the time of the integration, without the start of the program. Films, tables and pages that turn in "
-        "your hand are built by `python docs/site/gallery.py` before the site is.\n"
+        "# Gallery\n\nEvery shipped scenario, with the command that runs it. The tables have results of a run and the "
+        "time of its integration, without the start of the program. `python docs/site/gallery.py` makes the films, "
+        "tables and interactive pages before the site is built.\n"
     ]
     for file in shipped_scenarios():
         name = file.stem

@@ -4,8 +4,6 @@ As long as the caller rewrites nothing, the steps are bit-identical to :func:`dy
 not cut them. The step that passes the requested time is kept pending, and the state at that time is interpolated from
 its dense output. If the caller rewrites something, this step is discarded, and a shorter one ends at the requested
 time.
-
-Long because: it is one class, the public stepper, and half of it is its documentation.
 """
 
 from __future__ import annotations

@@ -123,10 +123,10 @@ def contact_modes() -> Figure:
         ("open", "gap > 0: no force", 0.45, None, (0.55, -0.35)),
         ("sticks", r"$v_t = 0$,  $|f_t| \leq \mu_s f_n$", 0.0, (0.26, 1.1), None),
         ("slides", r"$f_t = -\mu f_n\, v_t/|v_t|$: on the cone's edge", 0.0, (-MU * 1.0, 1.0), (0.75, 0.0)),
-        ("lifts off", r"where $f_n$ comes to 0, an event", 0.0, (0.0, 0.0), (0.25, 0.5)),
+        ("lifts off", r"where $f_n$ reaches 0: an event", 0.0, (0.0, 0.0), (0.25, 0.5)),
         (
             "lands",
-            "where the gap comes to 0: an impact,\nwith its impulse P in the cone",
+            "where the gap reaches 0: an impact,\nwith its impulse P in the cone",
             0.0,
             (-0.2, 1.0),
             (0.45, -0.6),

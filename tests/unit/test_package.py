@@ -50,6 +50,34 @@ def test_pages_films_and_braces_are_at_the_top_without_another_import() -> None:
     assert (done.stdout, done.stderr) == ("write write Brace\n", "")
 
 
+# Libraries that the command must not import; scipy itself is imported by numba, so one of its parts stands for it.
+RUN = {"scipy.interpolate", "scipy.linalg", "scipy.optimize", "scipy.spatial", "matplotlib", "PIL", "serial", "asyncio"}
+WAITING = {
+    "--help": RUN | {"numba", "ruamel", "pydantic", "h5py"},
+    "hw --help": RUN | {"numba", "ruamel", "h5py"},
+    "check elbow_comparison": RUN | {"h5py"},
+    "run elbow_comparison --variant two_elbows --set duration_s=0.1 --no-figures": RUN,
+    "run snake_pick_up --variant lifts --set duration_s=0.1 --no-figures": RUN,
+}
+IMPORTED = """
+import atexit, sys
+heavy, command = sys.argv[1:]
+atexit.register(lambda: print("imported", *sorted(set(sys.modules) & set(heavy.split(",")))))
+from dynsim.cli import main
+sys.argv[1:] = command.split()
+main()
+"""
+
+
+@pytest.mark.parametrize("command", WAITING)
+def test_heavy_libraries_wait_until_they_are_needed(command: str, tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", IMPORTED, ",".join(WAITING[command]), command],
+        cwd=tmp_path, capture_output=True, text=True, timeout=240, check=False,
+    )  # fmt: skip
+    assert (done.stdout.splitlines()[-1].split(), done.returncode) == (["imported"], 0), done.stderr
+
+
 WITHOUT_POSIX = """
 import os, signal, sys
 import dynamixel_sdk  # its serial port knows other systems, but not this one without its modules

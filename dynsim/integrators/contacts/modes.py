@@ -7,8 +7,6 @@ First impulses stop approaching points and joints (:mod:`dynsim.integrators.cont
 
 is solved for the points at rest along their surfaces; points that slide already have the force f_n (n − μ t) with the
 single unknown f_n. The solution shows which points lift off, which stick, and which begin to slip in which direction.
-
-Long because: the steps of the choice share the rows, the system and the scratch of one gathered problem.
 """
 
 from __future__ import annotations
