@@ -17,12 +17,12 @@ from dynsim.model.urdf.reader import (
     ROWS,
     SEVERAL,
     Element,
-    UrdfFile,
     UrdfTree,
     _links,
     _places,
     _words,
     read_tree,
+    read_xml,
 )
 
 # Two readers of the same decimals differ by rounding, in sines of angles and in sums over merged bodies.
@@ -57,7 +57,7 @@ def plain_text(root: Element, name: str) -> str:
 def assert_pinocchio_reads_the_same(path: Path, text: str | None = None) -> None:
     """Raise AssertionError unless Pinocchio reads the same joints and bodies from the file, or from ``text``."""
     tree = read_tree(path)
-    model = pinocchio.buildModelFromXML(plain_text(UrdfFile(path).root(), tree.name) if text is None else text)
+    model = pinocchio.buildModelFromXML(plain_text(read_xml(path), tree.name) if text is None else text)
     neutral = pinocchio.neutral(model)
     places = _places(tree)
     links = _links(tree, places)

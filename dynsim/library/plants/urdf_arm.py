@@ -11,6 +11,7 @@ from pydantic import Field, model_validator
 
 from dynsim.compile.protocols import BuildContext
 from dynsim.config.base import BodyPoint, NonNegative, StrictConfig, Vector3, error_at
+from dynsim.config.problems import suggest
 from dynsim.errors import ModelError
 from dynsim.library import families
 from dynsim.model.description import Array, Robot
@@ -72,7 +73,7 @@ class Config(StrictConfig):
     @model_validator(mode="after")
     def _check_joints(self) -> Self:
         """Check names and kinds of joints here, so that errors have a line; ``build`` reports all other errors."""
-        from dynsim.model.urdf.reader import MOVING, SEVERAL, read_tree, suggestion
+        from dynsim.model.urdf.reader import MOVING, SEVERAL, read_tree
 
         try:
             if not is_file(self.file, ModelError):
@@ -87,9 +88,7 @@ class Config(StrictConfig):
                 path = f"{key}.{name}"
                 if name not in joints:
                     moving = ", ".join(joint.name for joint in joints.values() if joint.kind != "fixed")
-                    raise error_at(
-                        path, f"unknown joint {name!r}{suggestion(name, joints)}; joints in the file: {moving}"
-                    )
+                    raise error_at(path, f"unknown joint {name!r}{suggest(name, joints)}; joints in the file: {moving}")
                 kind = MOVING.get(joints[name].kind, joints[name].kind)
                 if kind in SEVERAL:
                     if key == "initial_pose":
