@@ -29,9 +29,8 @@ INCOMPLETE = "INCOMPLETE"
 _MARK = (
     "Files of this folder are being exchanged, or a run died while it exchanged them: they may be of different runs."
 )
-_TEMPORARY = re.compile(r"\.dynsim-[0-9a-f]{16}\.tmp")
-_LEFT_BEHIND = 60.0
-"""Age [s] from which an unlocked temporary file was left by a dead process; younger files may not be locked yet."""
+_LEFT_BEHIND = 86_400.0
+"""Age [s] from which a temporary file was left by a dead process: a living one writes to its file more often."""
 _STREAM = re.compile(r"/dev/(stdin|stdout|stderr|fd/.*)|/proc/.*")
 """Names of open descriptors of a process: they may be files, but cannot be replaced."""
 _NAME_LENGTH = 120
@@ -153,12 +152,12 @@ def replace_together(folder: Path, contents: Mapping[str, bytes | memoryview]) -
     with ExitStack() as open_drafts:
         drafts = [open_drafts.enter_context(_Draft(folder / name)) for name in contents]
         for draft, content in zip(drafts, contents.values(), strict=True):
-            with draft.one_line_errors():
+            with _one_line_errors(draft.path):
                 draft.stream.write(content)
                 draft.complete(durable=True)
         with _marked(folder, contents) as published:
             for draft in drafts:
-                with draft.one_line_errors():
+                with _one_line_errors(draft.path):
                     draft.publish()
                 published.append(draft.path)
 
@@ -208,6 +207,15 @@ def json_text(data: Any) -> str:
     return json.dumps(data, indent=2, ensure_ascii=False) + "\n"
 
 
+@contextmanager
+def _one_line_errors(path: Path) -> Iterator[None]:
+    """Convert OSError to RecordError."""
+    try:
+        yield
+    except (OSError, UnicodeEncodeError) as error:
+        raise RecordError(f"cannot write {path}: {_reason(error)}; nothing was changed there") from error
+
+
 class _Draft:
     """Content for ``path`` in a temporary file next to it; errors within its ``with`` name the path."""
 
@@ -215,7 +223,7 @@ class _Draft:
         self.path = path
 
     def __enter__(self) -> _Draft:
-        with self.one_line_errors():
+        with _one_line_errors(self.path):
             existing = self._existing()
             # Only this process uses the name: the file must not exist, and a link of that name is not followed.
             self._temporary = self._target.with_name(f".dynsim-{os.urandom(8).hex()}.tmp")
@@ -233,16 +241,8 @@ class _Draft:
         """Close, and remove the temporary file if it was not published."""
         self._discard()
         if isinstance(error, (OSError, UnicodeEncodeError)):
-            with self.one_line_errors():
+            with _one_line_errors(self.path):
                 raise error
-
-    @contextmanager
-    def one_line_errors(self) -> Iterator[None]:
-        """Convert OSError to RecordError."""
-        try:
-            yield
-        except (OSError, UnicodeEncodeError) as error:
-            raise RecordError(f"cannot write {self.path}: {_reason(error)}; nothing was changed there") from error
 
     def _discard(self) -> None:
         # A signal may have come before the stream was known.
@@ -270,9 +270,8 @@ class _Draft:
         return existing
 
     def _take_over(self, existing: os.stat_result | None) -> None:
-        """Lock the temporary file, and give it owner and mode of the file that it replaces."""
+        """Give the temporary file owner and mode of the file that it replaces."""
         descriptor = self.stream.fileno()
-        lock(descriptor, wait=False)
         if existing is not None and hasattr(os, "fchmod"):
             with suppress(OSError):  # only root may change the owner; otherwise the file remains ours
                 if (existing.st_uid, existing.st_gid) != (os.geteuid(), os.getegid()):
@@ -312,21 +311,10 @@ def lock(descriptor: int, *, wait: bool) -> bool:
 
 def _remove_left_behind(folder: Path) -> None:
     """Remove temporary files of processes that died."""
-    if fcntl is None:
-        return
-    with suppress(OSError), os.scandir(folder) as entries:
-        for entry in entries:
-            if not _TEMPORARY.fullmatch(entry.name):
-                continue
-            with suppress(OSError):
-                if time.time() - entry.stat(follow_symlinks=False).st_mtime < _LEFT_BEHIND:
-                    continue
-                descriptor = os.open(entry.path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
-                try:
-                    if lock(descriptor, wait=False):
-                        os.unlink(entry.path)
-                finally:
-                    os.close(descriptor)
+    for path in folder.glob(".dynsim-*.tmp"):
+        with suppress(OSError):
+            if time.time() - path.lstat().st_mtime > _LEFT_BEHIND:
+                path.unlink()
 
 
 @contextmanager
@@ -338,21 +326,18 @@ def _marked(folder: Path, names: Mapping[str, object]) -> Iterator[list[Path]]:
     """
     mark = folder / INCOMPLETE
     published: list[Path] = []
-    try:
+    with _one_line_errors(mark):
         stream, before = _open_mark(mark)
-    except OSError as error:
-        raise RecordError(f"cannot write {mark}: {_reason(error)}; nothing was changed there") from error
     with stream:
         try:
-            _rewrite_mark(stream, before | set(names))
+            with _one_line_errors(mark):
+                _rewrite_mark(stream, before | set(names))
             yield published
         except BaseException as error:
             if not published:
                 with suppress(OSError):
                     _remove_mark(mark, stream, before)
-            if isinstance(error, OSError):
-                raise RecordError(f"cannot write {mark}: {_reason(error)}; nothing was changed there") from error
-            if published and isinstance(error, RecordError):
+            elif isinstance(error, RecordError):
                 done = ", ".join(path.name for path in published)
                 raise RecordError(f"{error}; {done} came before, so {folder} is marked {INCOMPLETE}") from error
             raise

@@ -129,7 +129,7 @@ def test_what_dead_runs_left_is_removed_and_what_living_ones_write_is_not(tmp_pa
     with replacing(tmp_path / "file") as stream:
         (living,) = {*tmp_path.iterdir()} - {left, tmp_path / "own.tmp"}
         assert stream.writable()
-        for path in tmp_path.iterdir():
+        for path in (left, tmp_path / "own.tmp"):
             os.utime(path, (0, 0))
         write_text(tmp_path / "other", "x")
         assert living.exists()
