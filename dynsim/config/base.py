@@ -7,12 +7,23 @@ from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, GetCoreSchemaHandler
 from pydantic_core import PydanticCustomError
 
 Vector3 = Annotated[list[float], Field(min_length=3, max_length=3)]
+Pair = Annotated[list[float], Field(min_length=2, max_length=2)]
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
+Lengths = Annotated[list[Positive], Field(min_length=3, max_length=3)]
+
+
+def _nonzero(vector: list[float]) -> list[float]:
+    if np.linalg.norm(vector) < 1e-12:
+        raise ValueError("must not be the zero vector")
+    return vector
+
+
+Direction = Annotated[Vector3, AfterValidator(_nonzero)]
 
 
 def _forbid_conversion(schema: Any) -> None:
@@ -53,7 +64,7 @@ class BodyPoint(StrictConfig):
     """Point fixed on a body."""
 
     body: str = Field(description="name of the body, or of a frame fixed to a body")
-    point_m: Vector3 = Field(default=[0.0, 0.0, 0.0], description="coordinates in the axes of the body or frame")
+    point_m: Vector3 = Field([0.0, 0.0, 0.0], description="coordinates in the axes of the body or frame")
 
 
 def error_at(key: str, message: str) -> PydanticCustomError:

@@ -180,15 +180,13 @@ def limit(value: float | None) -> float:
 class DriveParameters(StrictConfig):
     """Motor of any kind: mass and continuous rating."""
 
-    mass_kg: NonNegative = Field(
-        default=0.0, description="mass of motor and gear, a point mass on the link before the joint"
-    )
+    mass_kg: NonNegative = Field(0.0, description="mass of motor and gear, a point mass on the link before the joint")
     mass_point_m: Vector3 | None = Field(
-        default=None, description="position of the mass in that link's frame; default: at the motor's joint"
+        None, description="position of the mass in that link's frame; default: at the motor's joint"
     )
 
     nominal_torque_N_m: Positive | None = Field(
-        default=None, description="continuous torque rating of motor and gear, at the joint; N at a prismatic joint"
+        None, description="continuous torque rating of motor and gear, at the joint; N at a prismatic joint"
     )
 
     @model_validator(mode="after")
@@ -216,15 +214,13 @@ class MotorParameters(DriveParameters):
     inductance_H: Positive
     rotor_inertia_kg_m2: NonNegative
     gear_ratio: Positive = Field(description="motor turns per joint turn; at a prismatic joint rad of the motor per m")
-    gear_damping_N_m_s_per_rad: NonNegative = Field(default=0.0, description="viscous, on the motor side")
+    gear_damping_N_m_s_per_rad: NonNegative = Field(0.0, description="viscous, on the motor side")
     coulomb_friction_N_m: NonNegative = Field(
-        default=0.0, description="dry friction of the gear, at the joint; N at a prismatic joint; unilateral law"
+        0.0, description="dry friction of the gear, at the joint; N at a prismatic joint; unilateral law"
     )
     voltage_limit_V: Positive | None = None
-    nominal_current_A: Positive | None = Field(
-        default=None, description="continuous rating: a run that exceeds it warns"
-    )
-    peak_current_A: Positive | None = Field(default=None, description="current limit of its driver")
+    nominal_current_A: Positive | None = Field(None, description="continuous rating: a run that exceeds it warns")
+    peak_current_A: Positive | None = Field(None, description="current limit of its driver")
 
     @model_validator(mode="after")
     def _check_currents(self) -> Self:
@@ -277,23 +273,21 @@ class ServoParameters(DriveParameters):
     stall_torque_N_m: Positive
     no_load_speed_rad_per_s: Positive
     mode: Literal["position", "velocity"] = Field(
-        default="position", description="part of the reference that the servo follows"
+        "position", description="part of the reference that the servo follows"
     )
-    k_p_V_per_rad: NonNegative = Field(default=0.0, description="position mode")
-    k_d_V_s_per_rad: NonNegative = Field(default=0.0, description="position mode")
-    k_v_V_s_per_rad: NonNegative = Field(default=0.0, description="velocity mode")
-    rotor_inertia_kg_m2: NonNegative = Field(default=0.0, description="rotor and gear, at the output shaft")
-    gear_damping_N_m_s_per_rad: NonNegative = Field(default=0.0, description="viscous, at the output shaft")
-    coulomb_friction_N_m: NonNegative = Field(default=0.0, description="friction of the gear, at the output shaft")
+    k_p_V_per_rad: NonNegative = Field(0.0, description="position mode")
+    k_d_V_s_per_rad: NonNegative = Field(0.0, description="position mode")
+    k_v_V_s_per_rad: NonNegative = Field(0.0, description="velocity mode")
+    rotor_inertia_kg_m2: NonNegative = Field(0.0, description="rotor and gear, at the output shaft")
+    gear_damping_N_m_s_per_rad: NonNegative = Field(0.0, description="viscous, at the output shaft")
+    coulomb_friction_N_m: NonNegative = Field(0.0, description="friction of the gear, at the output shaft")
     coulomb_speed_rad_per_s: Positive | None = Field(
-        default=None,
+        None,
         description="speed below which Coulomb friction fades; default: 0.01; under the unilateral law dry friction",
     )
     current_limit_A: Positive | None = None
-    torque_limit_N_m: Positive | None = Field(default=None, description="current limit as torque without gear friction")
-    nominal_current_A: Positive | None = Field(
-        default=None, description="continuous rating: a run that exceeds it warns"
-    )
+    torque_limit_N_m: Positive | None = Field(None, description="current limit as torque without gear friction")
+    nominal_current_A: Positive | None = Field(None, description="continuous rating: a run that exceeds it warns")
 
     @model_validator(mode="after")
     def _check_currents(self) -> Self:

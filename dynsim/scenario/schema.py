@@ -17,7 +17,18 @@ from pydantic import BaseModel, Field, PrivateAttr, StrictInt, field_validator, 
 
 from dynsim.compile.protocols import BuildContext
 from dynsim.compile.scene import WHEEL_WIDTH, turn_from_z
-from dynsim.config.base import BodyPoint, NonNegative, Positive, StrictConfig, Vector3, error_at, unit_vector
+from dynsim.config.base import (
+    BodyPoint,
+    Direction,
+    Lengths,
+    NonNegative,
+    Pair,
+    Positive,
+    StrictConfig,
+    Vector3,
+    error_at,
+    unit_vector,
+)
 from dynsim.config.problems import Origin, listed
 from dynsim.library.families import build, engine, section_defaults, union
 from dynsim.model.description import WORLD, Array, Foot, Frame, Inertia, Link, Tie
@@ -109,13 +120,12 @@ class TieConfig(StrictConfig):
 
     body: str = Field(description="first end: a body, or a frame fixed on a body")
     other: str = Field(description="second end: a body, a frame fixed on a body, or `world`")
-    axis: Vector3 = Field(description="direction of the tie, in the axes of `body`")
-    pushes: bool = Field(default=False, description="only push `body` along the axis, away from `other`")
-    holds: bool = Field(default=True, description="active at the start; `Simulation.set_tie` changes it")
+    axis: Direction = Field(description="direction of the tie, in the axes of `body`")
+    pushes: bool = Field(False, description="only push `body` along the axis, away from `other`")
+    holds: bool = Field(True, description="active at the start; `Simulation.set_tie` changes it")
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        unit_vector(self.axis, "axis")
         if self.body == self.other:
             raise error_at("other", f"must differ from body ({self.body!r}); a tie connects two bodies")
         stiffness, damping, bound = self.LAW
@@ -139,12 +149,12 @@ class Linear(TieConfig):
     LAW = "stiffness_N_per_m", "damping_N_s_per_m", "bound_N"
 
     type: Literal["linear"]
-    point_m: Vector3 = Field(default=[0.0, 0.0, 0.0], description="point of `body`, in its axes from its origin")
-    other_point_m: Vector3 = Field(default=[0.0, 0.0, 0.0], description="point of `other`, in its axes from its origin")
-    stiffness_N_per_m: NonNegative = Field(default=0.0, description="stiffness k")
-    damping_N_s_per_m: NonNegative = Field(default=0.0, description="damping c")
-    bound_N: Positive | None = Field(default=None, description="force limit, beyond which x_0 moves; default: no limit")
-    rest_m: float | None = Field(default=None, description="rest length x_0; default: x at the start")
+    point_m: Vector3 = Field([0.0, 0.0, 0.0], description="point of `body`, in its axes from its origin")
+    other_point_m: Vector3 = Field([0.0, 0.0, 0.0], description="point of `other`, in its axes from its origin")
+    stiffness_N_per_m: NonNegative = Field(0.0, description="stiffness k")
+    damping_N_s_per_m: NonNegative = Field(0.0, description="damping c")
+    bound_N: Positive | None = Field(None, description="force limit, beyond which x_0 moves; default: no limit")
+    rest_m: float | None = Field(None, description="rest length x_0; default: x at the start")
 
     def tie(self, name: str) -> Tie:
         """Return the tie."""
@@ -160,11 +170,9 @@ class Torsion(TieConfig):
     LAW = "stiffness_N_m_per_rad", "damping_N_m_s_per_rad", "bound_N_m"
 
     type: Literal["torsion"]
-    stiffness_N_m_per_rad: NonNegative = Field(default=0.0, description="stiffness k")
-    damping_N_m_s_per_rad: NonNegative = Field(default=0.0, description="damping c")
-    bound_N_m: Positive | None = Field(
-        default=None, description="torque limit, beyond which x_0 moves; default: no limit"
-    )
+    stiffness_N_m_per_rad: NonNegative = Field(0.0, description="stiffness k")
+    damping_N_m_s_per_rad: NonNegative = Field(0.0, description="damping c")
+    bound_N_m: Positive | None = Field(None, description="torque limit, beyond which x_0 moves; default: no limit")
 
     def tie(self, name: str) -> Tie:
         """Return the tie."""
@@ -186,15 +194,15 @@ Pieces = tuple[NDArray[np.float64], NDArray[np.float64]]
 class WrenchConfig(BodyPoint):
     """Point of application of a wrench, and the axes of its components."""
 
-    frame: Literal["world", "body"] = Field(default="world", description="axes of the force and torque components")
+    frame: Literal["world", "body"] = Field("world", description="axes of the force and torque components")
 
 
 class Constant(WrenchConfig):
     """Constant force and torque."""
 
     type: Literal["constant"]
-    force_N: Vector3 = Field(default=[0.0, 0.0, 0.0], description="force at the point")
-    torque_N_m: Vector3 = Field(default=[0.0, 0.0, 0.0], description="torque about the point")
+    force_N: Vector3 = Field([0.0, 0.0, 0.0], description="force at the point")
+    torque_N_m: Vector3 = Field([0.0, 0.0, 0.0], description="torque about the point")
 
     @property
     def hold(self) -> bool:
@@ -212,11 +220,10 @@ class Sampled(WrenchConfig):
     """Force and torque interpolated between samples."""
 
     interpolation: Literal["spline", "linear"] = Field(
-        default="spline",
-        description="`spline`: cubic, not-a-knot (a line for two samples, a parabola for three); or `linear`",
+        "spline", description="`spline`: cubic, not-a-knot (a line for two samples, a parabola for three); or `linear`"
     )
     hold: bool = Field(
-        default=False, description="hold the first and last sample outside the sampled times; default: zero there"
+        False, description="hold the first and last sample outside the sampled times; default: zero there"
     )
     # Computed at load time: a later edit of the file does not change a loaded scenario.
     _pieces: Pieces = PrivateAttr()
@@ -255,9 +262,9 @@ class Samples(Sampled):
 
     type: Literal["samples"]
     times_s: list[float] = Field(min_length=2, description="sample times, increasing")
-    force_N: list[Vector3] | None = Field(default=None, description="force at each time; default: no force")
+    force_N: list[Vector3] | None = Field(None, description="force at each time; default: no force")
     torque_N_m: list[Vector3] | None = Field(
-        default=None, description="torque about the point at each time; default: no torque"
+        None, description="torque about the point at each time; default: no torque"
     )
 
     @model_validator(mode="after")
@@ -302,9 +309,9 @@ class Payload(BodyPoint):
 
     type: Literal["payload"]
     mass_kg: NonNegative = Field(description="mass")
-    radius_m: NonNegative = Field(default=0.0, description="radius of a solid sphere; 0: a point mass")
+    radius_m: NonNegative = Field(0.0, description="radius of a solid sphere; 0: a point mass")
     inertia_kg_m2: Annotated[list[NonNegative], Field(min_length=3, max_length=3)] | None = Field(
-        default=None,
+        None,
         description="moments of inertia xx, yy, zz about the centre of mass, in the axes of `body`; "
         "default: solid sphere of `radius_m`",
     )
@@ -326,10 +333,6 @@ LoadConfig = Annotated[Constant | Samples | Table | Payload, Field(discriminator
 
 # The colour of wood, so that objects differ from the robot.
 COLOUR = (0.91, 0.81, 0.65, 1.0)
-Edges = Annotated[list[Positive], Field(min_length=3, max_length=3)]
-
-
-Pair = Annotated[list[float], Field(min_length=2, max_length=2)]
 
 
 class Guide(StrictConfig):
@@ -337,12 +340,7 @@ class Guide(StrictConfig):
 
     KIND: ClassVar[str]
 
-    axis: Vector3 = Field([0.0, 0.0, 1.0], description="axis of the joint, in the object's axes")
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        unit_vector(self.axis, "axis")
-        return self
+    axis: Direction = Field([0.0, 0.0, 1.0], description="axis of the joint, in the object's axes")
 
     def _joint(self, link: Link, damping: float, friction: float, limits: list[float] | None) -> Link:
         """Return the link on this joint, with limits [rad or m]."""
@@ -387,7 +385,7 @@ class Slide(Guide):
 
     KIND = "prismatic"
 
-    axis: Vector3 = Field([1.0, 0.0, 0.0], description="direction of the rails, in the object's axes")
+    axis: Direction = Field([1.0, 0.0, 0.0], description="direction of the rails, in the object's axes")
     friction_N: NonNegative = Field(0.0, description="dry friction force; unilateral law")
     damping_N_s_per_m: NonNegative = Field(0.0, description="viscous damping")
     limits_m: Pair | None = Field(None, description="lower and upper limit; default: no limits")
@@ -425,7 +423,7 @@ class Solid(StrictConfig):
 
     mass_kg: Positive = Field(description="mass")
     shape: Literal["box", "sphere", "cylinder"] = Field("box", description="shape")
-    size_m: Edges | None = Field(None, description="edge lengths of a box along its axes")
+    size_m: Lengths | None = Field(None, description="edge lengths of a box along its axes")
     radius_m: Positive | None = Field(None, description="radius of a sphere or cylinder")
     length_m: Positive | None = Field(None, description="length of a cylinder along its z axis")
 
@@ -499,29 +497,19 @@ class Grasp(StrictConfig):
     position_m: Vector3 = Field(
         [0.0, 0.0, 0.0], description="position of the gripper's tip, in the object's axes from its centre"
     )
-    axis: Vector3 = Field([1.0, 0.0, 0.0], description="pointing direction of the gripper, in the object's axes")
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        unit_vector(self.axis, "axis")
-        return self
+    axis: Direction = Field([1.0, 0.0, 0.0], description="pointing direction of the gripper, in the object's axes")
 
 
 class ObjectWheel(StrictConfig):
     """Wheel of an object: it touches surfaces as a sphere and has the inertia of a disc."""
 
     position_m: Vector3 = Field(description="position of the wheel's centre, in the object's axes from its centre")
-    axis: Vector3 = Field([0.0, 1.0, 0.0], description="axle, in the object's axes")
+    axis: Direction = Field([0.0, 1.0, 0.0], description="axle, in the object's axes")
     radius_m: Positive = Field(description="radius")
     mass_kg: Positive = Field(description="mass")
     friction_N_m: NonNegative = Field(0.0, description="dry friction torque of the bearing; unilateral law")
     damping_N_m_s_per_rad: NonNegative = Field(0.0, description="viscous damping")
     motor: union("motor") | None = Field(None, description="motor; default: no motor")  # type: ignore[valid-type]
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        unit_vector(self.axis, "axis")
-        return self
 
     def link(self, name: str, carrier: str) -> Link:
         """Return the wheel's link on the body `carrier`; I = m r²/2 about the axle, m r²/4 across it."""
@@ -547,7 +535,7 @@ class SceneObject(StrictConfig):
 
     mass_kg: Positive | None = Field(None, description="mass; with `shape: parts` the sum of the masses of the parts")
     shape: Literal["box", "sphere", "cylinder", "parts"] = Field("box", description="shape")
-    size_m: Edges | None = Field(None, description="edge lengths of a box along its axes")
+    size_m: Lengths | None = Field(None, description="edge lengths of a box along its axes")
     radius_m: Positive | None = Field(None, description="radius of a sphere or cylinder")
     length_m: Positive | None = Field(None, description="length of a cylinder along its z axis")
     parts: Annotated[dict[str, Part], Field(min_length=1)] | None = Field(
@@ -736,94 +724,82 @@ Share = Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)]
 class Grip(StrictConfig):
     """Friction that differs along and across an axis of the body, like the friction of a wheel."""
 
-    axis: Vector3 = Field(
+    axis: Direction = Field(
         description="direction of the reduced friction in the axes of the body or frame, projected onto the surface"
     )
     ratio: Share = Field(
         description="friction along the axis as a fraction of the friction across it; 0: it rolls freely"
     )
 
-    @field_validator("axis")
-    @classmethod
-    def _check_axis(cls, value: list[float]) -> list[float]:
-        if not any(value):
-            raise ValueError("must not be the zero vector")
-        return value
-
 
 class ContactPoint(BodyPoint):
     """Contact of a point fixed on a body, or of a sphere around it, with a surface."""
 
-    surface: str = Field(default="floor", description="name of a surface")
-    radius_m: NonNegative = Field(default=0.0, description="radius of a sphere around the point; 0: the point touches")
-    friction: NonNegative | None = Field(
-        default=None, description="kinetic coefficient μ; default: `contacts.friction`"
-    )
+    surface: str = Field("floor", description="name of a surface")
+    radius_m: NonNegative = Field(0.0, description="radius of a sphere around the point; 0: the point touches")
+    friction: NonNegative | None = Field(None, description="kinetic coefficient μ; default: `contacts.friction`")
     static_friction: NonNegative | None = Field(
-        default=None, description="static coefficient μ_s; default: `contacts.static_friction`; unilateral law"
+        None, description="static coefficient μ_s; default: `contacts.static_friction`; unilateral law"
     )
     restitution: Share | None = Field(
-        default=None, description="coefficient of restitution; default: `contacts.restitution`; unilateral law"
+        None, description="coefficient of restitution; default: `contacts.restitution`; unilateral law"
     )
-    grip: Grip | None = Field(default=None, description="anisotropic friction; default: isotropic; time_stepping only")
+    grip: Grip | None = Field(None, description="anisotropic friction; default: isotropic; time_stepping only")
     stiffness_N_per_m: Positive | None = Field(
-        default=None,
-        description="stiffness along the normal; default: `contacts.stiffness_N_per_m`; time_stepping only",
+        None, description="stiffness along the normal; default: `contacts.stiffness_N_per_m`; time_stepping only"
     )
     damping_N_s_per_m: NonNegative | None = Field(
-        default=None, description="damping along the normal; default: `contacts.damping_N_s_per_m`; time_stepping only"
+        None, description="damping along the normal; default: `contacts.damping_N_s_per_m`; time_stepping only"
     )
-    enabled: bool = Field(default=True, description="whether the point can touch")
+    enabled: bool = Field(True, description="whether the point can touch")
 
 
 class Contacts(StrictConfig):
     """Contact law, friction and contact points."""
 
     law: Literal["bilateral", "unilateral"] = Field(
-        default="bilateral",
+        "bilateral",
         description="`bilateral`: points stay on their surfaces, with normal forces of any sign; "
         "`unilateral`: surfaces only push, and points stick, slip and lift off",
     )
-    friction: NonNegative = Field(default=0.1, description="kinetic coefficient μ")
+    friction: NonNegative = Field(0.1, description="kinetic coefficient μ")
     static_friction: NonNegative | None = Field(
-        default=None, description="static coefficient μ_s, at least `friction`; default: `friction`; unilateral law"
+        None, description="static coefficient μ_s, at least `friction`; default: `friction`; unilateral law"
     )
     stribeck_m_s: Positive | None = Field(
-        default=None,
+        None,
         description="Stribeck speed v_s of μ + (μ_s − μ) exp(−(v/v_s)²); "
         "default: μ as soon as the point slips; unilateral law",
     )
     viscous_friction_s_per_m: NonNegative = Field(
-        default=0.0, description="increase of the coefficient per m/s of slip; unilateral law"
+        0.0, description="increase of the coefficient per m/s of slip; unilateral law"
     )
-    restitution: Share = Field(
-        default=0.0, description="coefficient of restitution for the normal speed; unilateral law"
-    )
+    restitution: Share = Field(0.0, description="coefficient of restitution for the normal speed; unilateral law")
     stiffness_N_per_m: Positive | None = Field(
-        default=None, description="contact stiffness along the normal; default: rigid; time_stepping only"
+        None, description="contact stiffness along the normal; default: rigid; time_stepping only"
     )
     damping_N_s_per_m: NonNegative = Field(
-        default=0.0, description="damping of compliant contacts along the normal; time_stepping only"
+        0.0, description="damping of compliant contacts along the normal; time_stepping only"
     )
     slip_smoothing_m_s: Positive = Field(
-        default=1e-3, description="v_s of the smoothed slip direction v_t/√(v_t² + v_s²); bilateral law"
+        1e-3, description="v_s of the smoothed slip direction v_t/√(v_t² + v_s²); bilateral law"
     )
     pulling_friction: Literal["signed", "dissipative"] = Field(
-        default="dissipative",
+        "dissipative",
         description="friction of a pulling contact: `signed` f_t = μ f_n as printed in the paper, "
         "`dissipative` f_t = μ |f_n|; bilateral law",
     )
     reference_tolerance_m: Positive = Field(
-        default=2e-3,
+        2e-3,
         description="maximum distance of a contact point from its surface along the references; "
         "an error if exceeded; bilateral law",
     )
     candidates: Literal["points", "joints", "links"] = Field(
-        default="points",
+        "points",
         description="contacts in addition to `points`: none (`points`), all joints and the hand (`joints`), "
         "or the links as capsules (`links`)",
     )
-    points: dict[str, ContactPoint] = Field(default={}, description="named contact points")
+    points: dict[str, ContactPoint] = Field({}, description="named contact points")
 
     def coefficients(self, point: ContactPoint | None = None) -> tuple[float, float]:
         """Return the kinetic and static coefficient of a point, or of all contacts.
@@ -888,14 +864,14 @@ class Initial(StrictConfig):
     """Start of a run: smallest change of the plant's initial posture, and initial motor currents."""
 
     on_surface: list[str] = Field(
-        default=[], description="contact points, enabled or disabled, that start exactly on their surfaces"
+        [], description="contact points, enabled or disabled, that start exactly on their surfaces"
     )
     keep: list[str] = Field(
-        default=[], description="joints that `on_surface` must not move; `hand` keeps the position of the hand"
+        [], description="joints that `on_surface` must not move; `hand` keeps the position of the hand"
     )
-    on_references: bool = Field(default=False, description="start joints with waypoints at their first waypoint")
+    on_references: bool = Field(False, description="start joints with waypoints at their first waypoint")
     equilibrium: bool = Field(
-        default=False, description="start with the motor currents of least heat that hold the robot at rest"
+        False, description="start with the motor currents of least heat that hold the robot at rest"
     )
 
     @model_validator(mode="after")
@@ -914,43 +890,40 @@ class Initial(StrictConfig):
 class SurfaceError(StrictConfig):
     """Difference between the simulated surfaces and the surfaces that the controller assumes."""
 
-    shift_m: Vector3 = Field(default=[0.0, 0.0, 0.0], description="displacement of all surfaces in the world")
-    friction_factor: NonNegative = Field(default=1.0, description="factor on all coefficients of friction")
+    shift_m: Vector3 = Field([0.0, 0.0, 0.0], description="displacement of all surfaces in the world")
+    friction_factor: NonNegative = Field(1.0, description="factor on all coefficients of friction")
 
 
 class Integrator(StrictConfig):
     """Time integration."""
 
     method: Literal[METHODS] = Field(  # type: ignore[valid-type]
-        default="auto",
+        "auto",
         description="integration method; `auto`: `dopri5` or `radau5`, depending on the system; `dopri5`: adaptive, "
         "explicit 5(4); `radau5`: adaptive, implicit (for stiff motors); `time_stepping`: fixed step, with contacts "
         "that open and close",
     )
     solver: Literal["articulated", "m_star"] = Field(
-        default="articulated",
+        "articulated",
         description="equations of motion by O(n) sweeps (`articulated`) or the dense matrix M* (`m_star`)",
     )
-    rtol: float = Field(default=1e-6, ge=1e-13, le=1e-1, description="relative tolerance of adaptive methods")
+    rtol: float = Field(1e-6, ge=1e-13, le=1e-1, description="relative tolerance of adaptive methods")
     atol: float | None = Field(
-        default=None,
-        ge=1e-16,
-        le=1e-1,
-        description="absolute tolerance; default: rtol/100, at most 1e-8",
+        None, ge=1e-16, le=1e-1, description="absolute tolerance; default: rtol/100, at most 1e-8"
     )
     step_s: Positive | None = Field(
-        default=None,
+        None,
         description="fixed step of time_stepping, default: 0.001; first step of adaptive methods, default: automatic",
     )
     theta: float = Field(
-        default=THETA,
+        THETA,
         ge=0.5,
         le=1.0,
         description="implicitness of time_stepping: 0.5 is second order between events, 1 adds numerical damping",
     )
-    step_max_s: Positive | None = Field(default=None, description="maximum step of adaptive methods; default: no limit")
+    step_max_s: Positive | None = Field(None, description="maximum step of adaptive methods; default: no limit")
     wall_limit_s: Positive | None = Field(
-        default=None,
+        None,
         description="maximum wall-clock time of the integration; default: no limit; "
         "an error if the estimate exceeds ten times the limit",
     )
@@ -971,14 +944,14 @@ class Integrator(StrictConfig):
 class RecordOptions(StrictConfig):
     """Sampling rate and size limit of the record."""
 
-    rate_hz: Positive = Field(default=200.0, description="sampling rate of the record")
-    size_limit_GB: Positive = Field(default=2.0, description="maximum size of the record; a larger record is an error")
+    rate_hz: Positive = Field(200.0, description="sampling rate of the record")
+    size_limit_GB: Positive = Field(2.0, description="maximum size of the record; a larger record is an error")
 
 
 class Metrics(StrictConfig):
     """Options of the summary."""
 
-    settle_s: NonNegative = Field(default=2.0, description="time from which tracking errors are evaluated")
+    settle_s: NonNegative = Field(2.0, description="time from which tracking errors are evaluated")
 
 
 def merge_defaults(defaults: Any, values: Any) -> Any:
@@ -991,34 +964,34 @@ def merge_defaults(defaults: Any, values: Any) -> Any:
 class ScenarioConfig(StrictConfig):
     """Scenario file of dynsim."""
 
-    name: str = Field(default="", description="name of the scenario; default: the file name without extension")
-    variant: str = Field(default="", description="name of the variant; written into resolved scenarios")
-    description: str = Field(default="", description="text about the scenario")
+    name: str = Field("", description="name of the scenario; default: the file name without extension")
+    variant: str = Field("", description="name of the variant; written into resolved scenarios")
+    description: str = Field("", description="text about the scenario")
     duration_s: Positive = Field(description="simulated time")
     plant: union("plant") = Field(description="robot")  # type: ignore[valid-type]
     controller: union("controller") | None = Field(  # type: ignore[valid-type]
-        default=None, description="controller; default: none, with the motors short-circuited"
+        None, description="controller; default: none, with the motors short-circuited"
     )
     surfaces: dict[str, union("surface")] = Field(  # type: ignore[valid-type]
-        default={}, description="named surfaces"
+        {}, description="named surfaces"
     )
-    contacts: Contacts = Field(default=Contacts(), description="contact law, friction and contact points")
+    contacts: Contacts = Field(Contacts(), description="contact law, friction and contact points")
     surface_error: SurfaceError | None = Field(
-        default=None, description="difference between the surfaces and the controller's assumptions; default: none"
+        None, description="difference between the surfaces and the controller's assumptions; default: none"
     )
     initial: Initial | None = Field(
-        default=None, description="changes to the initial posture and motor currents; default: as in the plant"
+        None, description="changes to the initial posture and motor currents; default: as in the plant"
     )
-    loads: dict[str, LoadConfig] = Field(default={}, description="named forces, torques and payloads")
-    objects: dict[str, SceneObject] = Field(default={}, description="named bodies in addition to the robot")
-    ties: dict[str, TieChoice] = Field(default={}, description="named springs and dampers between two bodies")
+    loads: dict[str, LoadConfig] = Field({}, description="named forces, torques and payloads")
+    objects: dict[str, SceneObject] = Field({}, description="named bodies in addition to the robot")
+    ties: dict[str, TieChoice] = Field({}, description="named springs and dampers between two bodies")
     sensors: Sensors | None = Field(
-        default=None,
+        None,
         description="sensors of a sampled controller (default: the exact state without delay), and recorded sensors",
     )
-    integrator: Integrator = Field(default=Integrator(), description="time integration")
-    record: RecordOptions = Field(default=RecordOptions(), description="sampling rate and size limit of the record")
-    metrics: Metrics = Field(default=Metrics(), description="options of the summary")
+    integrator: Integrator = Field(Integrator(), description="time integration")
+    record: RecordOptions = Field(RecordOptions(), description="sampling rate and size limit of the record")
+    metrics: Metrics = Field(Metrics(), description="options of the summary")
 
     @model_validator(mode="before")
     @classmethod

@@ -25,7 +25,7 @@ class Config(StrictConfig):
         description="turn of the heading, positive to the left; with the sign opposite to radius_m the base reverses"
     )
     duration_s: Positive = Field(description="duration of the motion")
-    start_s: NonNegative = Field(default=0.0, description="start time of the motion")
+    start_s: NonNegative = Field(0.0, description="start time of the motion")
 
     def motion(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return distance R ψ [m] and turn ψ = α s(x) [rad] at times t [s], shape (T, 2)."""

@@ -35,8 +35,7 @@ class Config(StrictConfig):
         "t_s,V_m_s,omega_rad_s"
     )
     frame: Literal["world", "start"] | None = Field(
-        default=None,
-        description="frame of x_m and y_m: `world`, or `start` (the base at its start, x ahead); default: world",
+        None, description="frame of x_m and y_m: `world`, or `start` (the base at its start, x ahead); default: world"
     )
     # Read once: an edit of the file does not change a loaded scenario.
     _rows: NDArray[np.float64] = PrivateAttr()

@@ -20,7 +20,7 @@ class Config(StrictConfig):
     type: Literal["straight"]
     distance_m: float = Field(description="distance along the heading; negative: backward")
     duration_s: Positive = Field(description="duration of the motion")
-    start_s: NonNegative = Field(default=0.0, description="start time of the motion")
+    start_s: NonNegative = Field(0.0, description="start time of the motion")
 
     def motion(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return distance d s(x) [m] and zero turn at times t [s], shape (T, 2)."""

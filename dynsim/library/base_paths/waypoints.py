@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from typing import Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -11,9 +11,7 @@ from scipy.interpolate import BPoly
 from dynsim.compile.control import BasePath
 from dynsim.compile.protocols import BuildContext
 from dynsim.compile.references.plane_curve import AlongCurve, PlaneCurve, seen_from_start
-from dynsim.config.base import NonNegative, StrictConfig, check_waypoints
-
-Point = Annotated[list[float], Field(min_length=2, max_length=2)]
+from dynsim.config.base import NonNegative, Pair, StrictConfig, check_waypoints
 
 
 class Config(StrictConfig):
@@ -21,9 +19,9 @@ class Config(StrictConfig):
 
     type: Literal["waypoints"]
     times_s: list[NonNegative] = Field(min_length=2, description="times of the points, increasing")
-    points_m: list[Point] = Field(min_length=2, description="x and y of the points; the base starts at the first")
+    points_m: list[Pair] = Field(min_length=2, description="x and y of the points; the base starts at the first")
     frame: Literal["world", "start"] = Field(
-        default="world", description="frame of the points: `world`, or `start` (the base at its start, x ahead)"
+        "world", description="frame of the points: `world`, or `start` (the base at its start, x ahead)"
     )
 
     @model_validator(mode="after")

@@ -57,15 +57,15 @@ class HandReference(StrictConfig):
 
     path: PathChoice = Field(description="path of the hand")
     orientation: Orientation | None = Field(
-        default=None, description="constant attitude of the hand's body or frame; default: free"
+        None, description="constant attitude of the hand's body or frame; default: free"
     )
     joints: list[str] = Field(
         description="joints that follow the path, while the other joints hold; an empty list if `controller.joints` "
         "moves the hand along the path"
     )
-    braces: list[str] = Field(default=[], description="contact points that the joints keep on their surfaces")
+    braces: list[str] = Field([], description="contact points that the joints keep on their surfaces")
     tolerance_m: Positive = Field(
-        default=1e-6, description="maximum position error; a larger error means that the path is out of reach"
+        1e-6, description="maximum position error; a larger error means that the path is out of reach"
     )
 
 
@@ -79,10 +79,10 @@ class JointPath(StrictConfig):
     """Waypoints of one joint: a cubic spline with zero rate at both ends, constant beyond them."""
 
     times_s: list[float] = Field(min_length=2, description="times of the waypoints, increasing")
-    angles_deg: list[float] | None = Field(default=None, min_length=2, description="angles of a revolute joint")
-    positions_m: list[float] | None = Field(default=None, min_length=2, description="positions of a prismatic joint")
+    angles_deg: list[float] | None = Field(None, min_length=2, description="angles of a revolute joint")
+    positions_m: list[float] | None = Field(None, min_length=2, description="positions of a prismatic joint")
     ends: Literal["rest", "free"] = Field(
-        default="rest", description="ends of the spline: `rest` (zero rate) or `free` (zero curvature)"
+        "rest", description="ends of the spline: `rest` (zero rate) or `free` (zero curvature)"
     )
 
     @model_validator(mode="after")
@@ -125,37 +125,33 @@ class Config(StrictConfig):
 
     type: Literal["joint_pd"]
     k_p_V_per_rad: NonNegative | list[NonNegative] | None = Field(
-        default=None,
-        description="position gain, one value or one per DC motor; V/m at a prismatic joint; default: 500",
+        None, description="position gain, one value or one per DC motor; V/m at a prismatic joint; default: 500"
     )
     k_d_V_s_per_rad: NonNegative | list[NonNegative] | None = Field(
-        default=None,
-        description="rate gain, one value or one per DC motor; V s/m at a prismatic joint; default: 20",
+        None, description="rate gain, one value or one per DC motor; V s/m at a prismatic joint; default: 20"
     )
-    hand: HandReference | None = Field(default=None, description="path of the hand; default: no path")
-    base: BaseReference | None = Field(default=None, description="path of the mobile base; default: it holds")
+    hand: HandReference | None = Field(None, description="path of the hand; default: no path")
+    base: BaseReference | None = Field(None, description="path of the mobile base; default: it holds")
     operator: OperatorConfig | None = Field(
-        default=None, description="velocities of hand and mobile base, instead of paths; default: no operator"
+        None, description="velocities of hand and mobile base, instead of paths; default: no operator"
     )
-    joints: dict[str, JointPath] = Field(default={}, description="waypoints of the named joints")
-    torques: dict[str, TorquePath] = Field(
-        default={}, description="torques of the named joints with motors of type torque"
-    )
+    joints: dict[str, JointPath] = Field({}, description="waypoints of the named joints")
+    torques: dict[str, TorquePath] = Field({}, description="torques of the named joints with motors of type torque")
     feed_forward: Literal["none", "gravity", "dynamics"] = Field(
-        default="none",
+        "none",
         description="planned voltages of DC motors along the references, added to the PD: none, for gravity, or for "
         "the full dynamics",
     )
     brace: Literal["optimal"] | dict[str, Positive] | None = Field(
-        default=None,
+        None,
         description="normal forces [N] of the named contacts, or `optimal` for forces of least heat; voltages are "
         "then planned for the full dynamics with these forces; default: no planned forces",
     )
-    min_N: NonNegative = Field(default=MIN_N, description="minimum normal force of each brace with `brace: optimal`")
+    min_N: NonNegative = Field(MIN_N, description="minimum normal force of each brace with `brace: optimal`")
     sample_time_s: Positive | None = Field(
-        default=None, description="sampling period of the commands, held in between; default: continuous"
+        None, description="sampling period of the commands, held in between; default: continuous"
     )
-    knot_spacing_s: Positive = Field(default=0.02, description="knot spacing of the reference splines")
+    knot_spacing_s: Positive = Field(0.02, description="knot spacing of the reference splines")
 
     @field_validator("brace", mode="before")
     @classmethod

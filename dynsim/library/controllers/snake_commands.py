@@ -34,8 +34,7 @@ class SnakeCommand(StrictConfig):
         "default: unchanged",
     )
     mode: int | Literal["switching", "fixing"] | None = Field(
-        None,
-        description="number of a mode to fix, or `switching` or `fixing` to enter that state; default: unchanged",
+        None, description="number of a mode to fix, or `switching` or `fixing` to enter that state; default: unchanged"
     )
     gripper: Literal["open", "closed"] | None = Field(None, description="gripper command; default: unchanged")
 

@@ -63,8 +63,7 @@ class Switching(StrictConfig):
         0.0, description="minimum support margin; a mode with a smaller or equal margin counts as tipping"
     )
     when_blocked: bool = Field(
-        False,
-        description="enter the switching state automatically when a command cannot be executed; the target waits",
+        False, description="enter the switching state automatically when a command cannot be executed; the target waits"
     )
     release_fraction: Annotated[float, Field(gt=0, lt=1)] = Field(
         0.6,
@@ -109,8 +108,7 @@ class Config(Script):
         "printed, `eq20_min`: adds 1/smallest support distance, smoothed",
     )
     cost_matrix: list[NonNegative] | None = Field(
-        None,
-        description="diagonal of K_V; default: [T] V.B (head yaw 15, head pitch 0.015, base 9.6, 4.8, 2.4, ...)",
+        None, description="diagonal of K_V; default: [T] V.B (head yaw 15, head pitch 0.015, base 9.6, 4.8, 2.4, ...)"
     )
     cost_angle_weight: NonNegative = Field(1.0, description="weight a_1 of the joint angles in eq 20 (assumed)")
     cost_support_weight_m: NonNegative = Field(

@@ -21,19 +21,17 @@ class Config(ServoParameters):
     """Servo with 8.4 N m and 45 rpm; gain, gear friction and rotor inertia are not from the data sheet."""
 
     type: Literal["mx_106"]
-    voltage_V: Positive = Field(default=12.0, description="supply voltage of the data sheet; also limits the voltage")
-    stall_torque_N_m: Positive = Field(default=8.4, description="stall torque (data sheet)")
-    no_load_speed_rad_per_s: Positive = Field(default=4.71, description="no-load speed, 45 rpm (data sheet)")
-    nominal_torque_N_m: Positive | None = Field(
-        default=1.68, description="continuous torque: a fifth of the stall torque"
-    )
+    voltage_V: Positive = Field(12.0, description="supply voltage of the data sheet; also limits the voltage")
+    stall_torque_N_m: Positive = Field(8.4, description="stall torque (data sheet)")
+    no_load_speed_rad_per_s: Positive = Field(4.71, description="no-load speed, 45 rpm (data sheet)")
+    nominal_torque_N_m: Positive | None = Field(1.68, description="continuous torque: a fifth of the stall torque")
     k_p_V_per_rad: NonNegative = Field(
-        default=58.6, description="gain in position mode: 41 N m/rad, fitted to the measured sag of T2 Snake-3"
+        58.6, description="gain in position mode: 41 N m/rad, fitted to the measured sag of T2 Snake-3"
     )
     coulomb_friction_N_m: NonNegative = Field(
-        default=0.8, description="gear friction, fitted to the measured sag of T2 Snake-3"
+        0.8, description="gear friction, fitted to the measured sag of T2 Snake-3"
     )
-    rotor_inertia_kg_m2: NonNegative = Field(default=0.01, description="rotor inertia at the output shaft (assumed)")
+    rotor_inertia_kg_m2: NonNegative = Field(0.01, description="rotor inertia at the output shaft (assumed)")
 
 
 def build(config: Config, context: BuildContext) -> Servo:

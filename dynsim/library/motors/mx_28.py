@@ -20,15 +20,13 @@ class Config(ServoParameters):
     """Servo with 2.5 N m and 55 rpm; gain and rotor inertia are not from the data sheet."""
 
     type: Literal["mx_28"]
-    voltage_V: Positive = Field(default=12.0, description="supply voltage of the data sheet; also limits the voltage")
-    stall_torque_N_m: Positive = Field(default=2.5, description="stall torque (data sheet)")
-    no_load_speed_rad_per_s: Positive = Field(default=5.76, description="no-load speed, 55 rpm (data sheet)")
-    nominal_torque_N_m: Positive | None = Field(
-        default=0.5, description="continuous torque: a fifth of the stall torque"
-    )
-    mode: Literal["position", "velocity"] = Field(default="velocity", description="quantity that the servo controls")
-    k_v_V_s_per_rad: NonNegative = Field(default=20.0, description="gain in velocity mode (assumed)")
-    rotor_inertia_kg_m2: NonNegative = Field(default=2e-4, description="rotor inertia at the output shaft (assumed)")
+    voltage_V: Positive = Field(12.0, description="supply voltage of the data sheet; also limits the voltage")
+    stall_torque_N_m: Positive = Field(2.5, description="stall torque (data sheet)")
+    no_load_speed_rad_per_s: Positive = Field(5.76, description="no-load speed, 55 rpm (data sheet)")
+    nominal_torque_N_m: Positive | None = Field(0.5, description="continuous torque: a fifth of the stall torque")
+    mode: Literal["position", "velocity"] = Field("velocity", description="quantity that the servo controls")
+    k_v_V_s_per_rad: NonNegative = Field(20.0, description="gain in velocity mode (assumed)")
+    rotor_inertia_kg_m2: NonNegative = Field(2e-4, description="rotor inertia at the output shaft (assumed)")
 
 
 def build(config: Config, context: BuildContext) -> Servo:

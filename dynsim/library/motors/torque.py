@@ -15,9 +15,7 @@ class Config(DriveParameters):
     """Torque source that follows `controller.torques` within its limit."""
 
     type: Literal["torque"]
-    limit_N_m: Positive | None = Field(
-        default=None, description="torque limit; N at a prismatic joint; default: no limit"
-    )
+    limit_N_m: Positive | None = Field(None, description="torque limit; N at a prismatic joint; default: no limit")
 
 
 def build(config: Config, context: BuildContext) -> TorqueSource:

@@ -19,13 +19,12 @@ class Config(StrictConfig):
     type: Literal["circle"]
     center_m: Vector3 = Field(description="centre in the world")
     radius_m: Positive = Field(description="radius")
-    normal: Vector3 = Field(default=[0.0, 0.0, 1.0], description="normal of the plane")
+    normal: Vector3 = Field([0.0, 0.0, 1.0], description="normal of the plane")
     start: Vector3 = Field(
-        default=[1.0, 0.0, 0.0],
-        description="direction from the centre to the first point, projected onto the plane",
+        [1.0, 0.0, 0.0], description="direction from the centre to the first point, projected onto the plane"
     )
-    period_s: Positive = Field(default=10.0, description="duration of one turn")
-    clockwise: bool = Field(default=False, description="clockwise about the normal")
+    period_s: Positive = Field(10.0, description="duration of one turn")
+    clockwise: bool = Field(False, description="clockwise about the normal")
 
     @model_validator(mode="after")
     def _check(self) -> Self:

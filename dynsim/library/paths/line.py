@@ -20,7 +20,7 @@ class Config(StrictConfig):
     type: Literal["line"]
     from_m: Vector3 = Field(description="first point in the world")
     to_m: Vector3 = Field(description="last point in the world")
-    start_s: NonNegative = Field(default=0.0, description="start time of the motion")
+    start_s: NonNegative = Field(0.0, description="start time of the motion")
     duration_s: Positive = Field(description="duration of the motion")
 
     def position(self, t: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from dynsim.compile.protocols import BuildContext
-from dynsim.config.base import BodyPoint, NonNegative, Positive, StrictConfig, Vector3, error_at, unit_vector
+from dynsim.config.base import BodyPoint, NonNegative, Pair, Positive, StrictConfig, Vector3, error_at, unit_vector
 from dynsim.library import families
 from dynsim.model.description import Inertia, Link, Robot, vector
 from dynsim.model.drives import Drive
@@ -18,9 +18,6 @@ ENGINE = "dynamics"
 MotorChoice: Any = families.union("motor")
 AXES = {"x": [1.0, 0.0, 0.0], "y": [0.0, 1.0, 0.0], "z": [0.0, 0.0, 1.0]}
 
-
-Limits = Annotated[list[float], Field(min_length=2, max_length=2)]
-
 # Maximum number of links of a chain; each takes some kilobytes before the simulation starts.
 LINKS_MAX = 100_000
 
@@ -28,38 +25,34 @@ LINKS_MAX = 100_000
 class LinkKeys(StrictConfig):
     """Keys of a joint and its link. The link extends from the joint along its +z axis."""
 
-    count: int = Field(default=1, ge=1, le=LINKS_MAX, description="number of equal links")
-    kind: Literal["revolute", "prismatic"] = Field(default="revolute", description="type of the joint")
-    axis: Literal["x", "y", "z"] | Vector3 = Field(default="y", description="joint axis in the link's frame")
-    length_m: NonNegative = Field(default=0.3, description="length of the link")
+    count: int = Field(1, ge=1, le=LINKS_MAX, description="number of equal links")
+    kind: Literal["revolute", "prismatic"] = Field("revolute", description="type of the joint")
+    axis: Literal["x", "y", "z"] | Vector3 = Field("y", description="joint axis in the link's frame")
+    length_m: NonNegative = Field(0.3, description="length of the link")
     radius_m: Positive = Field(
-        default=0.01,
+        0.01,
         description="radius of the solid cylinder that defines the inertia, and depth below a surface beyond which a "
         "warning reports the link",
     )
-    mass_kg: NonNegative = Field(default=0.1, description="mass of the link")
+    mass_kg: NonNegative = Field(0.1, description="mass of the link")
     com_m: Vector3 | None = Field(
-        default=None, description="centre of mass in the link's frame; default: the middle of the link"
+        None, description="centre of mass in the link's frame; default: the middle of the link"
     )
     inertia_kg_m2: list[float] | None = Field(
-        default=None,
+        None,
         min_length=6,
         max_length=6,
         description="inertia tensor xx, xy, xz, yy, yz, zz about the centre of mass; default: solid cylinder",
     )
-    damping_N_m_s_per_rad: NonNegative = Field(default=0.0, description="viscous damping of a revolute joint")
-    damping_N_s_per_m: NonNegative = Field(default=0.0, description="viscous damping of a prismatic joint")
-    friction_N_m: NonNegative = Field(default=0.0, description="dry friction of a revolute joint; unilateral law")
-    friction_N: NonNegative = Field(default=0.0, description="dry friction of a prismatic joint; unilateral law")
-    motor: MotorChoice | None = Field(default=None, description="motor of the joint; default: no motor")
-    limit_deg: Limits | None = Field(
-        default=None, description="lower and upper stop of a revolute joint; default: no stops"
-    )
-    limit_m: Limits | None = Field(
-        default=None, description="lower and upper stop of a prismatic joint; default: no stops"
-    )
-    initial_deg: float = Field(default=0.0, description="initial angle of a revolute joint")
-    initial_m: float = Field(default=0.0, description="initial position of a prismatic joint")
+    damping_N_m_s_per_rad: NonNegative = Field(0.0, description="viscous damping of a revolute joint")
+    damping_N_s_per_m: NonNegative = Field(0.0, description="viscous damping of a prismatic joint")
+    friction_N_m: NonNegative = Field(0.0, description="dry friction of a revolute joint; unilateral law")
+    friction_N: NonNegative = Field(0.0, description="dry friction of a prismatic joint; unilateral law")
+    motor: MotorChoice | None = Field(None, description="motor of the joint; default: no motor")
+    limit_deg: Pair | None = Field(None, description="lower and upper stop of a revolute joint; default: no stops")
+    limit_m: Pair | None = Field(None, description="lower and upper stop of a prismatic joint; default: no stops")
+    initial_deg: float = Field(0.0, description="initial angle of a revolute joint")
+    initial_m: float = Field(0.0, description="initial position of a prismatic joint")
 
     @field_validator("axis")
     @classmethod
@@ -139,26 +132,23 @@ class LinkConfig(LinkKeys):
 class BaseConfig(StrictConfig):
     """Pose of the base of a serial chain."""
 
-    position_m: Vector3 = Field(default=[0.0, 0.0, 0.0], description="position of the first joint in the world")
-    yaw_deg: float = Field(default=0.0, description="rotation about the vertical axis")
+    position_m: Vector3 = Field([0.0, 0.0, 0.0], description="position of the first joint in the world")
+    yaw_deg: float = Field(0.0, description="rotation about the vertical axis")
 
 
 class Config(StrictConfig):
     """Serial chain: `chain` lists the links from the base to the hand, `link` sets defaults for all of them."""
 
     type: Literal["serial_arm"]
-    base: BaseConfig = Field(default=BaseConfig(), description="pose of the base")
-    gravity_m_s2: Vector3 = Field(default=[0.0, 0.0, -9.81], description="gravitational acceleration")
+    base: BaseConfig = Field(BaseConfig(), description="pose of the base")
+    gravity_m_s2: Vector3 = Field([0.0, 0.0, -9.81], description="gravitational acceleration")
     # Omitted from resolved scenarios, where every entry of the chain is complete.
-    link: LinkKeys | None = Field(
-        default=None, exclude=True, description="defaults for all entries of `chain`; default: none"
-    )
+    link: LinkKeys | None = Field(None, exclude=True, description="defaults for all entries of `chain`; default: none")
     chain: list[LinkConfig] = Field(min_length=1, description="links from the base to the hand")
     initial_deg: list[float] | None = Field(
-        default=None,
-        description="initial angles of all joints of a revolute chain; default: `initial_deg` of the links",
+        None, description="initial angles of all joints of a revolute chain; default: `initial_deg` of the links"
     )
-    hand: BodyPoint | None = Field(default=None, description="controlled point; default: the end of the last link")
+    hand: BodyPoint | None = Field(None, description="controlled point; default: the end of the last link")
 
     @model_validator(mode="before")
     @classmethod

@@ -26,8 +26,8 @@ MotorChoice: Any = families.union("motor")
 class PoseConfig(StrictConfig):
     """Pose of a body in the frame of its joint, R = Rz(yaw) Ry(pitch) Rx(roll)."""
 
-    position_m: Vector3 = Field(default=[0.0, 0.0, 0.0], description="position of the body")
-    rpy_deg: Vector3 = Field(default=[0.0, 0.0, 0.0], description="attitude of the body: roll, pitch, yaw")
+    position_m: Vector3 = Field([0.0, 0.0, 0.0], description="position of the body")
+    rpy_deg: Vector3 = Field([0.0, 0.0, 0.0], description="attitude of the body: roll, pitch, yaw")
 
 
 class Config(StrictConfig):
@@ -35,39 +35,36 @@ class Config(StrictConfig):
 
     type: Literal["urdf_arm"]
     file: str = Field(description="path of a URDF file, relative to the scenario file")
-    gravity_m_s2: Vector3 = Field(default=[0.0, 0.0, -9.81], description="gravitational acceleration")
+    gravity_m_s2: Vector3 = Field([0.0, 0.0, -9.81], description="gravitational acceleration")
     motor: MotorChoice | None = Field(
-        default=None,
-        description="motor of all joints that are not in `motors` and not coupled to a leader; default: no motor",
+        None, description="motor of all joints that are not in `motors` and not coupled to a leader; default: no motor"
     )
-    motors: dict[str, MotorChoice] = Field(default={}, description="motors of the named joints")
+    motors: dict[str, MotorChoice] = Field({}, description="motors of the named joints")
     damping_N_m_s_per_rad: NonNegative | None = Field(
-        default=None, description="viscous damping of all revolute joints; default: from the URDF"
+        None, description="viscous damping of all revolute joints; default: from the URDF"
     )
     damping_N_s_per_m: NonNegative | None = Field(
-        default=None, description="viscous damping of all prismatic joints; default: from the URDF"
+        None, description="viscous damping of all prismatic joints; default: from the URDF"
     )
     friction_N_m: NonNegative | None = Field(
-        default=None, description="dry friction of all revolute joints; default: from the URDF"
+        None, description="dry friction of all revolute joints; default: from the URDF"
     )
     friction_N: NonNegative | None = Field(
-        default=None, description="dry friction of all prismatic joints; default: from the URDF"
+        None, description="dry friction of all prismatic joints; default: from the URDF"
     )
     initial_deg: dict[str, float] = Field(
-        default={},
-        description="initial angles of the named revolute joints; default: 0, or the value of the coupling",
+        {}, description="initial angles of the named revolute joints; default: 0, or the value of the coupling"
     )
     initial_m: dict[str, float] = Field(
-        default={},
-        description="initial positions of the named prismatic joints; default: 0, or the value of the coupling",
+        {}, description="initial positions of the named prismatic joints; default: 0, or the value of the coupling"
     )
     initial_pose: dict[str, PoseConfig] = Field(
-        default={}, description="initial poses of the bodies of the named floating and planar joints"
+        {}, description="initial poses of the bodies of the named floating and planar joints"
     )
-    lock_deg: dict[str, float] = Field(default={}, description="angles of the named revolute joints that are locked")
-    lock_m: dict[str, float] = Field(default={}, description="positions of the named prismatic joints that are locked")
+    lock_deg: dict[str, float] = Field({}, description="angles of the named revolute joints that are locked")
+    lock_m: dict[str, float] = Field({}, description="positions of the named prismatic joints that are locked")
     hand: BodyPoint | None = Field(
-        default=None, description="controlled point on a body or in a frame; default: the tip of the longest chain"
+        None, description="controlled point on a body or in a frame; default: the tip of the longest chain"
     )
 
     @model_validator(mode="after")

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from typing import Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from dynsim.compile.protocols import BuildContext
-from dynsim.config.base import Positive, StrictConfig, Vector3, error_at
+from dynsim.config.base import Lengths, Positive, StrictConfig, Vector3, error_at
 from dynsim.model.surfaces import Box
 from dynsim.model.urdf.reader import rotation
 
@@ -18,11 +18,9 @@ class Config(StrictConfig):
 
     type: Literal["box"]
     center_m: Vector3 = Field(description="centre in the world")
-    edges_m: Annotated[list[Positive], Field(min_length=3, max_length=3)] = Field(
-        description="edge lengths along x, y, z of the box"
-    )
-    rpy_deg: Vector3 = Field(default=[0.0, 0.0, 0.0], description="rotation about x, y, z of the world, in this order")
-    edge_radius_m: Positive = Field(default=0.005, description="radius of the rounded edges, within the box")
+    edges_m: Lengths = Field(description="edge lengths along x, y, z of the box")
+    rpy_deg: Vector3 = Field([0.0, 0.0, 0.0], description="rotation about x, y, z of the world, in this order")
+    edge_radius_m: Positive = Field(0.005, description="radius of the rounded edges, within the box")
 
     @model_validator(mode="after")
     def _check(self) -> Self:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Literal, Self
+from typing import Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from dynsim.compile.protocols import BuildContext
-from dynsim.config.base import Positive, StrictConfig, Vector3, unit_vector
+from dynsim.config.base import Direction, Positive, StrictConfig, Vector3, unit_vector
 from dynsim.model.description import Quadric
 
 
@@ -17,14 +17,9 @@ class Config(StrictConfig):
 
     type: Literal["cylinder"]
     point_m: Vector3 = Field(description="point on the axis, in the world")
-    axis: Vector3 = Field(description="direction of the axis")
+    axis: Direction = Field(description="direction of the axis")
     radius_m: Positive = Field(description="radius")
-    inside: bool = Field(default=False, description="whether the robot is inside")
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        unit_vector(self.axis, "axis")
-        return self
+    inside: bool = Field(False, description="whether the robot is inside")
 
 
 def build(config: Config, context: BuildContext) -> Quadric:

@@ -34,7 +34,7 @@ class Config(StrictConfig):
         description="grid spacing along x and y"
     )
     origin_m: Vector3 = Field(
-        default=[0.0, 0.0, 0.0], description="position of the first height of the first row; z is added to all heights"
+        [0.0, 0.0, 0.0], description="position of the first height of the first row; z is added to all heights"
     )
     # Read once: an edit of the file does not change a loaded scenario.
     _heights: list[list[float]] = PrivateAttr()

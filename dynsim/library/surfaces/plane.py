@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Literal, Self
+from typing import Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from dynsim.compile.protocols import BuildContext
-from dynsim.config.base import StrictConfig, Vector3, unit_vector
+from dynsim.config.base import Direction, StrictConfig, Vector3, unit_vector
 from dynsim.model.description import Quadric
 
 
@@ -16,13 +16,8 @@ class Config(StrictConfig):
     """Plane through `point_m`; the robot is on the side of `normal`."""
 
     type: Literal["plane"]
-    point_m: Vector3 = Field(default=[0.0, 0.0, 0.0], description="point on the plane, in the world")
-    normal: Vector3 = Field(default=[0.0, 0.0, 1.0], description="normal towards the robot")
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        unit_vector(self.normal, "normal")
-        return self
+    point_m: Vector3 = Field([0.0, 0.0, 0.0], description="point on the plane, in the world")
+    normal: Direction = Field([0.0, 0.0, 1.0], description="normal towards the robot")
 
 
 def build(config: Config, context: BuildContext) -> Quadric:

@@ -18,7 +18,7 @@ class Config(StrictConfig):
     type: Literal["sphere"]
     center_m: Vector3 = Field(description="centre in the world")
     radius_m: Positive = Field(description="radius")
-    inside: bool = Field(default=False, description="whether the robot is inside")
+    inside: bool = Field(False, description="whether the robot is inside")
 
 
 def build(config: Config, context: BuildContext) -> Quadric:
