@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from enum import StrEnum
+from pathlib import Path
 from typing import Annotated, Any, TextIO
 
 import typer
@@ -42,6 +43,9 @@ VariantOption = Annotated[
         help="Variant to use; default: the first in the file.",
         autocompletion=completion.variants,
     ),
+]
+RecordsArgument = Annotated[
+    list[Path], typer.Argument(metavar="RECORD", help="Records (HDF5), simulated or measured, or folders of runs.")
 ]
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")]
 TrustOption = Annotated[

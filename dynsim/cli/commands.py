@@ -15,6 +15,7 @@ from dynsim.cli.app import (
     FiguresOption,
     FormatOption,
     QuietOption,
+    RecordsArgument,
     ScenarioArgument,
     SetOption,
     TrustOption,
@@ -237,7 +238,7 @@ def list_() -> None:
 
 @app.command(epilog="Example: dynsim plot results/elbow_comparison/two_elbows/record.h5")
 def plot(
-    records: Annotated[list[Path], typer.Argument(metavar="RECORD", help="Records (HDF5), or folders of runs.")],
+    records: RecordsArgument,
     out: Annotated[
         Path | None,
         typer.Option(metavar="FOLDER", help="Output folder; default: figures/ next to each record."),

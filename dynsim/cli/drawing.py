@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from dynsim.cli.app import QuietOption, TrustOption
+from dynsim.cli.app import QuietOption, RecordsArgument, TrustOption
 from dynsim.cli.tables import console, drawing, errors, film_progress, labelled, print_line, print_written, record_files
 from dynsim.errors import RecordError
 from dynsim.system import interruption
@@ -124,9 +124,7 @@ def _draw(task: Figures | Page, _: Any) -> Path | None:
 
 
 def view(
-    records: Annotated[
-        list[Path], typer.Argument(metavar="RECORD", help="Records (HDF5), simulated or measured, or folders of runs.")
-    ],
+    records: RecordsArgument,
     ghost: Annotated[
         bool, typer.Option("--ghost", help="Overlay the records, the first one solid; default: side by side.")
     ] = False,
@@ -192,10 +190,7 @@ class ViewName(StrEnum):
 
 
 def animate(
-    records: Annotated[
-        list[Path],
-        typer.Argument(metavar="RECORD", help="Records (HDF5) or folders of runs; several are shown side by side."),
-    ],
+    records: RecordsArgument,
     out: Annotated[Path, typer.Option(metavar="FILE", help="Output file, FILE.mp4 or FILE.gif.")],
     view: Annotated[ViewName, typer.Option(help="View direction.")] = ViewName.iso,
     speed: Annotated[
@@ -211,7 +206,7 @@ def animate(
     quiet: QuietOption = False,
     trust: TrustOption = False,
 ) -> None:
-    """Write a GIF or MP4 film of records; needs no display."""
+    """Write a GIF or MP4 film of records, side by side; needs no display."""
     from dynsim.draw.film import write
     from dynsim.draw.film.film import check
 

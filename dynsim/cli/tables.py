@@ -81,61 +81,71 @@ def _energy(key: str) -> Callable[[Summary], float | None]:
     return take
 
 
-# Heading, function that reads the value from a summary, and its format. A row without values is omitted.
-_ROWS: tuple[tuple[str, Callable[[Summary], Any], Callable[[Any], str]], ...] = (
+def _worst_joint(motor: Summary) -> str:
+    """Return the name of a motor with its rms torque and nominal torque (stall torque if unknown)."""
+    rating = motor.get("nominal_torque_N_m", motor.get("stall_torque_N_m", math.inf))
+    return f"{escaped_line(motor['joint'])} {_loaded(motor['torque_rms_N_m'], rating)} of {rating:g}"
+
+
+def _loaded(rms: float, nominal: float) -> str:
+    return f"[bold red]{rms:.3g}[/]" if rms > nominal else f"{rms:.3g}"
+
+
+def _short(value: Any) -> str:
+    return _number(value, digits=3)
+
+
+def _millimetres(value: Any) -> str:
+    return _number(value, 1e3)
+
+
+def _exponent(value: float) -> str:
+    return _format(value, ".1e")
+
+
+# Heading, key of the summary or function that reads the value from it, and format. A row without values is omitted.
+_ROWS: tuple[tuple[str, str | Callable[[Summary], Any], Callable[[Any], str]], ...] = (
     ("electrical energy [J]", _energy("electrical_energy_J"), _number),
     ("  from one supply [J]", _energy("electrical_energy_supply_J"), _number),
     ("  from separate supplies [J]", _energy("electrical_energy_drawn_J"), _number),
-    ("battery energy [Wh]", lambda s: s.get("battery_energy_Wh"), lambda v: _number(v, digits=3)),
-    ("worst joint, rms torque [N m]", lambda s: s.get("worst_joint"), lambda v: _worst_joint(v)),
+    ("battery energy [Wh]", "battery_energy_Wh", _short),
+    ("worst joint, rms torque [N m]", "worst_joint", _worst_joint),
     ("mechanical work [J]", _energy("mechanical_work_J"), _number),
     ("Joule heat [J]", _energy("joule_heat_J"), _number),
     ("friction heat [J]", _energy("friction_heat_J"), _number),
     ("impact loss, all contacts [J]", _energy("impact_loss_J"), _number),
     ("stop loss [J]", lambda s: s.get("stop_loss_J") or None, _number),
     ("loss of time stepping [J]", _energy("scheme_loss_J"), _number),
-    ("hand error, rms [mm]", lambda s: s.get("hand_error_rms_m"), lambda v: _number(v, 1e3)),
-    ("  max [mm]", lambda s: s.get("hand_error_max_m"), lambda v: _number(v, 1e3)),
-    ("  vertical, rms [mm]", lambda s: s.get("hand_error_z_rms_m"), lambda v: _number(v, 1e3)),
-    ("final position error [m]", lambda s: s.get("final_position_error_m"), lambda v: _number(v, digits=3)),
-    ("final attitude error [rad]", lambda s: s.get("final_attitude_error_rad"), lambda v: _number(v, digits=3)),
-    ("position error, max [m]", lambda s: s.get("position_error_max_m"), lambda v: _number(v, digits=3)),
-    ("attitude error, max [rad]", lambda s: s.get("attitude_error_max_rad"), lambda v: _number(v, digits=3)),
-    (
-        "joint limit exceeded by [rad]",
-        lambda s: s.get("joint_limit_violation_max_rad"),
-        lambda v: _number(v, digits=3),
-    ),
-    ("cost, initial", lambda s: s.get("cost_initial"), _number),
-    ("cost, final", lambda s: s.get("cost_final"), _number),
-    ("mode switches", lambda s: s.get("mode_switches"), lambda v: str(v)),
+    ("hand error, rms [mm]", "hand_error_rms_m", _millimetres),
+    ("  max [mm]", "hand_error_max_m", _millimetres),
+    ("  vertical, rms [mm]", "hand_error_z_rms_m", _millimetres),
+    ("final position error [m]", "final_position_error_m", _short),
+    ("final attitude error [rad]", "final_attitude_error_rad", _short),
+    ("position error, max [m]", "position_error_max_m", _short),
+    ("attitude error, max [rad]", "attitude_error_max_rad", _short),
+    ("joint limit exceeded by [rad]", "joint_limit_violation_max_rad", _short),
+    ("cost, initial", "cost_initial", _number),
+    ("cost, final", "cost_final", _number),
+    ("mode switches", "mode_switches", str),
     ("deepest below a surface [mm]", _deepest, str),
     ("tip margin, settled", _base("tip_margin_min_settled"), _margin),
     ("  whole run", _base("tip_margin_min"), _margin),
-    ("  tips over at [s]", _base("overturns_settled_at_s"), lambda v: _number(v, digits=3)),
-    ("min load, wheels, caster [N]", _least_load, lambda v: _number(v, digits=3)),
-    ("ledger residual, relative", lambda s: s.get("energy_residual_relative"), lambda v: _format(v, ".1e")),
-    ("constraint drift [m]", lambda s: s.get("constraint_drift_max_m"), lambda v: _format(v, ".1e")),
-    ("integration method", lambda s: s.get("method"), str),
-    ("integration [s]", lambda s: s.get("integration_wall_s"), lambda v: f"{v:.3f}"),
-    ("speed, times real time", lambda s: s.get("real_time_factor"), lambda v: f"{v:.0f}"),
+    ("  tips over at [s]", _base("overturns_settled_at_s"), _short),
+    ("min load, wheels, caster [N]", _least_load, _short),
+    ("ledger residual, relative", "energy_residual_relative", _exponent),
+    ("constraint drift [m]", "constraint_drift_max_m", _exponent),
+    ("integration method", "method", str),
+    ("integration [s]", "integration_wall_s", lambda v: f"{v:.3f}"),
+    ("speed, times real time", "real_time_factor", lambda v: f"{v:.0f}"),
 )
 
 
 def print_summary(console: Console, summary: Summary) -> None:
     """Print the numbers, contacts and warnings of one run."""
-    title = f"{summary['scenario']} {summary['variant']}".strip()
-    table = Table(title=escaped_line(title), box=box.SIMPLE_HEAD, show_header=False, title_justify="left")
+    table = _table(f"{summary['scenario']} {summary['variant']}".strip(), show_header=False)
     table.add_column()
     table.add_column(justify="right")
-    for heading, take, show in _ROWS:
-        value = take(summary)
-        if value is not None:
-            table.add_row(escaped_line(heading), show(value))
-    for contact in summary.get("contacts", ()):
-        for heading, cells in _contact_rows(contact["name"], [contact]):
-            table.add_row(heading, *cells)
-    for heading, cells in (*_stop_rows([summary], [summary]), *_motor_rows([summary], [summary])):
+    for heading, cells in _rows([summary], [summary]):
         table.add_row(heading, *cells)
     console.print(table)
     _print_warnings(console, {"": summary})
@@ -143,40 +153,46 @@ def print_summary(console: Console, summary: Summary) -> None:
 
 def print_comparison(console: Console, summaries: Mapping[str, Summary]) -> None:
     """Print all variants side by side, one column per variant; in several tables if the terminal is too narrow."""
-    names = list(summaries)
+    names, everything = list(summaries), list(summaries.values())
     # "wheel2R 3.17 of 1.68" is the widest cell; most tables do not have this row.
-    cell = max([20 if any(s.get("worst_joint") for s in summaries.values()) else 10, *map(len, names)]) + 2
+    cell = max([20 if any(s.get("worst_joint") for s in everything) else 10, *map(len, names)]) + 2
     across = max(1, (console.width - _HEADING_WIDTH) // cell)
     for start in range(0, len(names), across):
-        _print_columns(console, summaries, names[start : start + across])
+        table = _table(everything[0]["scenario"])
+        table.add_column("", no_wrap=True)
+        for name in names[start : start + across]:
+            table.add_column(escaped_line(name), justify="right", no_wrap=True)
+        for heading, cells in _rows(everything, everything[start : start + across], compared=True):
+            table.add_row(heading, *cells)
+        console.print(table)
     _print_warnings(console, summaries)
 
 
-def _print_columns(console: Console, summaries: Mapping[str, Summary], names: Sequence[str]) -> None:
-    table = Table(
-        title=escaped_line(next(iter(summaries.values()))["scenario"]), box=box.SIMPLE_HEAD, title_justify="left"
-    )
-    table.add_column("", no_wrap=True)
-    for name in names:
-        table.add_column(escaped_line(name), justify="right", no_wrap=True)
-    shown = [summaries[name] for name in names]
-    for heading, take, show in _ROWS:
-        if any(take(summary) is not None for summary in summaries.values()):
-            values = [take(summary) for summary in shown]
-            table.add_row(escaped_line(heading), *("–" if value is None else show(value) for value in values))
-    energies = [summary.get("electrical_energy_J") or 0.0 for summary in summaries.values()]
-    if min(energies) > 0.0:
-        ratios = (summary["electrical_energy_J"] / min(energies) for summary in shown)
-        table.add_row("energy, times the minimum", *(f"{ratio:.3g}" for ratio in ratios))
-    contacts = list(dict.fromkeys(c["name"] for s in summaries.values() for c in s.get("contacts", ())))
-    for contact in contacts:
-        by_variant = [next((c for c in s.get("contacts", ()) if c["name"] == contact), None) for s in shown]
-        for heading, cells in _contact_rows(contact, by_variant):
-            table.add_row(heading, *cells)
-    everything = list(summaries.values())
-    for heading, cells in (*_stop_rows(everything, shown), *_motor_rows(everything, shown)):
-        table.add_row(heading, *cells)
-    console.print(table)
+def _table(title: object, **options: Any) -> Table:
+    """Return an empty table without vertical lines."""
+    return Table(title=escaped_line(title), title_justify="left", **{"box": box.SIMPLE_HEAD, **options})
+
+
+def _rows(
+    summaries: Sequence[Summary], shown: Sequence[Summary], compared: bool = False
+) -> Iterator[tuple[str, list[str]]]:
+    """Yield the rows that any run has, with a cell for each run shown; if ``compared``, also ratios of energies."""
+    for heading, source, show in _ROWS:
+
+        def cell(summary: Summary, source: Any = source, show: Any = show) -> str:
+            value = summary.get(source) if isinstance(source, str) else source(summary)
+            return "–" if value is None else show(value)
+
+        if any(cell(summary) != "–" for summary in summaries):
+            yield escaped_line(heading), [cell(summary) for summary in shown]
+    least = min(summary.get("electrical_energy_J") or 0.0 for summary in summaries)
+    if compared and least > 0.0:
+        yield "energy, times the minimum", [f"{summary['electrical_energy_J'] / least:.3g}" for summary in shown]
+    contacts = [{contact["name"]: contact for contact in summary.get("contacts", ())} for summary in shown]
+    for name in dict.fromkeys(contact["name"] for s in summaries for contact in s.get("contacts", ())):
+        yield from _contact_rows(name, [by_name.get(name) for by_name in contacts])
+    yield from _stop_rows(summaries, shown)
+    yield from _motor_rows(summaries, shown)
 
 
 def print_choices(console: Terminal) -> None:
@@ -204,7 +220,7 @@ def _print_choice(
         # Without the console, which would expand the tabs.
         print("\n".join(lines), file=console.file)
         return
-    table = Table(title=title, box=box.SIMPLE_HEAD, show_header=bool(headings), title_justify="left")
+    table = _table(title, show_header=bool(headings))
     for k, heading in enumerate(headings):
         table.add_column(heading, no_wrap=k == 0)
     for row in rows:
@@ -342,16 +358,6 @@ _RATED = (
 _MOST_MOTORS = 10
 
 
-def _loaded(rms: float, nominal: float) -> str:
-    return f"[bold red]{rms:.3g}[/]" if rms > nominal else f"{rms:.3g}"
-
-
-def _worst_joint(motor: Summary) -> str:
-    """Return the name of a motor with its rms torque and nominal torque (stall torque if unknown)."""
-    rating = motor.get("nominal_torque_N_m", motor.get("stall_torque_N_m", math.inf))
-    return f"{escaped_line(motor['joint'])} {_loaded(motor['torque_rms_N_m'], rating)} of {rating:g}"
-
-
 def _stop(stop: Summary) -> tuple[str, float]:
     return stop["joint"], stop["limit"]
 
@@ -450,7 +456,7 @@ def drawing(folder: Path, quiet: bool) -> Iterator[None]:
         yield
 
 
-def _bars(*columns: str | ProgressColumn) -> Progress:
+def _bars(*columns: str | ProgressColumn, quiet: bool) -> Progress:
     """Create progress bars with these columns and elapsed and remaining time, removed at the end without a terminal."""
     from rich import progress
     from rich.table import Column
@@ -460,8 +466,9 @@ def _bars(*columns: str | ProgressColumn) -> Progress:
         progress.TimeElapsedColumn(table_column=Column(no_wrap=True)),
         "to go",
         progress.TimeRemainingColumn(table_column=Column(no_wrap=True)),
-        console=console,
+        console=Console(quiet=True) if quiet else console,
         transient=not console.is_terminal,
+        disable=quiet,
     )
 
 
@@ -470,17 +477,10 @@ def show_compilation(status: Status, task: str, now: Compilation | None) -> None
     status.update(task if now is None else f"{task}: {escaped(now.text)}, {now.elapsed:.0f} s")
 
 
-def _silence() -> None:
-    """Suppress messages about compilation."""
-    from dynsim.engine.compilation import shown_by_caller
-
-    shown_by_caller()
-
-
 @contextmanager
-def _compilation_shown(show: Callable[[Compilation | None], None] = lambda now: None) -> Iterator[None]:
-    """Print the first compilation of kernels in the block, and show its progress."""
-    from dynsim.engine.compilation import watched
+def _compilation_shown(quiet: bool, show: Callable[[Compilation | None], None] = lambda now: None) -> Iterator[None]:
+    """Print the first compilation of kernels in the block, and show its progress; suppress both if ``quiet``."""
+    from dynsim.engine.compilation import shown_by_caller, watched
 
     shown: list[Compilation] = []
 
@@ -490,6 +490,10 @@ def _compilation_shown(show: Callable[[Compilation | None], None] = lambda now: 
             console.print(f"{escaped(now.text[0].upper() + now.text[1:])}.", highlight=False)
         show(now)
 
+    if quiet:
+        shown_by_caller()
+        yield
+        return
     with watched(compiling):
         yield
 
@@ -497,10 +501,6 @@ def _compilation_shown(show: Callable[[Compilation | None], None] = lambda now: 
 @contextmanager
 def progress(scenarios: Sequence[Scenario], quiet: bool) -> Iterator[VariantProgress]:
     """Show a progress bar per scenario, and one while its references take long; yields the report function."""
-    if quiet:
-        _silence()
-        yield lambda variant, time, stage="": None
-        return
     from rich.progress import BarColumn
 
     from dynsim.engine import REFERENCES, SIMULATION
@@ -517,7 +517,7 @@ def progress(scenarios: Sequence[Scenario], quiet: bool) -> Iterator[VariantProg
             kernels.append(bars.add_task("kernels", total=now.expected or _COMPILED_S, what="compiled"))
         bars.update(kernels[0], completed=now.elapsed, visible=True)
 
-    with _bars("{task.description}", BarColumn(), done) as bars, _compilation_shown(compiling):
+    with _bars("{task.description}", BarColumn(), done, quiet=quiet) as bars, _compilation_shown(quiet, compiling):
 
         def add(scenario: Scenario, kind: str, visible: bool) -> TaskID:
             title = scenario.variant or scenario.name
@@ -538,13 +538,9 @@ def progress(scenarios: Sequence[Scenario], quiet: bool) -> Iterator[VariantProg
 @contextmanager
 def sweep_progress(runs: int, quiet: bool) -> Iterator[Callable[[int, int], None]]:
     """Show a progress bar over all runs of a sweep, with the number of failed runs; yields the report function."""
-    if quiet:
-        _silence()
-        yield lambda done, failed: None
-        return
     from rich.progress import BarColumn, MofNCompleteColumn
 
-    bar = _bars("runs", BarColumn(), MofNCompleteColumn(), "{task.fields[failed]}")
+    bar = _bars("runs", BarColumn(), MofNCompleteColumn(), "{task.fields[failed]}", quiet=quiet)
     task = bar.add_task("", total=runs, failed="")
 
     def compiling(now: Compilation | None) -> None:
@@ -557,7 +553,7 @@ def sweep_progress(runs: int, quiet: bool) -> Iterator[Callable[[int, int], None
         bar.update(task, completed=done, failed=f"{failed} failed" if failed else "")
 
     try:
-        with _compilation_shown(compiling):
+        with _compilation_shown(quiet, compiling):
             yield report
     finally:
         if bar.live.is_started:
@@ -567,13 +563,9 @@ def sweep_progress(runs: int, quiet: bool) -> Iterator[Callable[[int, int], None
 @contextmanager
 def plan_progress(quiet: bool) -> Iterator[Callable[[str, float], None]]:
     """Show a progress bar over the stages of a plan; yields the report function (stage, fraction done)."""
-    if quiet:
-        _silence()
-        yield lambda stage, share: None
-        return
     from rich.progress import BarColumn
 
-    with _bars("{task.description}", BarColumn()) as bar, _compilation_shown():
+    with _bars("{task.description}", BarColumn(), quiet=quiet) as bar, _compilation_shown(quiet):
         task = bar.add_task("searching", total=1.0)
         yield lambda stage, share: bar.update(task, description=stage, completed=share)
 
@@ -581,12 +573,9 @@ def plan_progress(quiet: bool) -> Iterator[Callable[[str, float], None]]:
 @contextmanager
 def film_progress(quiet: bool) -> Iterator[Callable[[int, int], None]]:
     """Show a progress bar over the frames of a film; yields the report function."""
-    if quiet:
-        yield lambda done, total: None
-        return
     from rich.progress import BarColumn, MofNCompleteColumn
 
-    with _bars("frames", BarColumn(), MofNCompleteColumn()) as bar:
+    with _bars("frames", BarColumn(), MofNCompleteColumn(), quiet=quiet) as bar:
         task = bar.add_task("", total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)
 
@@ -597,7 +586,7 @@ LIFTED = 0.999
 
 def print_plan(plan: BracePlan) -> None:
     """Print a row for each number of braces, then the reasons for rejected and missing plans."""
-    table = Table(title=f"{escaped(plan.task.scenario.title)}: braces", title_justify="left")
+    table = _table(f"{plan.task.scenario.title}: braces", box=box.HEAVY_HEAD)
     heads = (
         "braces", "on", "heat [W]", "simulated [W]", "all energy [J]", "k_p [V/rad]", "forces [N]", "rounds",
         "survives",

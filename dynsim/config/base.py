@@ -7,7 +7,15 @@ from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, GetCoreSchemaHandler
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    GetCoreSchemaHandler,
+    SerializerFunctionWrapHandler,
+    model_serializer,
+)
 from pydantic_core import PydanticCustomError
 
 Vector3 = Annotated[list[float], Field(min_length=3, max_length=3)]
@@ -23,7 +31,14 @@ def _nonzero(vector: list[float]) -> list[float]:
     return vector
 
 
+def _ordered(limits: list[float]) -> list[float]:
+    if not limits[0] < limits[1]:
+        raise ValueError(f"the lower limit {limits[0]:g} must be below the upper limit {limits[1]:g}")
+    return limits
+
+
 Direction = Annotated[Vector3, AfterValidator(_nonzero)]
+Limits = Annotated[Pair, AfterValidator(_ordered)]
 
 
 def _forbid_conversion(schema: Any) -> None:
@@ -58,6 +73,15 @@ class StrictConfig(StrictModel):
     """Base class of mappings in scenario files: numbers must also be finite."""
 
     model_config = ConfigDict(allow_inf_nan=False, validate_default=True, defer_build=True)
+
+    @model_serializer(mode="wrap")
+    def _with_nulls(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Keep None with ``exclude_none`` too if it is not the default."""
+        written: dict[str, Any] = dump(self)
+        for key, member in type(self).model_fields.items():
+            if member.default is not None and getattr(self, key) is None and not member.exclude:
+                written[key] = None
+        return written
 
 
 class BodyPoint(StrictConfig):

@@ -52,17 +52,8 @@ FAMILIES = {
 }
 
 
-@dataclass(frozen=True)
-class Plugin:
-    """Member from an installed plug-in."""
-
-    module: ModuleType
-    library: tuple[str, str]
-    validator: SchemaValidator
-
-
-# Imported plug-ins by family and name.
-_imported: dict[tuple[str, str], Plugin] = {}
+# Imported modules of plug-ins by family and name.
+_imported: dict[tuple[str, str], ModuleType] = {}
 
 
 @cache
@@ -133,7 +124,8 @@ def faults() -> list[str]:
 
 def libraries() -> dict[str, str]:
     """Return the distributions of the imported plug-ins with their versions."""
-    return dict(sorted({plugin.library for plugin in _imported.values()}))
+    points = [_entry_points(family)[name][0] for family, name in _imported]
+    return dict(sorted((p.dist.name, p.dist.version) if p.dist else (p.value, "unknown") for p in points))
 
 
 def member(family: str, name: str) -> ModuleType:
@@ -144,7 +136,7 @@ def member(family: str, name: str) -> ModuleType:
     PluginError
         If no member has this name, or its plug-in is faulty.
     """
-    return _module(family, name) if is_shipped(family, name) else _plugin(family, name).module
+    return _module(family, name) if is_shipped(family, name) else _plugin(family, name)
 
 
 def build(family: str, config: Any, context: BuildContext, expected: type[T] | UnionType) -> T:
@@ -204,7 +196,7 @@ def section_defaults(plant: Any, sections: Mapping[str, Any]) -> dict[str, Any]:
     return {} if defaults is None else dict(defaults(plant, sections))
 
 
-def _plugin(family: str, name: str) -> Plugin:
+def _plugin(family: str, name: str) -> ModuleType:
     if (family, name) in _imported:
         return _imported[family, name]
     points = _entry_points(family).get(name, [])
@@ -214,15 +206,14 @@ def _plugin(family: str, name: str) -> Plugin:
     if others:
         raise PluginError(f"{family} {name!r} is in {' and '.join(map(_title, points))}; uninstall all but one of them")
     try:
-        module = point.load()
+        module: ModuleType = point.load()
     except (Exception, SystemExit) as error:
         reason = f"importing {point.value!r} fails with {type(error).__name__}: {' '.join(str(error).split())[:200]}"
         raise PluginError(_unusable(family, point, reason)) from error
     if defect := _defect(module, FAMILIES[family], name):
         raise PluginError(_unusable(family, point, f"{point.value!r} {defect}"))
-    library = (point.dist.name, point.dist.version) if point.dist else (point.value, "unknown")
-    _imported[family, name] = Plugin(module, library, SchemaValidator(_tagged({name: module.Config})))
-    return _imported[family, name]
+    _imported[family, name] = module
+    return module
 
 
 def _unusable(family: str, point: EntryPoint, reason: str) -> str:
@@ -279,7 +270,7 @@ class MemberField:
         """Return the ``Config`` classes of the shipped members and of the imported plug-ins."""
         if self.only:
             return [member(self.family, name).Config for name in self.only]
-        plugins = [plugin.module.Config for (family, _), plugin in _imported.items() if family == self.family]
+        plugins = [module.Config for (family, _), module in _imported.items() if family == self.family]
         return [member(self.family, name).Config for name in shipped(self.family)] + plugins
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
@@ -296,22 +287,20 @@ class MemberField:
         name = value.get("type") if isinstance(value, Mapping) else getattr(value, "type", None)
         if not isinstance(name, str) or (self.only and name not in self.only):
             return _validator(self.family, self.only or shipped(self.family)).validate_python(value)
-        if is_shipped(self.family, name):
-            return _validator(self.family, (name,)).validate_python(value)
-        if name not in _entry_points(self.family):
+        if not is_shipped(self.family, name) and name not in _entry_points(self.family):
             known = ", ".join(map(repr, names(self.family)))
             raise PydanticKnownError(
                 "union_tag_invalid", {"discriminator": "'type'", "tag": name, "expected_tags": known}
             )
         try:
-            return _plugin(self.family, name).validator.validate_python(value)
+            return _validator(self.family, (name,)).validate_python(value)
         except PluginError as error:
             raise error_at("type", str(error)) from None
 
 
 @cache
 def _validator(family: str, names: tuple[str, ...]) -> SchemaValidator:
-    """Return a validator that chooses among these shipped members."""
+    """Return a validator that chooses among these members."""
     return SchemaValidator(_tagged({name: member(family, name).Config for name in names}))
 
 

@@ -463,7 +463,7 @@ def _law(options: Contacts, point: ContactPoint) -> dict[str, Any]:
         "static_friction": static,
         "stribeck": options.stribeck_m_s or 0.0,
         "viscous_friction": options.viscous_friction_s_per_m,
-        "restitution": options.restitution if point.restitution is None else point.restitution,
+        "restitution": options.of(point, "restitution"),
         "stiffness": stiffness,
         "damping": damping if stiffness else 0.0,
         **({} if point.grip is None else {"grip": point.grip.ratio, "grip_axis": np.array(point.grip.axis)}),

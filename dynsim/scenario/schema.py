@@ -13,7 +13,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, Field, PrivateAttr, StrictInt, field_validator, model_validator
+from pydantic import Field, PrivateAttr, StrictInt, field_validator, model_validator
 
 from dynsim.compile.protocols import BuildContext
 from dynsim.compile.scene import WHEEL_WIDTH, turn_from_z
@@ -21,8 +21,8 @@ from dynsim.config.base import (
     BodyPoint,
     Direction,
     Lengths,
+    Limits,
     NonNegative,
-    Pair,
     Positive,
     StrictConfig,
     Vector3,
@@ -359,14 +359,9 @@ class Hinge(Guide):
     )
     friction_N_m: NonNegative = Field(0.0, description="dry friction torque; unilateral law")
     damping_N_m_s_per_rad: NonNegative = Field(0.0, description="viscous damping")
-    limits_deg: Pair | None = Field(None, description="lower and upper limit; default: no limits")
+    limits_deg: Limits | None = Field(None, description="lower and upper limit; default: no limits")
     spring_N_m_per_rad: NonNegative = Field(0.0, description="stiffness of a return spring; time_stepping only")
     rest_deg: float = Field(0.0, gt=-180.0, lt=180.0, description="angle at which the spring torque is zero")
-
-    @model_validator(mode="after")
-    def _check_limits(self) -> Self:
-        _ordered(self.limits_deg, "limits_deg")
-        return self
 
     def joint(self, link: Link) -> Link:
         """Return the link on this joint."""
@@ -388,7 +383,7 @@ class Slide(Guide):
     axis: Direction = Field([1.0, 0.0, 0.0], description="direction of the rails, in the object's axes")
     friction_N: NonNegative = Field(0.0, description="dry friction force; unilateral law")
     damping_N_s_per_m: NonNegative = Field(0.0, description="viscous damping")
-    limits_m: Pair | None = Field(None, description="lower and upper limit; default: no limits")
+    limits_m: Limits | None = Field(None, description="lower and upper limit; default: no limits")
     spring_N_per_m: NonNegative = Field(0.0, description="stiffness of a return spring; time_stepping only")
     rest_m: float = Field(0.0, description="displacement at which the spring force is zero")
 
@@ -396,11 +391,6 @@ class Slide(Guide):
     def point_m(self) -> list[float]:
         """Position of the joint: the object's centre."""
         return [0.0, 0.0, 0.0]
-
-    @model_validator(mode="after")
-    def _check_limits(self) -> Self:
-        _ordered(self.limits_m, "limits_m")
-        return self
 
     def joint(self, link: Link) -> Link:
         """Return the link on this joint."""
@@ -411,11 +401,6 @@ class Slide(Guide):
         law, at = (self.spring_N_per_m, 0.0), link.p_PJ
         tie = Tie(f"{name}.spring", link.name, WORLD, link.axis, *law, other_point=at, rest=self.rest_m)
         return tie if self.spring_N_per_m > 0.0 else None
-
-
-def _ordered(limits: list[float] | None, key: str) -> None:
-    if limits is not None and not limits[0] < limits[1]:
-        raise error_at(key, "the lower limit must be below the upper limit")
 
 
 class Solid(StrictConfig):
@@ -675,44 +660,13 @@ def frame_along(axis: Array) -> Array:
     return np.column_stack([axis, side, np.cross(axis, side)])
 
 
-# Nulls of a resolved scenario: without them a default would replace the None.
-
-
-def write_nulls(config: BaseModel, written: dict[str, Any], defaults: Any = None) -> None:
-    """Write ``null`` for each key that is None although the key or the plant has another default.
-
-    Parameters
-    ----------
-    config : BaseModel
-        Validated configuration.
-    written : dict
-        Dump of ``config`` without nulls; changed in place.
-    defaults : mapping, optional
-        Defaults of the plant, in the form of ``written``.
-    """
-    for key, member in type(config).model_fields.items():
-        value, of_plant = getattr(config, key), _entry(defaults, key)
-        if value is not None:
-            _write_within(value, written.get(key), of_plant)
-        elif not member.exclude and (member.default is not None or of_plant is not None):
+def _write_nulls(written: dict[str, Any], defaults: Mapping[str, Any]) -> None:
+    """Write ``null`` for each key without value that has a default of the plant, which would replace the None."""
+    for key, default in defaults.items():
+        if key not in written:
             written[key] = None
-
-
-def _write_within(value: Any, written: Any, defaults: Any) -> None:
-    """Apply `write_nulls` to a value: a configuration, or a mapping or list of configurations."""
-    if isinstance(value, BaseModel):
-        if isinstance(written, dict):
-            write_nulls(value, written, defaults)
-    elif isinstance(value, Mapping) and isinstance(written, Mapping):
-        for name, part in value.items():
-            _write_within(part, _entry(written, name), _entry(defaults, name))
-    elif isinstance(value, (list, tuple)) and isinstance(written, list):
-        for part, dumped in zip(value, written, strict=True):
-            _write_within(part, dumped, None)
-
-
-def _entry(mapping: Any, key: Any) -> Any:
-    return mapping.get(key) if isinstance(mapping, Mapping) else None
+        elif isinstance(default, Mapping):
+            _write_nulls(written[key], default)
 
 
 # Maximum length of a folder name on common file systems [bytes].
@@ -801,24 +755,22 @@ class Contacts(StrictConfig):
     )
     points: dict[str, ContactPoint] = Field({}, description="named contact points")
 
+    def of(self, point: ContactPoint | None, key: str) -> Any:
+        """Return a key of a point, or the key of `contacts` if the point does not set it."""
+        value = getattr(point, key, None)
+        return getattr(self, key) if value is None else value
+
     def coefficients(self, point: ContactPoint | None = None) -> tuple[float, float]:
         """Return the kinetic and static coefficient of a point, or of all contacts.
 
         Keys of the point take precedence over keys of `contacts`; the static coefficient defaults to the kinetic one.
         """
-        kinetic, static = (
-            getattr(self, key) if point is None or getattr(point, key) is None else getattr(point, key)
-            for key in ("friction", "static_friction")
-        )
+        kinetic, static = self.of(point, "friction"), self.of(point, "static_friction")
         return kinetic, kinetic if static is None else static
 
     def compliance(self, point: ContactPoint | None = None) -> tuple[float, float]:
         """Return stiffness [N/m] (0: rigid) and damping [N s/m] of a point, or of all contacts."""
-        stiffness, damping = (
-            getattr(self, key) if point is None or getattr(point, key) is None else getattr(point, key)
-            for key in ("stiffness_N_per_m", "damping_N_s_per_m")
-        )
-        return stiffness or 0.0, damping
+        return self.of(point, "stiffness_N_per_m") or 0.0, self.of(point, "damping_N_s_per_m")
 
     @property
     def other_keys(self) -> tuple[str, ...]:
@@ -851,7 +803,7 @@ class Contacts(StrictConfig):
             anywhere = soft or (point is None and not all(p.stiffness_N_per_m is None for p in self.points.values()))
             if config.damping_N_s_per_m and not anywhere:
                 raise error_at(f"{where}damping_N_s_per_m", "requires stiffness_N_per_m; add it or remove this key")
-            restitution = self.restitution if point is None or point.restitution is None else point.restitution
+            restitution = self.of(point, "restitution")
             if soft and restitution > 0.0:
                 key = "restitution" if config.restitution else "stiffness_N_per_m"
                 raise error_at(
@@ -1137,7 +1089,7 @@ class Scenario:
         1e-08
         """
         resolved = self.config.model_dump(mode="json", exclude_none=True)
-        write_nulls(self.config, resolved, section_defaults(resolved["plant"], resolved))
+        _write_nulls(resolved, section_defaults(resolved["plant"], resolved))
         for section in ("loads", "objects", "ties"):
             if not getattr(self.config, section):
                 del resolved[section]

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from dynsim.compile.protocols import BuildContext
-from dynsim.config.base import BodyPoint, NonNegative, Pair, Positive, StrictConfig, Vector3, error_at, unit_vector
+from dynsim.config.base import BodyPoint, Limits, NonNegative, Positive, StrictConfig, Vector3, error_at, unit_vector
 from dynsim.library import families
 from dynsim.model.description import Inertia, Link, Robot, vector
 from dynsim.model.drives import Drive
@@ -49,8 +49,8 @@ class LinkKeys(StrictConfig):
     friction_N_m: NonNegative = Field(0.0, description="dry friction of a revolute joint; unilateral law")
     friction_N: NonNegative = Field(0.0, description="dry friction of a prismatic joint; unilateral law")
     motor: MotorChoice | None = Field(None, description="motor of the joint; default: no motor")
-    limit_deg: Pair | None = Field(None, description="lower and upper stop of a revolute joint; default: no stops")
-    limit_m: Pair | None = Field(None, description="lower and upper stop of a prismatic joint; default: no stops")
+    limit_deg: Limits | None = Field(None, description="lower and upper stop of a revolute joint; default: no stops")
+    limit_m: Limits | None = Field(None, description="lower and upper stop of a prismatic joint; default: no stops")
     initial_deg: float = Field(0.0, description="initial angle of a revolute joint")
     initial_m: float = Field(0.0, description="initial position of a prismatic joint")
 
@@ -85,10 +85,6 @@ class LinkConfig(LinkKeys):
         for key, instead in _of_other_kind(self.kind).items():
             if getattr(self, key) not in (0.0, None):
                 raise error_at(key, f"not available for a {self.kind} joint; use {instead}")
-        for key in ("limit_deg", "limit_m"):
-            limits = getattr(self, key)
-            if limits is not None and not limits[0] < limits[1]:
-                raise error_at(key, f"the lower limit {limits[0]:g} must be below the upper limit {limits[1]:g}")
         return self
 
     @property
