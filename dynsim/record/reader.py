@@ -222,12 +222,11 @@ class _Reader:
         self._left = _allowed(size)
 
     def content(self) -> Content:
-        version = self._attribute(self._file, "format")
+        version, complete = (self._file.attrs.get(name) for name in ("format", "complete"))
         if not isinstance(version, str) or not version.startswith(_FORMATS):
             raise RecordError(f"an HDF5 file, but not a dynsim record ({FORMAT})")
         if version != FORMAT:
             raise RecordError(f"unsupported record format {brief(version)}; this version of dynsim reads {FORMAT}")
-        complete = self._attribute(self._file, "complete")
         if complete is None:
             raise RecordError("incomplete dynsim record: no attribute complete")
         if not isinstance(complete, (bool, np.bool_)):
@@ -260,12 +259,14 @@ class _Reader:
         path = f"signals/{name}"
         data, attributes = self._numbers(path), self._file[path].attrs
         kept = "labels" in attributes or "labels" not in self._file
-        labels = self._attribute(self._file[path], "labels") if kept else self._column(f"labels/{name}")
+        labels = attributes.get("labels") if kept else self._column(f"labels/{name}")
         if labels is None:
             raise RecordError(f"incomplete dynsim record: no labels of {_describe(path)}")
-        axis = self._string(path, "axis") if "axis" in attributes else TIME
-        texts = _texts(labels, f"{_describe(path)} has labels")
-        signal = Signal(data, self._string(path, "unit"), texts, self._string(path, "description"), axis)
+        texts = {key: attributes.get(key) for key in ("unit", "description")} | {"axis": attributes.get("axis", TIME)}
+        for key, text in texts.items():
+            if not isinstance(text, str):
+                raise RecordError(f"{key} of {_describe(path)} is not a text")
+        signal = Signal(data, labels=_texts(labels, f"{_describe(path)} has labels"), **texts)
         check_signal(name, signal, samples)
         return signal
 
@@ -322,20 +323,11 @@ class _Reader:
         return text.decode("utf-8")
 
     def _values(self, data: Any, path: str) -> Any:
-        """Return the content of a data set; reject data that are external, missing or too large."""
-        import h5py
-
-        name, properties = _describe(path), data.id.get_create_plist()
-        if properties.get_external_count() or data.is_virtual:
+        """Return the content of a data set; reject data that are external or too large."""
+        name = _describe(path)
+        if data.external or data.is_virtual:
             raise RecordError(f"{name} is stored in other files, which are not opened")
-        if data.shape is None:
-            raise RecordError(f"{name} is empty")
-        filters = [properties.get_filter(k)[0] for k in range(properties.get_nfilters())]
-        if filters not in ([], [h5py.h5z.FILTER_DEFLATE]):
-            raise RecordError(f"{name} uses HDF5 filters {filters}, which dynsim does not read; use gzip only")
-        size, stored = math.prod(data.shape) * data.dtype.itemsize, data.id.get_storage_size()
-        if stored > self._size or (size > stored and not filters):
-            raise RecordError(f"{name} claims {size} bytes, but the file ({self._size} bytes) contains {stored}")
+        size = math.prod(data.shape or ()) * data.dtype.itemsize
         self._left -= size
         if self._left < 0:
             raise RecordError(
@@ -343,21 +335,6 @@ class _Reader:
                 f"{_allowed(self._size)} in total"
             )
         return data[()]
-
-    def _attribute(self, owner: Any, name: str) -> Any:
-        """Return an attribute, or None if it is missing; reject one that is larger than the file."""
-        if name not in owner.attrs:
-            return None
-        identifier = owner.attrs.get_id(name)
-        if math.prod(identifier.shape or ()) * identifier.dtype.itemsize > self._size:
-            raise RecordError(f"attribute {name} claims more bytes than the file has")
-        return owner.attrs[name]
-
-    def _string(self, path: str, name: str) -> str:
-        value = self._attribute(self._file[path], name)
-        if not isinstance(value, str):
-            raise RecordError(f"{name} of {_describe(path)} is not a text")
-        return value
 
 
 def _mapping(name: str, text: str) -> dict[str, Any]:

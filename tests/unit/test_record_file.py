@@ -213,10 +213,6 @@ def huge_contiguous(file: h5py.File, _: Path) -> None:
     file["time"] = file["time2"]
 
 
-def shuffled(file: h5py.File, _: Path) -> None:
-    file.create_dataset("signals/s", data=np.zeros(5), chunks=(5,), shuffle=True)
-
-
 def type_as_signal(file: h5py.File, _: Path) -> None:
     file["signals/s"] = np.dtype("f8")
 
@@ -273,7 +269,6 @@ FOREIGN: list[tuple[Change, str]] = [
     (bomb, "s 43980465111040 2147483648"),
     (no_gzip, "HDF5"),
     (huge_contiguous, "time 281474976710656"),
-    (shuffled, "s HDF5 [2]"),
     (type_as_signal, "s"),
     (many_labels, "q labels"),
 ]
