@@ -22,6 +22,12 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
+
+def option(metavar: str, description: str, **settings: Any) -> Any:
+    """Return an option with a value, named ``metavar`` in the help; ``settings``: limits or completion of the value."""
+    return typer.Option(metavar=metavar, help=description, **settings)
+
+
 ScenarioArgument = Annotated[
     str,
     typer.Argument(
@@ -37,12 +43,7 @@ SetOption = Annotated[
     ),
 ]
 VariantOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="VARIANT",
-        help="Variant to use; default: the first in the file.",
-        autocompletion=completion.variants,
-    ),
+    str | None, option("VARIANT", "Variant to use; default: the first in the file.", autocompletion=completion.variants)
 ]
 RecordsArgument = Annotated[
     list[Path], typer.Argument(metavar="RECORD", help="Records (HDF5), simulated or measured, or folders of runs.")
@@ -66,7 +67,7 @@ def parsed_overrides(texts: list[str] | None) -> dict[str, Any]:
 
 def folder_option(default: str) -> Any:
     """Return the option ``--out`` of a command that writes several files."""
-    return typer.Option(metavar="FOLDER", help=f"Output folder; default: {default}.")
+    return option("FOLDER", f"Output folder; default: {default}.")
 
 
 class FigureFormat(StrEnum):

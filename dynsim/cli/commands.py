@@ -22,6 +22,7 @@ from dynsim.cli.app import (
     VariantOption,
     app,
     folder_option,
+    option,
     parsed_overrides,
 )
 from dynsim.cli.drawing import (
@@ -118,7 +119,7 @@ def compare(
     scenario: ScenarioArgument,
     overrides: SetOption = None,
     out: Annotated[Path | None, folder_option("results/SCENARIO")] = None,
-    jobs: Annotated[int, typer.Option(metavar="N", min=1, help="Number of worker processes.")] = 1,
+    jobs: Annotated[int, option("N", "Number of worker processes.", min=1)] = 1,
     no_figures: FiguresOption = False,
     format_: FormatOption = FigureFormat.png,
     quiet: QuietOption = False,
@@ -239,10 +240,7 @@ def list_() -> None:
 @app.command(epilog="Example: dynsim plot results/elbow_comparison/two_elbows/record.h5")
 def plot(
     records: RecordsArgument,
-    out: Annotated[
-        Path | None,
-        typer.Option(metavar="FOLDER", help="Output folder; default: figures/ next to each record."),
-    ] = None,
+    out: Annotated[Path | None, option("FOLDER", "Output folder; default: figures/ next to each record.")] = None,
     format_: FormatOption = FigureFormat.png,
     trust: TrustOption = False,
 ) -> None:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from dynsim.cli.app import QuietOption, RecordsArgument, TrustOption
+from dynsim.cli.app import QuietOption, RecordsArgument, TrustOption, option
 from dynsim.cli.tables import console, drawing, errors, film_progress, labelled, print_line, print_written, record_files
 from dynsim.errors import RecordError
 from dynsim.system import interruption
@@ -131,10 +131,7 @@ def view(
     open_: Annotated[bool, typer.Option("--open/--no-open", help="Open the page in a browser.")] = True,
     out: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Output file; default: view.html next to the record, or in the working directory for several.",
-        ),
+        option("FILE", "Output file; default: view.html next to the record, or in the working directory for several."),
     ] = None,
     trust: TrustOption = False,
 ) -> None:
@@ -191,17 +188,14 @@ class ViewName(StrEnum):
 
 def animate(
     records: RecordsArgument,
-    out: Annotated[Path, typer.Option(metavar="FILE", help="Output file, FILE.mp4 or FILE.gif.")],
+    out: Annotated[Path, option("FILE", "Output file, FILE.mp4 or FILE.gif.")],
     view: Annotated[ViewName, typer.Option(help="View direction.")] = ViewName.iso,
-    speed: Annotated[
-        float, typer.Option(metavar="X", help="Playback speed; 1 is real time, 0.1 is ten times slower.")
-    ] = 1.0,
-    size: Annotated[str, typer.Option(metavar="WxH", help="Width and height [pixel].")] = "960x540",
-    fps: Annotated[int, typer.Option(metavar="N", help="Frame rate [1/s].")] = 25,
-    hold: Annotated[float, typer.Option(metavar="S", help="Duration of the last frame [s].")] = 1.0,
+    speed: Annotated[float, option("X", "Playback speed; 1 is real time, 0.1 is ten times slower.")] = 1.0,
+    size: Annotated[str, option("WxH", "Width and height [pixel].")] = "960x540",
+    fps: Annotated[int, option("N", "Frame rate [1/s].")] = 25,
+    hold: Annotated[float, option("S", "Duration of the last frame [s].")] = 1.0,
     plot: Annotated[
-        str | None,
-        typer.Option(metavar="SIGNAL", help="Signal to plot below the scene, or none; default: chosen automatically."),
+        str | None, option("SIGNAL", "Signal to plot below the scene, or none; default: chosen automatically.")
     ] = None,
     quiet: QuietOption = False,
     trust: TrustOption = False,

@@ -15,6 +15,8 @@ from dynsim.cli.app import (
     ScenarioArgument,
     SetOption,
     VariantOption,
+    folder_option,
+    option,
     parsed_overrides,
 )
 from dynsim.cli.tables import plan_progress, print_line, print_plan, print_written
@@ -30,61 +32,42 @@ def plan(
     overrides: SetOption = None,
     candidates: Annotated[
         str,
-        typer.Option(
-            metavar="LIST",
-            help="Points that may become braces, comma-separated: links (at their joint), ranges (link_3:link_9), "
+        option(
+            "LIST",
+            "Points that may become braces, comma-separated: links (at their joint), ranges (link_3:link_9), "
             "frames or contact points; default: all links except the first two, and all contact points.",
         ),
     ] = "",
     along: Annotated[
         list[float] | None,
-        typer.Option(
-            metavar="SHARE", help="Also use the point at this fraction of each link's length, 0 to 1; repeatable."
-        ),
+        option("SHARE", "Also use the point at this fraction of each link's length, 0 to 1; repeatable."),
     ] = None,
-    radius: Annotated[
-        float | None, typer.Option(metavar="M", min=0.0, help="Brace radius [m]; default: the radius of the link.")
-    ] = None,
-    count: Annotated[str, typer.Option(metavar="MIN:MAX", help="Smallest and largest number of braces.")] = "0:3",
-    surface: Annotated[
-        list[str] | None, typer.Option(metavar="NAME", help="Surface that may be used; repeatable; default: all.")
-    ] = None,
+    radius: Annotated[float | None, option("M", "Brace radius [m]; default: the radius of the link.", min=0.0)] = None,
+    count: Annotated[str, option("MIN:MAX", "Smallest and largest number of braces.")] = "0:3",
+    surface: Annotated[list[str] | None, option("NAME", "Surface that may be used; repeatable; default: all.")] = None,
     weight: Annotated[
-        list[str] | None,
-        typer.Option(metavar="peak=VALUE", help="Extra cost of the largest torque of revolute joints [W/(N m)]."),
+        list[str] | None, option("peak=VALUE", "Extra cost of the largest torque of revolute joints [W/(N m)].")
     ] = None,
-    clearance: Annotated[
-        float, typer.Option(metavar="M", min=0.0, help="Minimum distance of unbraced joints from surfaces [m].")
-    ] = 0.01,
-    min_force: Annotated[
-        float, typer.Option(metavar="N", min=0.0, help="Minimum normal force on each brace [N].")
-    ] = 0.5,
+    clearance: Annotated[float, option("M", "Minimum distance of unbraced joints from surfaces [m].", min=0.0)] = 0.01,
+    min_force: Annotated[float, option("N", "Minimum normal force on each brace [N].", min=0.0)] = 0.5,
     verify: Annotated[
         bool, typer.Option("--verify/--no-verify", help="Re-simulate plans with errors in friction and surface height.")
     ] = True,
     friction_error: Annotated[
-        float,
-        typer.Option(metavar="SHARE", min=0.0, max=0.99, help="Relative friction error that plans must tolerate."),
+        float, option("SHARE", "Relative friction error that plans must tolerate.", min=0.0, max=0.99)
     ] = 0.2,
-    surface_error: Annotated[
-        float, typer.Option(metavar="M", min=0.0, help="Surface height error that plans must tolerate [m].")
-    ] = 0.005,
+    surface_error: Annotated[float, option("M", "Surface height error that plans must tolerate [m].", min=0.0)] = 0.005,
     gains: Annotated[
-        str | None,
-        typer.Option(metavar="LIST", help="Candidate gains k_p [V/rad], comma-separated; default: 500 to 5."),
+        str | None, option("LIST", "Candidate gains k_p [V/rad], comma-separated; default: 500 to 5.")
     ] = None,
     exhaustive: Annotated[bool, typer.Option("--exhaustive", help="Try every set of candidates (slow).")] = False,
-    starts: Annotated[int, typer.Option(metavar="N", min=1, help="Number of independent search rounds.")] = 8,
-    seed: Annotated[int, typer.Option(metavar="S", help="Seed for the random starting postures.")] = 0,
+    starts: Annotated[int, option("N", "Number of independent search rounds.", min=1)] = 8,
+    seed: Annotated[int, option("S", "Seed for the random starting postures.")] = 0,
     explain: Annotated[
         bool, typer.Option("--explain", help="For rejected plans, find the largest error they tolerate.")
     ] = False,
-    out: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="Output folder; default: results/SCENARIO/plan.")
-    ] = None,
-    jobs: Annotated[
-        int, typer.Option(metavar="N", min=0, help="Number of worker processes; default 0: one per core.")
-    ] = 0,
+    out: Annotated[Path | None, folder_option("results/SCENARIO/plan")] = None,
+    jobs: Annotated[int, option("N", "Number of worker processes; default 0: one per core.", min=0)] = 0,
     no_figures: FiguresOption = False,
     format_: FormatOption = FigureFormat.png,
     quiet: QuietOption = False,

@@ -18,6 +18,7 @@ from dynsim.cli.app import (
     ScenarioArgument,
     SetOption,
     folder_option,
+    option,
     parsed_overrides,
 )
 from dynsim.cli.tables import drawing, errors, print_line, sweep_progress
@@ -42,32 +43,27 @@ def sweep(
     scenario: ScenarioArgument,
     grid: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="KEY=start:stop:count",
-            help="Values of one key: start:stop:count (ends included) or a,b,c; repeatable (all combinations).",
+        option(
+            "KEY=start:stop:count",
+            "Values of one key: start:stop:count (ends included) or a,b,c; repeatable (all combinations).",
         ),
     ] = None,
     sample: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="KEY=normal(m,s)",
-            help="Random values of one key: normal(mean,sd) or uniform(a,b); `*` matches every list entry; repeatable.",
+        option(
+            "KEY=normal(m,s)",
+            "Random values of one key: normal(mean,sd) or uniform(a,b); `*` matches every list entry; repeatable.",
         ),
     ] = None,
-    count: Annotated[int, typer.Option(metavar="N", min=1, help="Number of random draws.")] = 1,
-    seed: Annotated[int, typer.Option(metavar="S", min=0, help="Seed for the random draws.")] = 0,
+    count: Annotated[int, option("N", "Number of random draws.", min=1)] = 1,
+    seed: Annotated[int, option("S", "Seed for the random draws.", min=0)] = 0,
     variants: Annotated[
-        str | None,
-        typer.Option(
-            metavar="all|NAMES", help="`all`, or comma-separated variant names; default: the first in the file."
-        ),
+        str | None, option("all|NAMES", "`all`, or comma-separated variant names; default: the first in the file.")
     ] = None,
     overrides: SetOption = None,
-    jobs: Annotated[
-        int | None, typer.Option(metavar="N", min=1, help="Number of worker processes; default: one per core.")
-    ] = None,
+    jobs: Annotated[int | None, option("N", "Number of worker processes; default: one per core.", min=1)] = None,
     scheduler: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="Run on the workers of this Dask scheduler (tcp://HOST:PORT).")
+        str | None, option("ADDRESS", "Run on the workers of this Dask scheduler (tcp://HOST:PORT).")
     ] = None,
     out: Annotated[Path | None, folder_option("results/SCENARIO/sweep")] = None,
     keep_records: Annotated[KeepRecords, typer.Option(help="Which runs keep their full record.")] = KeepRecords.none,
@@ -76,9 +72,9 @@ def sweep(
     ] = False,
     plot: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="NUMBER",
-            help="Table column to plot instead of energy and error, e.g. base.tip_margin_min; repeatable. "
+        option(
+            "NUMBER",
+            "Table column to plot instead of energy and error, e.g. base.tip_margin_min; repeatable. "
             "With --resume, redraws a finished sweep.",
         ),
     ] = None,

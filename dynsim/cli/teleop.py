@@ -8,7 +8,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from dynsim.cli.app import QuietOption, ScenarioArgument, SetOption, VariantOption, folder_option, parsed_overrides
+from dynsim.cli.app import (
+    QuietOption,
+    ScenarioArgument,
+    SetOption,
+    VariantOption,
+    folder_option,
+    option,
+    parsed_overrides,
+)
 from dynsim.cli.drawing import open_address, write_view
 from dynsim.cli.tables import console, errors, print_line, print_written
 from dynsim.errors import DynsimError
@@ -18,19 +26,11 @@ from dynsim.system.terminal import escaped
 if TYPE_CHECKING:
     from dynsim.teleop.web.live import DriveReport
 
-SpeedOption = Annotated[
-    float, typer.Option(metavar="M/S", min=1e-3, max=10.0, help="Maximum speed of the hand or head [m/s].")
-]
-TurnOption = Annotated[
-    float, typer.Option(metavar="RAD/S", min=1e-3, max=20.0, help="Maximum turning rate of the hand or head [rad/s].")
-]
-BaseSpeedOption = Annotated[
-    float, typer.Option(metavar="M/S", min=1e-3, max=10.0, help="Maximum speed of the mobile base [m/s].")
-]
-LongestOption = Annotated[float, typer.Option(metavar="S", min=1.0, max=36000.0, help="Maximum duration [s].")]
-HttpPortOption = Annotated[
-    int, typer.Option(metavar="N", min=0, max=65535, help="Local port of the web page; 0 picks a free one.")
-]
+SpeedOption = Annotated[float, option("M/S", "Maximum speed of the hand or head [m/s].", min=1e-3, max=10.0)]
+TurnOption = Annotated[float, option("RAD/S", "Maximum turning rate of the hand or head [rad/s].", min=1e-3, max=20.0)]
+BaseSpeedOption = Annotated[float, option("M/S", "Maximum speed of the mobile base [m/s].", min=1e-3, max=10.0)]
+LongestOption = Annotated[float, option("S", "Maximum duration [s].", min=1.0, max=36000.0)]
+HttpPortOption = Annotated[int, option("N", "Local port of the web page; 0 picks a free one.", min=0, max=65535)]
 UntilClosedOption = Annotated[
     bool, typer.Option("--until-closed", help="Also end when the last browser window closes.")
 ]

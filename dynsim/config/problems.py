@@ -11,12 +11,15 @@ import re
 import types
 import typing
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel, ValidationError
+
+from dynsim.errors import ModelError
 
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
@@ -29,6 +32,15 @@ SHOWN_LIMIT = 80
 TAGS = ("type", "kind")
 # A list index in a dotted key.
 INDEX = re.compile("[0-9]{1,9}")
+
+
+@contextmanager
+def errors_at(*keys: int | str) -> Iterator[None]:
+    """Convert ModelErrors of the block to errors about a key of the scenario."""
+    try:
+        yield
+    except ModelError as error:
+        raise ModelError(f"{dotted(keys)}: {error}", keys=keys) from error
 
 
 @dataclass(frozen=True)

@@ -647,7 +647,7 @@ def prepare(scenario: Scenario, source: CommandSource | None = None) -> SnakeRun
         )
     description = build.machine(scenario)
     assert isinstance(description, SnakeDescription)
-    controller = build.controller(scenario, description)
+    controller = build.snake_controller(scenario, description)
     model, period = description.arrays(), controller.schedule.period
     ticks, stride = control_periods(scenario, period)
     rows, bodies = -(-ticks // stride) + 1, len(snake_scene(description).bodies)

@@ -158,7 +158,7 @@ def snake_start(scenario: Scenario, robot: SnakeTree, follow: Follow) -> tuple[S
         mode lifts wheel pair 1.
     """
     d, config = robot.description, scenario.config
-    controller = None if scenario.controller is None else build.controller(scenario, d)
+    controller = None if scenario.controller is None else build.snake_controller(scenario, d)
     grounded = np.ones(d.pairs)
     if controller is not None:
         grounded = controller.law.grounded[controller.fixing_row].astype(np.float64)

@@ -68,7 +68,7 @@ class Event:
     description: str = ""
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class Content:
     """Complete content of a record file."""
 

@@ -64,7 +64,7 @@ class Entries(dict[str, Any]):
         raise MissingEntry(f"no {self._kind} {brief(key)}; this record has: {', '.join(self) or 'none'}")
 
 
-class Record:
+class Record(Content):
     """Results of one run: signals with units, events, scene and provenance.
 
     ``record["q"]`` is the array of a signal, ``record.times("q")`` its sample times; iteration yields the signal names,
@@ -419,19 +419,7 @@ class Record:
         >>> bytes(dynsim.Record([0.0, 1.0]).to_hdf5()[1:4])
         b'HDF'
         """
-        return reader.encode(self._content())
-
-    def _content(self) -> Content:
-        return Content(
-            time=self.time,
-            signals=self.signals,
-            summary=self.summary,
-            provenance=self.provenance,
-            complete=self.complete,
-            axes=self.axes,
-            events=self.events,
-            scene=self.scene,
-        )
+        return reader.encode(self)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], *, trust: bool = False) -> Record:
@@ -468,12 +456,8 @@ class Record:
         """
         content = reader.read(Path(path), trust=trust)
         record = cls(content.time, provenance=content.provenance)
-        record.signals.update(content.signals)
-        record.summary.update(content.summary)
-        record.complete = content.complete
-        record.axes.update(content.axes)
-        record.events.extend(content.events)
-        record.scene = content.scene
+        for name in ("signals", "summary", "complete", "axes", "events", "scene"):
+            setattr(record, name, getattr(content, name))
         return record
 
     def to_dataframe(self, axis: str = TIME) -> pandas.DataFrame:
@@ -505,7 +489,7 @@ class Record:
         >>> list(record.to_dataframe().columns)
         ['q.shoulder', 'q.elbow']
         """
-        return export.to_dataframe(self._content(), axis)
+        return export.to_dataframe(self, axis)
 
     def to_xarray(self) -> xarray.Dataset:
         """Convert all signals to an xarray Dataset.
@@ -529,7 +513,7 @@ class Record:
         >>> dict(record.to_xarray().sizes)
         {'time': 2, 'q_label': 2}
         """
-        return export.to_xarray(self._content())
+        return export.to_xarray(self)
 
 
 def _entries(kind: str, entries: Mapping[str, Any]) -> Entries:

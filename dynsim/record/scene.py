@@ -34,12 +34,16 @@ HERE: Quaternion = (1.0, 0.0, 0.0, 0.0)
 """Identity orientation."""
 _FIELD = ("position", "spacing", "heights")
 """Attributes that a height field requires."""
-_CHECKS: Any = {"allow_inf_nan": False}
-"""Pydantic configuration of each class."""
+
+
+class _Finite:
+    """Base class of all parts of a scene: pydantic accepts only finite numbers."""
+
+    __pydantic_config__: ClassVar[Any] = {"allow_inf_nan": False}
 
 
 @dataclass(frozen=True)
-class Shape:
+class Shape(_Finite):
     """Solid on a body, for drawing only; it does not affect the mechanics.
 
     Attributes
@@ -57,7 +61,6 @@ class Shape:
         Red, green, blue and opacity from 0 to 1, if specified.
     """
 
-    __pydantic_config__: ClassVar[Any] = _CHECKS
     kind: ShapeKind
     size: tuple[float, ...]
     position: Vector3 = (0.0, 0.0, 0.0)
@@ -84,7 +87,7 @@ class Shape:
 
 
 @dataclass(frozen=True)
-class Joint:
+class Joint(_Finite):
     """Joint between a body and its parent.
 
     Attributes
@@ -107,7 +110,6 @@ class Joint:
         Name of the joint with several rates to which this joint belongs; "" for an independent joint.
     """
 
-    __pydantic_config__: ClassVar[Any] = _CHECKS
     name: str
     kind: JointKind
     axis: Vector3
@@ -125,10 +127,9 @@ class Joint:
 
 
 @dataclass(frozen=True)
-class Body:
+class Body(_Finite):
     """Rigid body; ``parent`` is the index of its parent body, or ``WORLD``."""
 
-    __pydantic_config__: ClassVar[Any] = _CHECKS
     name: str
     parent: int
     joint: Joint
@@ -145,7 +146,7 @@ class Body:
 
 
 @dataclass(frozen=True)
-class SceneSurface:
+class SceneSurface(_Finite):
     """Surface C(r) = 0 in the world; C > 0 is the free side, into which ∇C points.
 
     Attributes
@@ -170,7 +171,6 @@ class SceneSurface:
         Grid spacing of a height field along x and y, and its heights, one row per y [m], only as many as are drawn.
     """
 
-    __pydantic_config__: ClassVar[Any] = _CHECKS
     name: str
     Q: Matrix3
     b: Vector3
@@ -251,7 +251,7 @@ class SceneSurface:
 
 
 @dataclass(frozen=True)
-class Point:
+class Point(_Finite):
     """Named point on a body.
 
     Attributes
@@ -270,7 +270,6 @@ class Point:
         Coefficient of the friction cone of a contact point, 0 if unknown.
     """
 
-    __pydantic_config__: ClassVar[Any] = _CHECKS
     name: str
     role: Literal["hand", "contact", "support"]
     body: int
@@ -280,7 +279,7 @@ class Point:
 
 
 @dataclass(frozen=True)
-class SoftGripper:
+class SoftGripper(_Finite):
     """Soft gripper of a snake.
 
     Attributes
@@ -291,14 +290,13 @@ class SoftGripper:
         Bounds on the force [N] and torque [N m] on a grasped object.
     """
 
-    __pydantic_config__: ClassVar[Any] = _CHECKS
     capture: float
     force: float
     torque: float
 
 
 @dataclass(frozen=True)
-class Scene:
+class Scene(_Finite):
     """Bodies (parents first), surfaces, named points and fixed shapes.
 
     Attributes
@@ -331,7 +329,6 @@ class Scene:
         If a body precedes its parent, or a point is on a body that does not exist.
     """
 
-    __pydantic_config__: ClassVar[Any] = _CHECKS
     bodies: tuple[Body, ...] = ()
     surfaces: tuple[SceneSurface, ...] = ()
     points: tuple[Point, ...] = ()

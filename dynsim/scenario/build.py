@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, NamedTuple, overload
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from dynsim.compile.posture import on_surfaces
 from dynsim.compile.protocols import BuildContext
 from dynsim.compile.shapes import gap_at
 from dynsim.config.base import BodyPoint
-from dynsim.config.problems import dotted, suggest
+from dynsim.config.problems import dotted, errors_at, suggest
 from dynsim.errors import ModelError, ScenarioError, brief
 from dynsim.library import families
 from dynsim.model.description import WORLD, Array, Contact, Foot, Inertia, Load, Robot
@@ -135,11 +135,8 @@ def _tied(scenario: Scenario, built: Robot) -> Robot:
         for key, body in (("body", tie.body), ("other", tie.other)):
             if key == "other" and body == WORLD:
                 continue
-            try:
+            with errors_at("ties", name, key):
                 built.attach(body, tie.point)
-            except ModelError as error:
-                keys = ("ties", name, key)
-                raise ModelError(f"{dotted(keys)}: {error}", keys=keys) from error
     return replace(built, ties=(*built.ties, *ties.values()))
 
 
@@ -248,30 +245,38 @@ def build_model(scenario: Scenario) -> Model:
     return Model(robot(scenario))
 
 
-@overload
+def snake_controller(scenario: Scenario, description: SnakeDescription) -> TaskSpaceController:
+    """Build the controller for a snake; raises ModelError as :func:`controller`."""
+    from dynsim.snake.description import TaskSpaceController
+
+    context = BuildContext(scenario.duration_s, description)
+    return families.build("controller", _fitting_controller(scenario), context, TaskSpaceController)
+
+
+def _fitting_controller(scenario: Scenario) -> Any:
+    """Return the configuration of the controller; raise ModelError if there is none, or it does not fit the plant."""
+    config = scenario.controller
+    if config is None:
+        raise ModelError("the scenario has no controller; its motors are short-circuited")
+    # ENGINE of the modules, not of the scenario: a snake's controller drives a snake at both levels.
+    if families.member("plant", scenario.plant.type).ENGINE != families.member("controller", config.type).ENGINE:
+        raise ModelError(f"controller {config.type!r} cannot drive a {scenario.plant.type!r}")
+    return config
+
+
 def controller(
     scenario: Scenario,
     machine: Model,
     progress: Callable[[float], None] | None = None,
     touching: Sequence[Contact] | None = None,
-) -> JointControl: ...
-@overload
-def controller(
-    scenario: Scenario, machine: SnakeDescription, progress: Callable[[float], None] | None = None
-) -> TaskSpaceController: ...
-def controller(
-    scenario: Scenario,
-    machine: Model | SnakeDescription,
-    progress: Callable[[float], None] | None = None,
-    touching: Sequence[Contact] | None = None,
-) -> JointControl | TaskSpaceController:
-    """Build the controller for a machine.
+) -> JointControl:
+    """Build the controller for a model.
 
     Parameters
     ----------
     scenario : Scenario
         Validated scenario.
-    machine : Model or SnakeDescription
+    machine : Model
         Machine that the controller drives.
     progress : callable, optional
         Called with the time [s] up to which the references are computed.
@@ -285,59 +290,37 @@ def controller(
     UnreachableReference
         If the hand cannot follow its path.
     """
-    config = scenario.controller
-    if config is None:
-        raise ModelError("the scenario has no controller; its motors are short-circuited")
-    # ENGINE of the modules, not of the scenario: a snake's controller drives a snake at both levels.
-    if families.member("plant", scenario.plant.type).ENGINE != families.member("controller", config.type).ENGINE:
-        raise ModelError(f"controller {config.type!r} cannot drive a {scenario.plant.type!r}")
-    nominal = scenario
-    if isinstance(machine, Model) and scenario.config.surface_error is not None:
+    config, nominal = _fitting_controller(scenario), scenario
+    if scenario.config.surface_error is not None:
         # The controller plans with the nominal surfaces, not with the simulated ones.
         nominal = replace(scenario, config=scenario.config.model_copy(update={"surface_error": None}))
-        touching = contacts(nominal, machine.robot)
-    elif touching is None:
-        touching = contacts(scenario, machine.robot) if isinstance(machine, Model) else ()
+        touching = None
+    touching = contacts(nominal, machine.robot) if touching is None else touching
     points = {contact.name: contact for contact in touching}
     declared = [
         name for name, contact in points.items() if name in scenario.config.contacts.points and not contact.left_out
     ]
-    unused = disabled_points(nominal, machine.robot) if isinstance(machine, Model) else []
-    disabled = [contact.name for contact in unused]
-    tracked = _TrackedContacts({**points, **{contact.name: contact for contact in unused}})
+    unused = {contact.name: contact for contact in disabled_points(nominal, machine.robot)}
+    tracked, disabled = _TrackedContacts(points | unused), list(unused)
     context = BuildContext(
         scenario.duration_s, machine, progress=progress, contacts=tracked, declared=declared, disabled=disabled
     )
-    if isinstance(machine, Model):
+    made: list[JointControl] = []
 
-        def built() -> JointControl:
-            return families.build("controller", config, context, JointControl)
+    def independent_of_contacts() -> JointControl | None:
+        # A controller that reads no contact is the same for all runs with this machine and section.
+        made.append(families.build("controller", config, context, JointControl))
+        return None if tracked.accessed else made[0]
 
-        def independent_of_contacts() -> JointControl | None:
-            # A controller that reads no contact is the same for all runs with this machine and section.
-            made.append(built())
-            return None if tracked.accessed else made[0]
-
-        made: list[JointControl] = []
-        known = recall(
-            "controller",
-            independent_of_contacts,
-            config,
-            scenario.duration_s,
-            machine,
-            [*points],
-            declared,
-            disabled,
-        )
-        control = known or (made[0] if made else built())
-        # The kernels would extrapolate the last polynomial.
-        if control.end < scenario.duration_s * (1.0 - 1e-6):
-            ends = f"end at {control.end:g} s, the run at {scenario.duration_s:g} s"
-            raise ModelError(f"controller {config.type!r}: the references {ends}; extend the references")
-        return control
-    from dynsim.snake.description import TaskSpaceController
-
-    return families.build("controller", config, context, TaskSpaceController)
+    known = config, scenario.duration_s, machine, [*points], declared, disabled
+    control = recall("controller", independent_of_contacts, *known)
+    if control is None:
+        control = made[0] if made else families.build("controller", config, context, JointControl)
+    # The kernels would extrapolate the last polynomial.
+    if control.end < scenario.duration_s * (1.0 - 1e-6):
+        ends = f"end at {control.end:g} s, the run at {scenario.duration_s:g} s"
+        raise ModelError(f"controller {config.type!r}: the references {ends}; extend the references")
+    return control
 
 
 class _TrackedContacts(Mapping[str, Contact]):
@@ -494,12 +477,9 @@ def loads(scenario: Scenario, robot: Robot) -> list[Load]:
 
 def _attached(robot: Robot, name: str, config: BodyPoint) -> tuple[int, Array, Array]:
     """Return a load's link index, its point in the link's frame [m], and the axes of its components, shape (3, 3)."""
-    keys = ("loads", name, "body")
-    try:
+    with errors_at("loads", name, "body"):
         index, point = robot.attach(config.body, np.array(config.point_m))
-        return index, point, robot.attached_axes(config.body)
-    except ModelError as error:
-        raise ModelError(f"{dotted(keys)}: {error}", keys=keys) from error
+    return index, point, robot.attached_axes(config.body)
 
 
 def _payload(name: str, config: Payload, point: Array, axes: Array) -> Inertia:
@@ -584,11 +564,8 @@ def _keys_of(scenario: Scenario, contact: Contact) -> tuple[bool, tuple[str, ...
 
 def _check_body(scenario: Scenario, robot: Robot, contact: Contact) -> None:
     """Raise ModelError if a contact is on a body that does not exist or does not move."""
-    try:
+    with errors_at(*_keys_of(scenario, contact)[1], "body"):
         robot.attach(contact.body, contact.point)
-    except ModelError as error:
-        keys = (*_keys_of(scenario, contact)[1], "body")
-        raise ModelError(f"{dotted(keys)}: {error}", keys=keys) from error
 
 
 def left_out_warnings(
@@ -668,21 +645,19 @@ def sensor_mounts(scenario: Scenario, robot: Robot) -> dict[str, dict[str, Senso
 
 
 def _mount(robot: Robot, config: LinkSensorConfig, keys: tuple[str, ...]) -> SensorMount:
-    frames, key = {frame.name: frame.body for frame in robot.frames}, "body"
-    try:
+    frames = {frame.name: frame.body for frame in robot.frames}
+    with errors_at(*keys, "body"):
         if config.body == WORLD:
             raise ModelError(f"'world' has no joint; bodies: {', '.join(robot.bodies)}")
         robot.attach(config.body, np.zeros(3))
         if config.body in frames:
             body = frames[config.body]
             raise ModelError(f"{config.body!r} is a frame fixed to {body}; use body: {body}, frame: {config.body}")
-        key, frame = "frame", config.body if config.frame is None else config.frame
-        if config.frame is not None and frames.get(config.frame) != config.body:
+    if config.frame is not None and frames.get(config.frame) != config.body:
+        with errors_at(*keys, "frame"):
             own = [name for name, body in frames.items() if body == config.body]
             fix = f"frames: {', '.join(own)}" if own else "remove it, this body has no frames"
             raise ModelError(f"{config.frame!r} is not a frame fixed to {config.body}; {fix}")
-    except ModelError as error:
-        keys = (*keys, key)
-        raise ModelError(f"{dotted(keys)}: {error}", keys=keys) from error
+    frame = config.body if config.frame is None else config.frame
     index, point = robot.attach(frame, np.array(config.point_m))
     return SensorMount(index, robot.attached_axes(frame), point)

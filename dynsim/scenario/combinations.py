@@ -111,28 +111,9 @@ def _compliance(config: Any) -> Iterator[str]:
     )
 
 
-def _candidates(config: Any) -> Iterator[str]:
-    if config.contacts.candidates != "points":
-        yield "contacts.candidates"
-
-
-def _stepping(config: Any) -> Iterator[str]:
-    if config.integrator.method == "time_stepping":
-        yield "integrator.method"
-
-
-def _ties(config: Any) -> Iterator[str]:
-    yield from (f"ties.{name}" for name in config.ties)
-
-
-def _dense(config: Any) -> Iterator[str]:
-    if config.integrator.solver == "m_star":
-        yield "integrator.solver"
-
-
-def _theta(config: Any) -> Iterator[str]:
-    if config.integrator.theta != THETA:
-        yield "integrator.theta"
+def _key(key: str, used: Callable[[Any], bool]) -> Callable[[Any], Iterator[str]]:
+    """Return a function that yields a key if the configuration uses the feature."""
+    return lambda config: iter([key] if used(config) else [])
 
 
 def _joints_with_dry_friction(robot: Robot) -> list[str]:
@@ -160,7 +141,7 @@ RESTRICTIONS = (
         laws=LAWS[1:],
         methods=TIME_STEPPING,
         fix="set `contacts: {law: unilateral}`, even if nothing touches",
-        keys=_stepping,
+        keys=_key("integrator.method", lambda config: config.integrator.method == "time_stepping"),
     ),
     Restriction(
         "smoothed slip direction, pulling friction (`contacts.slip_smoothing_m_s`, `contacts.pulling_friction`)",
@@ -178,7 +159,7 @@ RESTRICTIONS = (
         "contact candidates `joints` and `links`",
         "the bilateral law would hold all of them to their surfaces",
         laws=LAWS[1:],
-        keys=_candidates,
+        keys=_key("contacts.candidates", lambda config: config.contacts.candidates != "points"),
     ),
     Restriction(
         "friction that depends on direction (`grip`)",
@@ -199,7 +180,7 @@ RESTRICTIONS = (
         "the event-driven methods have no bounded springs",
         laws=LAWS[1:],
         methods=TIME_STEPPING,
-        keys=_ties,
+        keys=lambda config: (f"ties.{name}" for name in config.ties),
         parts=lambda robot: [tie.name for tie in robot.ties],
         fix="remove the tie",
     ),
@@ -222,13 +203,13 @@ RESTRICTIONS = (
         "`integrator.solver: m_star`",
         "time stepping solves with articulated sweeps",
         methods=EVENT_DRIVEN,
-        keys=_dense,
+        keys=_key("integrator.solver", lambda config: config.integrator.solver == "m_star"),
     ),
     Restriction(
         "`integrator.theta`",
         "it is a parameter of that method",
         methods=TIME_STEPPING,
-        keys=_theta,
+        keys=_key("integrator.theta", lambda config: config.integrator.theta != THETA),
     ),
     WATCHED_EVENTS,
     LINEARIZATION,

@@ -109,20 +109,20 @@ def read_text(path: Path, error: ErrorClass, limit: int = SIZE_LIMIT) -> str:
         raise error(f"{path}:{line}: {wrong}; save it as UTF-8") from reason
 
 
-class YamlMapping(dict[str, Any]):
-    """Mapping of a YAML text; ``lines`` has the line of every key."""
+class _Located:
+    """Mapping or list of a YAML text; ``lines`` has the line of every key or entry."""
 
-    def __init__(self) -> None:
+    def __init__(self, lines: dict[Any, int] | None = None) -> None:
         super().__init__()
-        self.lines: dict[Any, int] = {}
+        self.lines: dict[Any, int] = {} if lines is None else lines
 
 
-class YamlList(list[Any]):
-    """List of a YAML text; ``lines`` has the line of every entry."""
+class YamlMapping(_Located, dict[str, Any]):
+    """Mapping of a YAML text."""
 
-    def __init__(self) -> None:
-        super().__init__()
-        self.lines: dict[Any, int] = {}
+
+class YamlList(_Located, list[Any]):
+    """List of a YAML text."""
 
 
 def parse_yaml(text: str, error: ErrorClass, source: str, *, line_numbers: bool = True) -> Any:
@@ -298,14 +298,12 @@ class _Reader:
         if isinstance(value, YamlMapping | YamlList):
             self._check_depth(line, depth)
         if isinstance(value, YamlMapping):
-            mapping = YamlMapping()
+            mapping = YamlMapping(value.lines)
             mapping.update((key, self._copy(item, line, depth + 1)) for key, item in value.items())
-            mapping.lines = value.lines
             return mapping
         if isinstance(value, YamlList):
-            entries = YamlList()
+            entries = YamlList(value.lines)
             entries.extend(self._copy(item, line, depth + 1) for item in value)
-            entries.lines = value.lines
             return entries
         return value
 

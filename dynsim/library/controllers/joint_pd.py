@@ -18,7 +18,7 @@ from dynsim.compile.references.inverse_kinematics import follow, planned_voltage
 from dynsim.compile.references.splines import clamped_cubic, quintic_coefficients, rolled, wheel_angles
 from dynsim.compile.references.teleop import TeleopOptions
 from dynsim.config.base import NonNegative, Positive, StrictConfig, Vector3, check_waypoints, error_at
-from dynsim.config.problems import suggest
+from dynsim.config.problems import errors_at, suggest
 from dynsim.errors import ModelError
 from dynsim.library import families
 from dynsim.library.controllers.operator import OperatorConfig
@@ -205,7 +205,10 @@ def build(config: Config, context: BuildContext) -> JointControl:
         path = recall(
             "path", lambda: families.build("path", path_config, context, HandPath), path_config, context.duration
         )
-    base_path = None if config.base is None else _base_path(config.base, context)
+    base_path = None
+    if config.base is not None:
+        with errors_at("controller", "base", "path"):
+            base_path = families.build("base_path", config.base.path, context, BasePath)
     times, positions = np.zeros(0), dict[str, NDArray[np.float64]]()
     planned = config.brace is not None or config.feed_forward != "none"
     if config.joints or config.torques or path is not None or base_path is not None or planned:
@@ -352,13 +355,6 @@ def _knots(spacing: float, duration: float) -> NDArray[np.float64]:
         )
     # A quintic spline needs six knots.
     return np.linspace(0.0, duration, max(int(np.ceil(segments)), 6) + 1)
-
-
-def _base_path(base: BaseReference, context: BuildContext) -> BasePath:
-    try:
-        return families.build("base_path", base.path, context, BasePath)
-    except ModelError as error:
-        raise ModelError(f"controller.base.path: {error}", keys=("controller", "base", "path")) from error
 
 
 def _wheel_angles(robot: Robot, path: BasePath, times: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:

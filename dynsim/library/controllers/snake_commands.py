@@ -6,7 +6,6 @@ The script of a live operator is replayed tick by tick, as recorded.
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 from pydantic import Field, field_validator, model_validator
 
 from dynsim.config.base import NonNegative, Positive, StrictConfig
+from dynsim.config.problems import suggest
 from dynsim.snake.description import FIXING, SWITCHING, CommandBlock, Feedback
 
 Coordinates = tuple[float, float, float, float, float, float]
@@ -45,17 +45,23 @@ class SnakeCommand(StrictConfig):
         text = value if isinstance(value, str) else ""
         if value is None or text in STATES or (isinstance(value, int) and not isinstance(value, bool)):
             return value
-        near = difflib.get_close_matches(text, STATES, n=1)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
-        raise ValueError(f"unknown mode{hint} (choices: {', '.join(STATES)}, or the number of a mode)")
+        raise ValueError(f"unknown mode{suggest(text, STATES)} (choices: {', '.join(STATES)}, or the number of a mode)")
 
 
-class Ramp(StrictConfig):
+class TargetMotion(StrictConfig):
+    """Motion of the target with a start, a duration and a profile in time."""
+
+    start_s: NonNegative = Field(0.0, description="start time of the motion")
+    duration_s: Positive = Field(description="duration of the motion")
+    profile: Profile = Field(
+        "smooth", description="progress in time: `linear`, or `smooth` (minimum jerk, from rest to rest)"
+    )
+
+
+class Ramp(TargetMotion):
     """Straight displacement of the target in its six coordinates."""
 
     type: Literal["ramp"]
-    start_s: NonNegative = Field(0.0, description="start time of the motion")
-    duration_s: Positive = Field(description="duration of the motion")
     displacement: Coordinates = Field(description="displacement in x, y, z [m] and alpha, beta, gamma [rad]")
     profile: Profile = Field(
         "linear", description="progress in time: `linear`, or `smooth` (minimum jerk, from rest to rest)"
@@ -66,12 +72,10 @@ class Ramp(StrictConfig):
         return s[:, None] * np.array(self.displacement)
 
 
-class Circle(StrictConfig):
+class Circle(TargetMotion):
     """Circle of the target in world axes: in the horizontal plane, starting along +x, or in the vertical yz plane."""
 
     type: Literal["circle"]
-    start_s: NonNegative = Field(0.0, description="start time of the motion")
-    duration_s: Positive = Field(description="duration of the motion")
     radius_m: Positive = Field(description="radius")
     turns: float = Field(
         1.0,
@@ -81,9 +85,6 @@ class Circle(StrictConfig):
     plane: Literal["xy", "yz"] = Field("xy", description="plane of the circle")
     backward: bool = Field(False, description="plane xy: move backward from the start point")
     turn_head: bool = Field(True, description="plane xy: the yaw angle follows the tangent")
-    profile: Profile = Field(
-        "smooth", description="progress in time: `linear`, or `smooth` (minimum jerk, from rest to rest)"
-    )
 
     def offset(self, s: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the displacement at progress s in [0, 1], shape (T, 6)."""
@@ -101,22 +102,17 @@ class Circle(StrictConfig):
         return out
 
 
-class DoorArc(StrictConfig):
+class DoorArc(TargetMotion):
     """Arc of a door knob about the hinge, with the yaw perpendicular to the door ([T] V.D.3).
 
     The robot faces the door along +x; the hinge is `radius_m` to the left or right of the target's start.
     """
 
     type: Literal["door_arc"]
-    start_s: NonNegative = Field(0.0, description="start time of the motion")
-    duration_s: Positive = Field(description="duration of the motion")
     radius_m: Positive = Field(description="distance from hinge to knob")
     angle_deg: Annotated[float, Field(gt=0, le=180)] = Field(60.0, description="opening angle of the door")
     hinge: Literal["left", "right"] = Field("left", description="side of the hinge")
     opening: Literal["pull", "push"] = Field("pull", description="direction in which the door opens")
-    profile: Profile = Field(
-        "smooth", description="progress in time: `linear`, or `smooth` (minimum jerk, from rest to rest)"
-    )
 
     def offset(self, s: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the displacement at progress s in [0, 1], shape (T, 6)."""

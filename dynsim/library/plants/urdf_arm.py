@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 
 from dynsim.compile.protocols import BuildContext
 from dynsim.config.base import BodyPoint, NonNegative, StrictConfig, Vector3, error_at
-from dynsim.config.problems import suggest
+from dynsim.config.problems import errors_at, suggest
 from dynsim.errors import ModelError
 from dynsim.library import families
 from dynsim.model.description import Array, Robot
@@ -136,10 +136,8 @@ def build(config: Config, context: BuildContext) -> Robot:
     }
     hand, axes = robot.hand, robot.hand_frame
     if config.hand is not None:
-        try:
+        with errors_at("plant", "hand", "body"):
             body, point = robot.attach(config.hand.body, np.array(config.hand.point_m))
-        except ModelError as error:
-            raise ModelError(f"plant.hand.body: {error}") from None
         hand, axes = (robot.links[body].name, point), robot.attached_axes(config.hand.body)
     return dataclasses.replace(
         robot,
