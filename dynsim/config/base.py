@@ -25,6 +25,11 @@ NonNegative = Annotated[float, Field(ge=0)]
 Lengths = Annotated[list[Positive], Field(min_length=3, max_length=3)]
 
 
+def default(value: Any, description: str, **limits: Any) -> Any:
+    """Return the field of a key that may be omitted: its default value, description and limits."""
+    return Field(value, description=description, **limits)
+
+
 def _nonzero(vector: list[float]) -> list[float]:
     if np.linalg.norm(vector) < 1e-12:
         raise ValueError("must not be the zero vector")
@@ -88,7 +93,7 @@ class BodyPoint(StrictConfig):
     """Point fixed on a body."""
 
     body: str = Field(description="name of the body, or of a frame fixed to a body")
-    point_m: Vector3 = Field([0.0, 0.0, 0.0], description="coordinates in the axes of the body or frame")
+    point_m: Vector3 = default([0.0, 0.0, 0.0], "coordinates in the axes of the body or frame")
 
 
 def error_at(key: str, message: str) -> PydanticCustomError:

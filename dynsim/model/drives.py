@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator, model_validator
 
-from dynsim.config.base import NonNegative, Positive, StrictConfig, Vector3, error_at
+from dynsim.config.base import NonNegative, Positive, StrictConfig, Vector3, default, error_at
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.drive import law as law
 
@@ -180,13 +180,13 @@ def limit(value: float | None) -> float:
 class DriveParameters(StrictConfig):
     """Motor of any kind: mass and continuous rating."""
 
-    mass_kg: NonNegative = Field(0.0, description="mass of motor and gear, a point mass on the link before the joint")
-    mass_point_m: Vector3 | None = Field(
-        None, description="position of the mass in that link's frame; default: at the motor's joint"
+    mass_kg: NonNegative = default(0.0, "mass of motor and gear, a point mass on the link before the joint")
+    mass_point_m: Vector3 | None = default(
+        None, "position of the mass in that link's frame; default: at the motor's joint"
     )
 
-    nominal_torque_N_m: Positive | None = Field(
-        None, description="continuous torque rating of motor and gear, at the joint; N at a prismatic joint"
+    nominal_torque_N_m: Positive | None = default(
+        None, "continuous torque rating of motor and gear, at the joint; N at a prismatic joint"
     )
 
     @model_validator(mode="after")
@@ -214,13 +214,13 @@ class MotorParameters(DriveParameters):
     inductance_H: Positive
     rotor_inertia_kg_m2: NonNegative
     gear_ratio: Positive = Field(description="motor turns per joint turn; at a prismatic joint rad of the motor per m")
-    gear_damping_N_m_s_per_rad: NonNegative = Field(0.0, description="viscous, on the motor side")
-    coulomb_friction_N_m: NonNegative = Field(
-        0.0, description="dry friction of the gear, at the joint; N at a prismatic joint; unilateral law"
+    gear_damping_N_m_s_per_rad: NonNegative = default(0.0, "viscous, on the motor side")
+    coulomb_friction_N_m: NonNegative = default(
+        0.0, "dry friction of the gear, at the joint; N at a prismatic joint; unilateral law"
     )
     voltage_limit_V: Positive | None = None
-    nominal_current_A: Positive | None = Field(None, description="continuous rating: a run that exceeds it warns")
-    peak_current_A: Positive | None = Field(None, description="current limit of its driver")
+    nominal_current_A: Positive | None = default(None, "continuous rating: a run that exceeds it warns")
+    peak_current_A: Positive | None = default(None, "current limit of its driver")
 
     @model_validator(mode="after")
     def _check_currents(self) -> Self:
@@ -272,22 +272,19 @@ class ServoParameters(DriveParameters):
     voltage_V: Positive = Field(description="supply voltage of stall torque and no-load speed")
     stall_torque_N_m: Positive
     no_load_speed_rad_per_s: Positive
-    mode: Literal["position", "velocity"] = Field(
-        "position", description="part of the reference that the servo follows"
-    )
-    k_p_V_per_rad: NonNegative = Field(0.0, description="position mode")
-    k_d_V_s_per_rad: NonNegative = Field(0.0, description="position mode")
-    k_v_V_s_per_rad: NonNegative = Field(0.0, description="velocity mode")
-    rotor_inertia_kg_m2: NonNegative = Field(0.0, description="rotor and gear, at the output shaft")
-    gear_damping_N_m_s_per_rad: NonNegative = Field(0.0, description="viscous, at the output shaft")
-    coulomb_friction_N_m: NonNegative = Field(0.0, description="friction of the gear, at the output shaft")
-    coulomb_speed_rad_per_s: Positive | None = Field(
-        None,
-        description="speed below which Coulomb friction fades; default: 0.01; under the unilateral law dry friction",
+    mode: Literal["position", "velocity"] = default("position", "part of the reference that the servo follows")
+    k_p_V_per_rad: NonNegative = default(0.0, "position mode")
+    k_d_V_s_per_rad: NonNegative = default(0.0, "position mode")
+    k_v_V_s_per_rad: NonNegative = default(0.0, "velocity mode")
+    rotor_inertia_kg_m2: NonNegative = default(0.0, "rotor and gear, at the output shaft")
+    gear_damping_N_m_s_per_rad: NonNegative = default(0.0, "viscous, at the output shaft")
+    coulomb_friction_N_m: NonNegative = default(0.0, "friction of the gear, at the output shaft")
+    coulomb_speed_rad_per_s: Positive | None = default(
+        None, "speed below which Coulomb friction fades; default: 0.01; under the unilateral law dry friction"
     )
     current_limit_A: Positive | None = None
-    torque_limit_N_m: Positive | None = Field(None, description="current limit as torque without gear friction")
-    nominal_current_A: Positive | None = Field(None, description="continuous rating: a run that exceeds it warns")
+    torque_limit_N_m: Positive | None = default(None, "current limit as torque without gear friction")
+    nominal_current_A: Positive | None = default(None, "continuous rating: a run that exceeds it warns")
 
     @model_validator(mode="after")
     def _check_currents(self) -> Self:

@@ -26,6 +26,7 @@ from dynsim.config.base import (
     Positive,
     StrictConfig,
     Vector3,
+    default,
     error_at,
     unit_vector,
 )
@@ -52,42 +53,38 @@ MX_RESOLUTION = math.degrees(2.0 * math.pi / 4096)
 class Sensor(StrictConfig):
     """Sampled sensor; the controller reads the last sample that has arrived."""
 
-    rate_hz: Rate | None = Field(None, description="sampling rate; default: one sample per controller tick")
-    delay_s: NonNegative = Field(0.0, description="delay between a sample and its arrival")
+    rate_hz: Rate | None = default(None, "sampling rate; default: one sample per controller tick")
+    delay_s: NonNegative = default(0.0, "delay between a sample and its arrival")
 
 
 class Encoders(Sensor):
     """Joint encoders; joint rates are differences of samples."""
 
-    resolution_deg: NonNegative = Field(
-        MX_RESOLUTION, description="resolution of joint angles; default: 4096 positions per turn, as in MX servos"
+    resolution_deg: NonNegative = default(
+        MX_RESOLUTION, "resolution of joint angles; default: 4096 positions per turn, as in MX servos"
     )
-    noise_deg: NonNegative = Field(0.0, description="standard deviation of the noise of joint angles, before rounding")
-    resolution_m: NonNegative = Field(0.0, description="resolution of prismatic joints")
-    noise_m: NonNegative = Field(
-        0.0, description="standard deviation of the noise of prismatic joints, before rounding"
-    )
+    noise_deg: NonNegative = default(0.0, "standard deviation of the noise of joint angles, before rounding")
+    resolution_m: NonNegative = default(0.0, "resolution of prismatic joints")
+    noise_m: NonNegative = default(0.0, "standard deviation of the noise of prismatic joints, before rounding")
 
 
 class MotionCapture(Sensor):
     """Motion capture of the position and attitude of a snake's controlled point ([T] V.A)."""
 
-    rate_hz: Rate | None = Field(100.0, description="sampling rate (assumed)")
-    delay_s: NonNegative = Field(0.01, description="delay between a sample and its arrival (assumed)")
-    position_noise_m: NonNegative = Field(
-        2e-4, description="standard deviation of the noise of each coordinate (assumed)"
-    )
-    attitude_noise_rad: NonNegative = Field(5e-4, description="standard deviation of the noise of each angle (assumed)")
+    rate_hz: Rate | None = default(100.0, "sampling rate (assumed)")
+    delay_s: NonNegative = default(0.01, "delay between a sample and its arrival (assumed)")
+    position_noise_m: NonNegative = default(2e-4, "standard deviation of the noise of each coordinate (assumed)")
+    attitude_noise_rad: NonNegative = default(5e-4, "standard deviation of the noise of each angle (assumed)")
 
 
 class LinkSensorConfig(StrictConfig):
     """Recorded sensor on a link: the body that carries it, and its point and axes there."""
 
     body: str = Field(description="name of the body that carries the sensor")
-    frame: str | None = Field(
-        None, description="frame fixed to `body`, from which the sensor has its axes; default: the frame of `body`"
+    frame: str | None = default(
+        None, "frame fixed to `body`, from which the sensor has its axes; default: the frame of `body`"
     )
-    point_m: Vector3 = Field([0.0, 0.0, 0.0], description="point of the sensor, in the axes of `frame`")
+    point_m: Vector3 = default([0.0, 0.0, 0.0], "point of the sensor, in the axes of `frame`")
 
 
 class WrenchSensor(LinkSensorConfig):
@@ -100,13 +97,13 @@ class WrenchSensor(LinkSensorConfig):
 class Sensors(StrictConfig):
     """Sensors of the robot; without a sensor the controller reads the exact state without delay."""
 
-    seed: StrictInt = Field(0, ge=0, description="seed of the noise of all sensors; equal seeds give equal noise")
-    encoders: Encoders | None = Field(None, description="joint encoders; default: exact joint angles and rates")
-    motion_capture: MotionCapture | None = Field(
-        None, description="motion capture of a snake's controlled point; default: the exact pose"
+    seed: StrictInt = default(0, "seed of the noise of all sensors; equal seeds give equal noise", ge=0)
+    encoders: Encoders | None = default(None, "joint encoders; default: exact joint angles and rates")
+    motion_capture: MotionCapture | None = default(
+        None, "motion capture of a snake's controlled point; default: the exact pose"
     )
-    wrench: dict[str, WrenchSensor] | None = Field(
-        None, description="named six-axis force/torque sensors at joints, recorded; default: no such sensors"
+    wrench: dict[str, WrenchSensor] | None = default(
+        None, "named six-axis force/torque sensors at joints, recorded; default: no such sensors"
     )
 
 
@@ -121,8 +118,8 @@ class TieConfig(StrictConfig):
     body: str = Field(description="first end: a body, or a frame fixed on a body")
     other: str = Field(description="second end: a body, a frame fixed on a body, or `world`")
     axis: Direction = Field(description="direction of the tie, in the axes of `body`")
-    pushes: bool = Field(False, description="only push `body` along the axis, away from `other`")
-    holds: bool = Field(True, description="active at the start; `Simulation.set_tie` changes it")
+    pushes: bool = default(False, "only push `body` along the axis, away from `other`")
+    holds: bool = default(True, "active at the start; `Simulation.set_tie` changes it")
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -149,12 +146,12 @@ class Linear(TieConfig):
     LAW = "stiffness_N_per_m", "damping_N_s_per_m", "bound_N"
 
     type: Literal["linear"]
-    point_m: Vector3 = Field([0.0, 0.0, 0.0], description="point of `body`, in its axes from its origin")
-    other_point_m: Vector3 = Field([0.0, 0.0, 0.0], description="point of `other`, in its axes from its origin")
-    stiffness_N_per_m: NonNegative = Field(0.0, description="stiffness k")
-    damping_N_s_per_m: NonNegative = Field(0.0, description="damping c")
-    bound_N: Positive | None = Field(None, description="force limit, beyond which x_0 moves; default: no limit")
-    rest_m: float | None = Field(None, description="rest length x_0; default: x at the start")
+    point_m: Vector3 = default([0.0, 0.0, 0.0], "point of `body`, in its axes from its origin")
+    other_point_m: Vector3 = default([0.0, 0.0, 0.0], "point of `other`, in its axes from its origin")
+    stiffness_N_per_m: NonNegative = default(0.0, "stiffness k")
+    damping_N_s_per_m: NonNegative = default(0.0, "damping c")
+    bound_N: Positive | None = default(None, "force limit, beyond which x_0 moves; default: no limit")
+    rest_m: float | None = default(None, "rest length x_0; default: x at the start")
 
     def tie(self, name: str) -> Tie:
         """Return the tie."""
@@ -170,9 +167,9 @@ class Torsion(TieConfig):
     LAW = "stiffness_N_m_per_rad", "damping_N_m_s_per_rad", "bound_N_m"
 
     type: Literal["torsion"]
-    stiffness_N_m_per_rad: NonNegative = Field(0.0, description="stiffness k")
-    damping_N_m_s_per_rad: NonNegative = Field(0.0, description="damping c")
-    bound_N_m: Positive | None = Field(None, description="torque limit, beyond which x_0 moves; default: no limit")
+    stiffness_N_m_per_rad: NonNegative = default(0.0, "stiffness k")
+    damping_N_m_s_per_rad: NonNegative = default(0.0, "damping c")
+    bound_N_m: Positive | None = default(None, "torque limit, beyond which x_0 moves; default: no limit")
 
     def tie(self, name: str) -> Tie:
         """Return the tie."""
@@ -194,15 +191,15 @@ Pieces = tuple[NDArray[np.float64], NDArray[np.float64]]
 class WrenchConfig(BodyPoint):
     """Point of application of a wrench, and the axes of its components."""
 
-    frame: Literal["world", "body"] = Field("world", description="axes of the force and torque components")
+    frame: Literal["world", "body"] = default("world", "axes of the force and torque components")
 
 
 class Constant(WrenchConfig):
     """Constant force and torque."""
 
     type: Literal["constant"]
-    force_N: Vector3 = Field([0.0, 0.0, 0.0], description="force at the point")
-    torque_N_m: Vector3 = Field([0.0, 0.0, 0.0], description="torque about the point")
+    force_N: Vector3 = default([0.0, 0.0, 0.0], "force at the point")
+    torque_N_m: Vector3 = default([0.0, 0.0, 0.0], "torque about the point")
 
     @property
     def hold(self) -> bool:
@@ -219,12 +216,10 @@ class Constant(WrenchConfig):
 class Sampled(WrenchConfig):
     """Force and torque interpolated between samples."""
 
-    interpolation: Literal["spline", "linear"] = Field(
-        "spline", description="`spline`: cubic, not-a-knot (a line for two samples, a parabola for three); or `linear`"
+    interpolation: Literal["spline", "linear"] = default(
+        "spline", "`spline`: cubic, not-a-knot (a line for two samples, a parabola for three); or `linear`"
     )
-    hold: bool = Field(
-        False, description="hold the first and last sample outside the sampled times; default: zero there"
-    )
+    hold: bool = default(False, "hold the first and last sample outside the sampled times; default: zero there")
     # Computed at load time: a later edit of the file does not change a loaded scenario.
     _pieces: Pieces = PrivateAttr()
 
@@ -262,10 +257,8 @@ class Samples(Sampled):
 
     type: Literal["samples"]
     times_s: list[float] = Field(min_length=2, description="sample times, increasing")
-    force_N: list[Vector3] | None = Field(None, description="force at each time; default: no force")
-    torque_N_m: list[Vector3] | None = Field(
-        None, description="torque about the point at each time; default: no torque"
-    )
+    force_N: list[Vector3] | None = default(None, "force at each time; default: no force")
+    torque_N_m: list[Vector3] | None = default(None, "torque about the point at each time; default: no torque")
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -309,10 +302,10 @@ class Payload(BodyPoint):
 
     type: Literal["payload"]
     mass_kg: NonNegative = Field(description="mass")
-    radius_m: NonNegative = Field(0.0, description="radius of a solid sphere; 0: a point mass")
-    inertia_kg_m2: Annotated[list[NonNegative], Field(min_length=3, max_length=3)] | None = Field(
+    radius_m: NonNegative = default(0.0, "radius of a solid sphere; 0: a point mass")
+    inertia_kg_m2: Annotated[list[NonNegative], Field(min_length=3, max_length=3)] | None = default(
         None,
-        description="moments of inertia xx, yy, zz about the centre of mass, in the axes of `body`; "
+        "moments of inertia xx, yy, zz about the centre of mass, in the axes of `body`; "
         "default: solid sphere of `radius_m`",
     )
 
@@ -340,7 +333,7 @@ class Guide(StrictConfig):
 
     KIND: ClassVar[str]
 
-    axis: Direction = Field([0.0, 0.0, 1.0], description="axis of the joint, in the object's axes")
+    axis: Direction = default([0.0, 0.0, 1.0], "axis of the joint, in the object's axes")
 
     def _joint(self, link: Link, damping: float, friction: float, limits: list[float] | None) -> Link:
         """Return the link on this joint, with limits [rad or m]."""
@@ -354,14 +347,14 @@ class Hinge(Guide):
 
     KIND = "revolute"
 
-    point_m: Vector3 = Field(
-        [0.0, 0.0, 0.0], description="point on the axis, from the object's centre; it becomes the origin of the body"
+    point_m: Vector3 = default(
+        [0.0, 0.0, 0.0], "point on the axis, from the object's centre; it becomes the origin of the body"
     )
-    friction_N_m: NonNegative = Field(0.0, description="dry friction torque; unilateral law")
-    damping_N_m_s_per_rad: NonNegative = Field(0.0, description="viscous damping")
-    limits_deg: Limits | None = Field(None, description="lower and upper limit; default: no limits")
-    spring_N_m_per_rad: NonNegative = Field(0.0, description="stiffness of a return spring; time_stepping only")
-    rest_deg: float = Field(0.0, gt=-180.0, lt=180.0, description="angle at which the spring torque is zero")
+    friction_N_m: NonNegative = default(0.0, "dry friction torque; unilateral law")
+    damping_N_m_s_per_rad: NonNegative = default(0.0, "viscous damping")
+    limits_deg: Limits | None = default(None, "lower and upper limit; default: no limits")
+    spring_N_m_per_rad: NonNegative = default(0.0, "stiffness of a return spring; time_stepping only")
+    rest_deg: float = default(0.0, "angle at which the spring torque is zero", gt=-180.0, lt=180.0)
 
     def joint(self, link: Link) -> Link:
         """Return the link on this joint."""
@@ -380,12 +373,12 @@ class Slide(Guide):
 
     KIND = "prismatic"
 
-    axis: Direction = Field([1.0, 0.0, 0.0], description="direction of the rails, in the object's axes")
-    friction_N: NonNegative = Field(0.0, description="dry friction force; unilateral law")
-    damping_N_s_per_m: NonNegative = Field(0.0, description="viscous damping")
-    limits_m: Limits | None = Field(None, description="lower and upper limit; default: no limits")
-    spring_N_per_m: NonNegative = Field(0.0, description="stiffness of a return spring; time_stepping only")
-    rest_m: float = Field(0.0, description="displacement at which the spring force is zero")
+    axis: Direction = default([1.0, 0.0, 0.0], "direction of the rails, in the object's axes")
+    friction_N: NonNegative = default(0.0, "dry friction force; unilateral law")
+    damping_N_s_per_m: NonNegative = default(0.0, "viscous damping")
+    limits_m: Limits | None = default(None, "lower and upper limit; default: no limits")
+    spring_N_per_m: NonNegative = default(0.0, "stiffness of a return spring; time_stepping only")
+    rest_m: float = default(0.0, "displacement at which the spring force is zero")
 
     @property
     def point_m(self) -> list[float]:
@@ -407,10 +400,10 @@ class Solid(StrictConfig):
     """Homogeneous solid: a box, a sphere, or a cylinder along its z axis."""
 
     mass_kg: Positive = Field(description="mass")
-    shape: Literal["box", "sphere", "cylinder"] = Field("box", description="shape")
-    size_m: Lengths | None = Field(None, description="edge lengths of a box along its axes")
-    radius_m: Positive | None = Field(None, description="radius of a sphere or cylinder")
-    length_m: Positive | None = Field(None, description="length of a cylinder along its z axis")
+    shape: Literal["box", "sphere", "cylinder"] = default("box", "shape")
+    size_m: Lengths | None = default(None, "edge lengths of a box along its axes")
+    radius_m: Positive | None = default(None, "radius of a sphere or cylinder")
+    length_m: Positive | None = default(None, "length of a cylinder along its z axis")
 
     @model_validator(mode="after")
     def _check_size(self) -> Self:
@@ -472,29 +465,29 @@ def _check_sizes(solid: Solid | SceneObject) -> None:
 class Part(Solid):
     """Solid that is part of an object."""
 
-    position_m: Vector3 = Field([0.0, 0.0, 0.0], description="position of the part's centre, in the object's axes")
-    rpy_deg: Vector3 = Field([0.0, 0.0, 0.0], description="attitude in the object's axes, Rz(yaw) Ry(pitch) Rx(roll)")
+    position_m: Vector3 = default([0.0, 0.0, 0.0], "position of the part's centre, in the object's axes")
+    rpy_deg: Vector3 = default([0.0, 0.0, 0.0], "attitude in the object's axes, Rz(yaw) Ry(pitch) Rx(roll)")
 
 
 class Grasp(StrictConfig):
     """Pose of a gripper that holds an object."""
 
-    position_m: Vector3 = Field(
-        [0.0, 0.0, 0.0], description="position of the gripper's tip, in the object's axes from its centre"
+    position_m: Vector3 = default(
+        [0.0, 0.0, 0.0], "position of the gripper's tip, in the object's axes from its centre"
     )
-    axis: Direction = Field([1.0, 0.0, 0.0], description="pointing direction of the gripper, in the object's axes")
+    axis: Direction = default([1.0, 0.0, 0.0], "pointing direction of the gripper, in the object's axes")
 
 
 class ObjectWheel(StrictConfig):
     """Wheel of an object: it touches surfaces as a sphere and has the inertia of a disc."""
 
     position_m: Vector3 = Field(description="position of the wheel's centre, in the object's axes from its centre")
-    axis: Direction = Field([0.0, 1.0, 0.0], description="axle, in the object's axes")
+    axis: Direction = default([0.0, 1.0, 0.0], "axle, in the object's axes")
     radius_m: Positive = Field(description="radius")
     mass_kg: Positive = Field(description="mass")
-    friction_N_m: NonNegative = Field(0.0, description="dry friction torque of the bearing; unilateral law")
-    damping_N_m_s_per_rad: NonNegative = Field(0.0, description="viscous damping")
-    motor: union("motor") | None = Field(None, description="motor; default: no motor")  # type: ignore[valid-type]
+    friction_N_m: NonNegative = default(0.0, "dry friction torque of the bearing; unilateral law")
+    damping_N_m_s_per_rad: NonNegative = default(0.0, "viscous damping")
+    motor: union("motor") | None = default(None, "motor; default: no motor")  # type: ignore[valid-type]
 
     def link(self, name: str, carrier: str) -> Link:
         """Return the wheel's link on the body `carrier`; I = m r²/2 about the axle, m r²/4 across it."""
@@ -518,22 +511,22 @@ class ObjectWheel(StrictConfig):
 class SceneObject(StrictConfig):
     """Object: a solid box, sphere or cylinder, or a rigid body of several parts."""
 
-    mass_kg: Positive | None = Field(None, description="mass; with `shape: parts` the sum of the masses of the parts")
-    shape: Literal["box", "sphere", "cylinder", "parts"] = Field("box", description="shape")
-    size_m: Lengths | None = Field(None, description="edge lengths of a box along its axes")
-    radius_m: Positive | None = Field(None, description="radius of a sphere or cylinder")
-    length_m: Positive | None = Field(None, description="length of a cylinder along its z axis")
-    parts: Annotated[dict[str, Part], Field(min_length=1)] | None = Field(
-        None, description="named solids, fixed to each other, for `shape: parts`"
+    mass_kg: Positive | None = default(None, "mass; with `shape: parts` the sum of the masses of the parts")
+    shape: Literal["box", "sphere", "cylinder", "parts"] = default("box", "shape")
+    size_m: Lengths | None = default(None, "edge lengths of a box along its axes")
+    radius_m: Positive | None = default(None, "radius of a sphere or cylinder")
+    length_m: Positive | None = default(None, "length of a cylinder along its z axis")
+    parts: Annotated[dict[str, Part], Field(min_length=1)] | None = default(
+        None, "named solids, fixed to each other, for `shape: parts`"
     )
     position_m: Vector3 = Field(
         description="initial position of the centre in the world; for `shape: parts`, of the origin of the parts"
     )
-    rpy_deg: Vector3 = Field([0.0, 0.0, 0.0], description="initial attitude, Rz(yaw) Ry(pitch) Rx(roll)")
-    hinge: Hinge | None = Field(None, description="hinge to the world; default: the object is free")
-    slide: Slide | None = Field(None, description="rails in the world; default: the object is free")
-    wheels: dict[str, ObjectWheel] = Field({}, description="named wheels of a free object")
-    grasp: Grasp | None = Field(None, description="grasp pose for a gripper; default: it cannot be gripped")
+    rpy_deg: Vector3 = default([0.0, 0.0, 0.0], "initial attitude, Rz(yaw) Ry(pitch) Rx(roll)")
+    hinge: Hinge | None = default(None, "hinge to the world; default: the object is free")
+    slide: Slide | None = default(None, "rails in the world; default: the object is free")
+    wheels: dict[str, ObjectWheel] = default({}, "named wheels of a free object")
+    grasp: Grasp | None = default(None, "grasp pose for a gripper; default: it cannot be gripped")
 
     @model_validator(mode="after")
     def _check_size(self) -> Self:
@@ -662,11 +655,11 @@ def frame_along(axis: Array) -> Array:
 
 def _write_nulls(written: dict[str, Any], defaults: Mapping[str, Any]) -> None:
     """Write ``null`` for each key without value that has a default of the plant, which would replace the None."""
-    for key, default in defaults.items():
+    for key, value in defaults.items():
         if key not in written:
             written[key] = None
-        elif isinstance(default, Mapping):
-            _write_nulls(written[key], default)
+        elif isinstance(value, Mapping):
+            _write_nulls(written[key], value)
 
 
 # Maximum length of a folder name on common file systems [bytes].
@@ -689,71 +682,64 @@ class Grip(StrictConfig):
 class ContactPoint(BodyPoint):
     """Contact of a point fixed on a body, or of a sphere around it, with a surface."""
 
-    surface: str = Field("floor", description="name of a surface")
-    radius_m: NonNegative = Field(0.0, description="radius of a sphere around the point; 0: the point touches")
-    friction: NonNegative | None = Field(None, description="kinetic coefficient μ; default: `contacts.friction`")
-    static_friction: NonNegative | None = Field(
-        None, description="static coefficient μ_s; default: `contacts.static_friction`; unilateral law"
+    surface: str = default("floor", "name of a surface")
+    radius_m: NonNegative = default(0.0, "radius of a sphere around the point; 0: the point touches")
+    friction: NonNegative | None = default(None, "kinetic coefficient μ; default: `contacts.friction`")
+    static_friction: NonNegative | None = default(
+        None, "static coefficient μ_s; default: `contacts.static_friction`; unilateral law"
     )
-    restitution: Share | None = Field(
-        None, description="coefficient of restitution; default: `contacts.restitution`; unilateral law"
+    restitution: Share | None = default(
+        None, "coefficient of restitution; default: `contacts.restitution`; unilateral law"
     )
-    grip: Grip | None = Field(None, description="anisotropic friction; default: isotropic; time_stepping only")
-    stiffness_N_per_m: Positive | None = Field(
-        None, description="stiffness along the normal; default: `contacts.stiffness_N_per_m`; time_stepping only"
+    grip: Grip | None = default(None, "anisotropic friction; default: isotropic; time_stepping only")
+    stiffness_N_per_m: Positive | None = default(
+        None, "stiffness along the normal; default: `contacts.stiffness_N_per_m`; time_stepping only"
     )
-    damping_N_s_per_m: NonNegative | None = Field(
-        None, description="damping along the normal; default: `contacts.damping_N_s_per_m`; time_stepping only"
+    damping_N_s_per_m: NonNegative | None = default(
+        None, "damping along the normal; default: `contacts.damping_N_s_per_m`; time_stepping only"
     )
-    enabled: bool = Field(True, description="whether the point can touch")
+    enabled: bool = default(True, "whether the point can touch")
 
 
 class Contacts(StrictConfig):
     """Contact law, friction and contact points."""
 
-    law: Literal["bilateral", "unilateral"] = Field(
+    law: Literal["bilateral", "unilateral"] = default(
         "bilateral",
-        description="`bilateral`: points stay on their surfaces, with normal forces of any sign; "
+        "`bilateral`: points stay on their surfaces, with normal forces of any sign; "
         "`unilateral`: surfaces only push, and points stick, slip and lift off",
     )
-    friction: NonNegative = Field(0.1, description="kinetic coefficient μ")
-    static_friction: NonNegative | None = Field(
-        None, description="static coefficient μ_s, at least `friction`; default: `friction`; unilateral law"
+    friction: NonNegative = default(0.1, "kinetic coefficient μ")
+    static_friction: NonNegative | None = default(
+        None, "static coefficient μ_s, at least `friction`; default: `friction`; unilateral law"
     )
-    stribeck_m_s: Positive | None = Field(
+    stribeck_m_s: Positive | None = default(
         None,
-        description="Stribeck speed v_s of μ + (μ_s − μ) exp(−(v/v_s)²); "
-        "default: μ as soon as the point slips; unilateral law",
+        "Stribeck speed v_s of μ + (μ_s − μ) exp(−(v/v_s)²); default: μ as soon as the point slips; unilateral law",
     )
-    viscous_friction_s_per_m: NonNegative = Field(
-        0.0, description="increase of the coefficient per m/s of slip; unilateral law"
+    viscous_friction_s_per_m: NonNegative = default(0.0, "increase of the coefficient per m/s of slip; unilateral law")
+    restitution: Share = default(0.0, "coefficient of restitution for the normal speed; unilateral law")
+    stiffness_N_per_m: Positive | None = default(
+        None, "contact stiffness along the normal; default: rigid; time_stepping only"
     )
-    restitution: Share = Field(0.0, description="coefficient of restitution for the normal speed; unilateral law")
-    stiffness_N_per_m: Positive | None = Field(
-        None, description="contact stiffness along the normal; default: rigid; time_stepping only"
-    )
-    damping_N_s_per_m: NonNegative = Field(
-        0.0, description="damping of compliant contacts along the normal; time_stepping only"
-    )
-    slip_smoothing_m_s: Positive = Field(
-        1e-3, description="v_s of the smoothed slip direction v_t/√(v_t² + v_s²); bilateral law"
-    )
-    pulling_friction: Literal["signed", "dissipative"] = Field(
+    damping_N_s_per_m: NonNegative = default(0.0, "damping of compliant contacts along the normal; time_stepping only")
+    slip_smoothing_m_s: Positive = default(1e-3, "v_s of the smoothed slip direction v_t/√(v_t² + v_s²); bilateral law")
+    pulling_friction: Literal["signed", "dissipative"] = default(
         "dissipative",
-        description="friction of a pulling contact: `signed` f_t = μ f_n as printed in the paper, "
+        "friction of a pulling contact: `signed` f_t = μ f_n as printed in the paper, "
         "`dissipative` f_t = μ |f_n|; bilateral law",
     )
-    reference_tolerance_m: Positive = Field(
+    reference_tolerance_m: Positive = default(
         2e-3,
-        description="maximum distance of a contact point from its surface along the references; "
+        "maximum distance of a contact point from its surface along the references; "
         "an error if exceeded; bilateral law",
     )
-    candidates: Literal["points", "joints", "links"] = Field(
+    candidates: Literal["points", "joints", "links"] = default(
         "points",
-        description="contacts in addition to `points`: none (`points`), all joints and the hand (`joints`), "
+        "contacts in addition to `points`: none (`points`), all joints and the hand (`joints`), "
         "or the links as capsules (`links`)",
     )
-    points: dict[str, ContactPoint] = Field({}, description="named contact points")
+    points: dict[str, ContactPoint] = default({}, "named contact points")
 
     def of(self, point: ContactPoint | None, key: str) -> Any:
         """Return a key of a point, or the key of `contacts` if the point does not set it."""
@@ -815,16 +801,10 @@ class Contacts(StrictConfig):
 class Initial(StrictConfig):
     """Start of a run: smallest change of the plant's initial posture, and initial motor currents."""
 
-    on_surface: list[str] = Field(
-        [], description="contact points, enabled or disabled, that start exactly on their surfaces"
-    )
-    keep: list[str] = Field(
-        [], description="joints that `on_surface` must not move; `hand` keeps the position of the hand"
-    )
-    on_references: bool = Field(False, description="start joints with waypoints at their first waypoint")
-    equilibrium: bool = Field(
-        False, description="start with the motor currents of least heat that hold the robot at rest"
-    )
+    on_surface: list[str] = default([], "contact points, enabled or disabled, that start exactly on their surfaces")
+    keep: list[str] = default([], "joints that `on_surface` must not move; `hand` keeps the position of the hand")
+    on_references: bool = default(False, "start joints with waypoints at their first waypoint")
+    equilibrium: bool = default(False, "start with the motor currents of least heat that hold the robot at rest")
 
     @model_validator(mode="after")
     def _check_effect(self) -> Self:
@@ -842,41 +822,37 @@ class Initial(StrictConfig):
 class SurfaceError(StrictConfig):
     """Difference between the simulated surfaces and the surfaces that the controller assumes."""
 
-    shift_m: Vector3 = Field([0.0, 0.0, 0.0], description="displacement of all surfaces in the world")
-    friction_factor: NonNegative = Field(1.0, description="factor on all coefficients of friction")
+    shift_m: Vector3 = default([0.0, 0.0, 0.0], "displacement of all surfaces in the world")
+    friction_factor: NonNegative = default(1.0, "factor on all coefficients of friction")
 
 
 class Integrator(StrictConfig):
     """Time integration."""
 
-    method: Literal[METHODS] = Field(  # type: ignore[valid-type]
+    method: Literal[METHODS] = default(  # type: ignore[valid-type]
         "auto",
-        description="integration method; `auto`: `dopri5` or `radau5`, depending on the system; `dopri5`: adaptive, "
+        "integration method; `auto`: `dopri5` or `radau5`, depending on the system; `dopri5`: adaptive, "
         "explicit 5(4); `radau5`: adaptive, implicit (for stiff motors); `time_stepping`: fixed step, with contacts "
         "that open and close",
     )
-    solver: Literal["articulated", "m_star"] = Field(
-        "articulated",
-        description="equations of motion by O(n) sweeps (`articulated`) or the dense matrix M* (`m_star`)",
+    solver: Literal["articulated", "m_star"] = default(
+        "articulated", "equations of motion by O(n) sweeps (`articulated`) or the dense matrix M* (`m_star`)"
     )
-    rtol: float = Field(1e-6, ge=1e-13, le=1e-1, description="relative tolerance of adaptive methods")
-    atol: float | None = Field(
-        None, ge=1e-16, le=1e-1, description="absolute tolerance; default: rtol/100, at most 1e-8"
+    rtol: float = default(1e-6, "relative tolerance of adaptive methods", ge=1e-13, le=1e-1)
+    atol: float | None = default(None, "absolute tolerance; default: rtol/100, at most 1e-8", ge=1e-16, le=1e-1)
+    step_s: Positive | None = default(
+        None, "fixed step of time_stepping, default: 0.001; first step of adaptive methods, default: automatic"
     )
-    step_s: Positive | None = Field(
-        None,
-        description="fixed step of time_stepping, default: 0.001; first step of adaptive methods, default: automatic",
-    )
-    theta: float = Field(
+    theta: float = default(
         THETA,
+        "implicitness of time_stepping: 0.5 is second order between events, 1 adds numerical damping",
         ge=0.5,
         le=1.0,
-        description="implicitness of time_stepping: 0.5 is second order between events, 1 adds numerical damping",
     )
-    step_max_s: Positive | None = Field(None, description="maximum step of adaptive methods; default: no limit")
-    wall_limit_s: Positive | None = Field(
+    step_max_s: Positive | None = default(None, "maximum step of adaptive methods; default: no limit")
+    wall_limit_s: Positive | None = default(
         None,
-        description="maximum wall-clock time of the integration; default: no limit; "
+        "maximum wall-clock time of the integration; default: no limit; "
         "an error if the estimate exceeds ten times the limit",
     )
 
@@ -896,14 +872,14 @@ class Integrator(StrictConfig):
 class RecordOptions(StrictConfig):
     """Sampling rate and size limit of the record."""
 
-    rate_hz: Positive = Field(200.0, description="sampling rate of the record")
-    size_limit_GB: Positive = Field(2.0, description="maximum size of the record; a larger record is an error")
+    rate_hz: Positive = default(200.0, "sampling rate of the record")
+    size_limit_GB: Positive = default(2.0, "maximum size of the record; a larger record is an error")
 
 
 class Metrics(StrictConfig):
     """Options of the summary."""
 
-    settle_s: NonNegative = Field(2.0, description="time from which tracking errors are evaluated")
+    settle_s: NonNegative = default(2.0, "time from which tracking errors are evaluated")
 
 
 def merge_defaults(defaults: Any, values: Any) -> Any:
@@ -916,34 +892,31 @@ def merge_defaults(defaults: Any, values: Any) -> Any:
 class ScenarioConfig(StrictConfig):
     """Scenario file of dynsim."""
 
-    name: str = Field("", description="name of the scenario; default: the file name without extension")
-    variant: str = Field("", description="name of the variant; written into resolved scenarios")
-    description: str = Field("", description="text about the scenario")
+    name: str = default("", "name of the scenario; default: the file name without extension")
+    variant: str = default("", "name of the variant; written into resolved scenarios")
+    description: str = default("", "text about the scenario")
     duration_s: Positive = Field(description="simulated time")
     plant: union("plant") = Field(description="robot")  # type: ignore[valid-type]
-    controller: union("controller") | None = Field(  # type: ignore[valid-type]
-        None, description="controller; default: none, with the motors short-circuited"
+    controller: union("controller") | None = default(  # type: ignore[valid-type]
+        None, "controller; default: none, with the motors short-circuited"
     )
-    surfaces: dict[str, union("surface")] = Field(  # type: ignore[valid-type]
-        {}, description="named surfaces"
+    surfaces: dict[str, union("surface")] = default({}, "named surfaces")  # type: ignore[valid-type]
+    contacts: Contacts = default(Contacts(), "contact law, friction and contact points")
+    surface_error: SurfaceError | None = default(
+        None, "difference between the surfaces and the controller's assumptions; default: none"
     )
-    contacts: Contacts = Field(Contacts(), description="contact law, friction and contact points")
-    surface_error: SurfaceError | None = Field(
-        None, description="difference between the surfaces and the controller's assumptions; default: none"
+    initial: Initial | None = default(
+        None, "changes to the initial posture and motor currents; default: as in the plant"
     )
-    initial: Initial | None = Field(
-        None, description="changes to the initial posture and motor currents; default: as in the plant"
+    loads: dict[str, LoadConfig] = default({}, "named forces, torques and payloads")
+    objects: dict[str, SceneObject] = default({}, "named bodies in addition to the robot")
+    ties: dict[str, TieChoice] = default({}, "named springs and dampers between two bodies")
+    sensors: Sensors | None = default(
+        None, "sensors of a sampled controller (default: the exact state without delay), and recorded sensors"
     )
-    loads: dict[str, LoadConfig] = Field({}, description="named forces, torques and payloads")
-    objects: dict[str, SceneObject] = Field({}, description="named bodies in addition to the robot")
-    ties: dict[str, TieChoice] = Field({}, description="named springs and dampers between two bodies")
-    sensors: Sensors | None = Field(
-        None,
-        description="sensors of a sampled controller (default: the exact state without delay), and recorded sensors",
-    )
-    integrator: Integrator = Field(Integrator(), description="time integration")
-    record: RecordOptions = Field(RecordOptions(), description="sampling rate and size limit of the record")
-    metrics: Metrics = Field(Metrics(), description="options of the summary")
+    integrator: Integrator = default(Integrator(), "time integration")
+    record: RecordOptions = default(RecordOptions(), "sampling rate and size limit of the record")
+    metrics: Metrics = default(Metrics(), "options of the summary")
 
     @model_validator(mode="before")
     @classmethod

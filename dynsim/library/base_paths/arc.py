@@ -11,7 +11,7 @@ from pydantic import Field
 from dynsim.compile.control import BasePath
 from dynsim.compile.protocols import BuildContext
 from dynsim.compile.references.splines import minimum_jerk
-from dynsim.config.base import NonNegative, Positive, StrictConfig
+from dynsim.config.base import NonNegative, Positive, StrictConfig, default
 
 
 class Config(StrictConfig):
@@ -25,7 +25,7 @@ class Config(StrictConfig):
         description="turn of the heading, positive to the left; with the sign opposite to radius_m the base reverses"
     )
     duration_s: Positive = Field(description="duration of the motion")
-    start_s: NonNegative = Field(0.0, description="start time of the motion")
+    start_s: NonNegative = default(0.0, "start time of the motion")
 
     def motion(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return distance R ψ [m] and turn ψ = α s(x) [rad] at times t [s], shape (T, 2)."""

@@ -14,7 +14,7 @@ from scipy.interpolate import PchipInterpolator
 from dynsim.compile.control import BasePath
 from dynsim.compile.protocols import BuildContext
 from dynsim.compile.references.plane_curve import AlongCurve, PlaneCurve, seen_from_start
-from dynsim.config.base import StrictConfig, error_at
+from dynsim.config.base import StrictConfig, default, error_at
 from dynsim.errors import ModelError
 from dynsim.record.csv_rows import read_table
 
@@ -34,8 +34,8 @@ class Config(StrictConfig):
         description="path of a CSV file, relative to the scenario file, with the header t_s,x_m,y_m or "
         "t_s,V_m_s,omega_rad_s"
     )
-    frame: Literal["world", "start"] | None = Field(
-        None, description="frame of x_m and y_m: `world`, or `start` (the base at its start, x ahead); default: world"
+    frame: Literal["world", "start"] | None = default(
+        None, "frame of x_m and y_m: `world`, or `start` (the base at its start, x ahead); default: world"
     )
     # Read once: an edit of the file does not change a loaded scenario.
     _rows: NDArray[np.float64] = PrivateAttr()

@@ -11,7 +11,7 @@ from scipy.interpolate import BPoly
 from dynsim.compile.control import BasePath
 from dynsim.compile.protocols import BuildContext
 from dynsim.compile.references.plane_curve import AlongCurve, PlaneCurve, seen_from_start
-from dynsim.config.base import NonNegative, Pair, StrictConfig, check_waypoints
+from dynsim.config.base import NonNegative, Pair, StrictConfig, check_waypoints, default
 
 
 class Config(StrictConfig):
@@ -20,8 +20,8 @@ class Config(StrictConfig):
     type: Literal["waypoints"]
     times_s: list[NonNegative] = Field(min_length=2, description="times of the points, increasing")
     points_m: list[Pair] = Field(min_length=2, description="x and y of the points; the base starts at the first")
-    frame: Literal["world", "start"] = Field(
-        "world", description="frame of the points: `world`, or `start` (the base at its start, x ahead)"
+    frame: Literal["world", "start"] = default(
+        "world", "frame of the points: `world`, or `start` (the base at its start, x ahead)"
     )
 
     @model_validator(mode="after")

@@ -17,7 +17,7 @@ from dynsim.compile.protocols import BuildContext
 from dynsim.compile.references.inverse_kinematics import follow, planned_voltages
 from dynsim.compile.references.splines import clamped_cubic, quintic_coefficients, rolled, wheel_angles
 from dynsim.compile.references.teleop import TeleopOptions
-from dynsim.config.base import NonNegative, Positive, StrictConfig, Vector3, check_waypoints, error_at
+from dynsim.config.base import NonNegative, Positive, StrictConfig, Vector3, check_waypoints, default, error_at
 from dynsim.config.problems import errors_at, suggest
 from dynsim.errors import ModelError
 from dynsim.library import families
@@ -56,17 +56,13 @@ class HandReference(StrictConfig):
     """Hand path that inverse kinematics converts to references of `joints`."""
 
     path: PathChoice = Field(description="path of the hand")
-    orientation: Orientation | None = Field(
-        None, description="constant attitude of the hand's body or frame; default: free"
-    )
+    orientation: Orientation | None = default(None, "constant attitude of the hand's body or frame; default: free")
     joints: list[str] = Field(
         description="joints that follow the path, while the other joints hold; an empty list if `controller.joints` "
         "moves the hand along the path"
     )
-    braces: list[str] = Field([], description="contact points that the joints keep on their surfaces")
-    tolerance_m: Positive = Field(
-        1e-6, description="maximum position error; a larger error means that the path is out of reach"
-    )
+    braces: list[str] = default([], "contact points that the joints keep on their surfaces")
+    tolerance_m: Positive = default(1e-6, "maximum position error; a larger error means that the path is out of reach")
 
 
 class BaseReference(StrictConfig):
@@ -79,11 +75,9 @@ class JointPath(StrictConfig):
     """Waypoints of one joint: a cubic spline with zero rate at both ends, constant beyond them."""
 
     times_s: list[float] = Field(min_length=2, description="times of the waypoints, increasing")
-    angles_deg: list[float] | None = Field(None, min_length=2, description="angles of a revolute joint")
-    positions_m: list[float] | None = Field(None, min_length=2, description="positions of a prismatic joint")
-    ends: Literal["rest", "free"] = Field(
-        "rest", description="ends of the spline: `rest` (zero rate) or `free` (zero curvature)"
-    )
+    angles_deg: list[float] | None = default(None, "angles of a revolute joint", min_length=2)
+    positions_m: list[float] | None = default(None, "positions of a prismatic joint", min_length=2)
+    ends: Literal["rest", "free"] = default("rest", "ends of the spline: `rest` (zero rate) or `free` (zero curvature)")
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -124,34 +118,34 @@ class Config(StrictConfig):
     """
 
     type: Literal["joint_pd"]
-    k_p_V_per_rad: NonNegative | list[NonNegative] | None = Field(
-        None, description="position gain, one value or one per DC motor; V/m at a prismatic joint; default: 500"
+    k_p_V_per_rad: NonNegative | list[NonNegative] | None = default(
+        None, "position gain, one value or one per DC motor; V/m at a prismatic joint; default: 500"
     )
-    k_d_V_s_per_rad: NonNegative | list[NonNegative] | None = Field(
-        None, description="rate gain, one value or one per DC motor; V s/m at a prismatic joint; default: 20"
+    k_d_V_s_per_rad: NonNegative | list[NonNegative] | None = default(
+        None, "rate gain, one value or one per DC motor; V s/m at a prismatic joint; default: 20"
     )
-    hand: HandReference | None = Field(None, description="path of the hand; default: no path")
-    base: BaseReference | None = Field(None, description="path of the mobile base; default: it holds")
-    operator: OperatorConfig | None = Field(
-        None, description="velocities of hand and mobile base, instead of paths; default: no operator"
+    hand: HandReference | None = default(None, "path of the hand; default: no path")
+    base: BaseReference | None = default(None, "path of the mobile base; default: it holds")
+    operator: OperatorConfig | None = default(
+        None, "velocities of hand and mobile base, instead of paths; default: no operator"
     )
-    joints: dict[str, JointPath] = Field({}, description="waypoints of the named joints")
-    torques: dict[str, TorquePath] = Field({}, description="torques of the named joints with motors of type torque")
-    feed_forward: Literal["none", "gravity", "dynamics"] = Field(
+    joints: dict[str, JointPath] = default({}, "waypoints of the named joints")
+    torques: dict[str, TorquePath] = default({}, "torques of the named joints with motors of type torque")
+    feed_forward: Literal["none", "gravity", "dynamics"] = default(
         "none",
-        description="planned voltages of DC motors along the references, added to the PD: none, for gravity, or for "
+        "planned voltages of DC motors along the references, added to the PD: none, for gravity, or for "
         "the full dynamics",
     )
-    brace: Literal["optimal"] | dict[str, Positive] | None = Field(
+    brace: Literal["optimal"] | dict[str, Positive] | None = default(
         None,
-        description="normal forces [N] of the named contacts, or `optimal` for forces of least heat; voltages are "
+        "normal forces [N] of the named contacts, or `optimal` for forces of least heat; voltages are "
         "then planned for the full dynamics with these forces; default: no planned forces",
     )
-    min_N: NonNegative = Field(MIN_N, description="minimum normal force of each brace with `brace: optimal`")
-    sample_time_s: Positive | None = Field(
-        None, description="sampling period of the commands, held in between; default: continuous"
+    min_N: NonNegative = default(MIN_N, "minimum normal force of each brace with `brace: optimal`")
+    sample_time_s: Positive | None = default(
+        None, "sampling period of the commands, held in between; default: continuous"
     )
-    knot_spacing_s: Positive = Field(0.02, description="knot spacing of the reference splines")
+    knot_spacing_s: Positive = default(0.02, "knot spacing of the reference splines")
 
     @field_validator("brace", mode="before")
     @classmethod

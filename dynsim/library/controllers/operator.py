@@ -9,44 +9,41 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from dynsim.compile.references.teleop import BASE, HAND, VELOCITIES, VelocityScript
-from dynsim.config.base import NonNegative, Pair, Positive, StrictConfig, Vector3
+from dynsim.config.base import NonNegative, Pair, Positive, StrictConfig, Vector3, default
 
 
 class Velocity(StrictConfig):
     """Velocity command of an operator; omitted velocities do not change."""
 
     at_s: NonNegative = Field(description="time of the command")
-    hand: Vector3 | None = Field(
+    hand: Vector3 | None = default(
         None,
-        description="hand velocity x, y, z [m/s] in world axes, or on a mobile base in the axes of the base; "
-        "default: unchanged",
+        "hand velocity x, y, z [m/s] in world axes, or on a mobile base in the axes of the base; default: unchanged",
     )
-    base: Pair | None = Field(
-        None, description="base velocity: forward [m/s] and turning to the left [rad/s]; default: unchanged"
+    base: Pair | None = default(
+        None, "base velocity: forward [m/s] and turning to the left [rad/s]; default: unchanged"
     )
 
 
 class OperatorConfig(StrictConfig):
     """References that follow commanded velocities, from a scenario or a live operator, updated at every tick."""
 
-    rate_hz: Positive = Field(100.0, description="tick rate, at which the references are updated")
-    joints: list[str] = Field([], description="joints that follow the hand velocity; the other joints hold")
-    braces: list[str] = Field([], description="contact points that the joints keep on their surfaces")
-    rate_limit_rad_s: Positive = Field(
-        2.0, description="maximum joint rate (m/s at a prismatic joint); it slows the hand down if necessary"
+    rate_hz: Positive = default(100.0, "tick rate, at which the references are updated")
+    joints: list[str] = default([], "joints that follow the hand velocity; the other joints hold")
+    braces: list[str] = default([], "contact points that the joints keep on their surfaces")
+    rate_limit_rad_s: Positive = default(
+        2.0, "maximum joint rate (m/s at a prismatic joint); it slows the hand down if necessary"
     )
-    acceleration_limit_rad_s2: Positive = Field(
+    acceleration_limit_rad_s2: Positive = default(
         10.0,
-        description="maximum joint acceleration (m/s² at a prismatic joint); limits how fast a joint stops at the "
+        "maximum joint acceleration (m/s² at a prismatic joint); limits how fast a joint stops at the "
         "edge of the workspace",
     )
-    hand_acceleration_m_s2: Positive = Field(0.5, description="acceleration of the hand")
-    base_acceleration_m_s2: Positive = Field(
-        0.5, description="forward acceleration of the base; larger values may tip it"
-    )
-    base_acceleration_rad_s2: Positive = Field(2.0, description="angular acceleration of the base")
-    tolerance_m: Positive = Field(1e-6, description="maximum position error; the target waits if it would be exceeded")
-    commands: list[Velocity] = Field([], description="velocity commands, each held until the next")
+    hand_acceleration_m_s2: Positive = default(0.5, "acceleration of the hand")
+    base_acceleration_m_s2: Positive = default(0.5, "forward acceleration of the base; larger values may tip it")
+    base_acceleration_rad_s2: Positive = default(2.0, "angular acceleration of the base")
+    tolerance_m: Positive = default(1e-6, "maximum position error; the target waits if it would be exceeded")
+    commands: list[Velocity] = default([], "velocity commands, each held until the next")
 
     @model_validator(mode="after")
     def _check(self) -> Self:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator, model_validator
 
-from dynsim.config.base import NonNegative, Positive, StrictConfig
+from dynsim.config.base import NonNegative, Positive, StrictConfig, default
 from dynsim.config.problems import suggest
 from dynsim.snake.description import FIXING, SWITCHING, CommandBlock, Feedback
 
@@ -28,15 +28,13 @@ class SnakeCommand(StrictConfig):
     """Command of an operator; omitted values do not change."""
 
     at_s: NonNegative = Field(description="time of the command")
-    velocity: Coordinates | None = Field(
-        None,
-        description="rates of x, y, z [m/s] and alpha, beta, gamma [rad/s], held until the next command; "
-        "default: unchanged",
+    velocity: Coordinates | None = default(
+        None, "rates of x, y, z [m/s] and alpha, beta, gamma [rad/s], held until the next command; default: unchanged"
     )
-    mode: int | Literal["switching", "fixing"] | None = Field(
-        None, description="number of a mode to fix, or `switching` or `fixing` to enter that state; default: unchanged"
+    mode: int | Literal["switching", "fixing"] | None = default(
+        None, "number of a mode to fix, or `switching` or `fixing` to enter that state; default: unchanged"
     )
-    gripper: Literal["open", "closed"] | None = Field(None, description="gripper command; default: unchanged")
+    gripper: Literal["open", "closed"] | None = default(None, "gripper command; default: unchanged")
 
     @field_validator("mode", mode="before")
     @classmethod
@@ -51,11 +49,9 @@ class SnakeCommand(StrictConfig):
 class TargetMotion(StrictConfig):
     """Motion of the target with a start, a duration and a profile in time."""
 
-    start_s: NonNegative = Field(0.0, description="start time of the motion")
+    start_s: NonNegative = default(0.0, "start time of the motion")
     duration_s: Positive = Field(description="duration of the motion")
-    profile: Profile = Field(
-        "smooth", description="progress in time: `linear`, or `smooth` (minimum jerk, from rest to rest)"
-    )
+    profile: Profile = default("smooth", "progress in time: `linear`, or `smooth` (minimum jerk, from rest to rest)")
 
 
 class Ramp(TargetMotion):
@@ -63,9 +59,7 @@ class Ramp(TargetMotion):
 
     type: Literal["ramp"]
     displacement: Coordinates = Field(description="displacement in x, y, z [m] and alpha, beta, gamma [rad]")
-    profile: Profile = Field(
-        "linear", description="progress in time: `linear`, or `smooth` (minimum jerk, from rest to rest)"
-    )
+    profile: Profile = default("linear", "progress in time: `linear`, or `smooth` (minimum jerk, from rest to rest)")
 
     def offset(self, s: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the displacement at progress s in [0, 1], shape (T, 6)."""
@@ -77,14 +71,12 @@ class Circle(TargetMotion):
 
     type: Literal["circle"]
     radius_m: Positive = Field(description="radius")
-    turns: float = Field(
-        1.0,
-        description="number of turns; plane xy: positive to the left; plane yz: starts at the top, positive first "
-        "to the left",
+    turns: float = default(
+        1.0, "number of turns; plane xy: positive to the left; plane yz: starts at the top, positive first to the left"
     )
-    plane: Literal["xy", "yz"] = Field("xy", description="plane of the circle")
-    backward: bool = Field(False, description="plane xy: move backward from the start point")
-    turn_head: bool = Field(True, description="plane xy: the yaw angle follows the tangent")
+    plane: Literal["xy", "yz"] = default("xy", "plane of the circle")
+    backward: bool = default(False, "plane xy: move backward from the start point")
+    turn_head: bool = default(True, "plane xy: the yaw angle follows the tangent")
 
     def offset(self, s: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the displacement at progress s in [0, 1], shape (T, 6)."""
@@ -110,9 +102,9 @@ class DoorArc(TargetMotion):
 
     type: Literal["door_arc"]
     radius_m: Positive = Field(description="distance from hinge to knob")
-    angle_deg: Annotated[float, Field(gt=0, le=180)] = Field(60.0, description="opening angle of the door")
-    hinge: Literal["left", "right"] = Field("left", description="side of the hinge")
-    opening: Literal["pull", "push"] = Field("pull", description="direction in which the door opens")
+    angle_deg: Annotated[float, Field(gt=0, le=180)] = default(60.0, "opening angle of the door")
+    hinge: Literal["left", "right"] = default("left", "side of the hinge")
+    opening: Literal["pull", "push"] = default("pull", "direction in which the door opens")
 
     def offset(self, s: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the displacement at progress s in [0, 1], shape (T, 6)."""

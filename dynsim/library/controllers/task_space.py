@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pydantic import Field, StrictInt, field_validator, model_validator
 
 from dynsim.compile.protocols import BuildContext
-from dynsim.config.base import NonNegative, Positive, StrictConfig, error_at
+from dynsim.config.base import NonNegative, Positive, StrictConfig, default, error_at
 from dynsim.errors import ModelError
 from dynsim.jit.kernel import integers, reals
 from dynsim.library.controllers.snake_commands import STATES as MODE_STATES
@@ -48,103 +48,90 @@ TABLE_II: dict[int, list[int]] = {1: [3, 6], 2: [6, 7], 3: [5, 6], 4: [4, 5], 5:
 class Switching(StrictConfig):
     """Switching state ([T] IV.C.5), entered by a command with `mode: switching`."""
 
-    policy: Policy = Field(
+    policy: Policy = default(
         "cyclic",
-        description="choice of the next mode; `fixed`: never switch, `cyclic`: in the order of [T], `predictive`: "
+        "choice of the next mode; `fixed`: never switch, `cyclic`: in the order of [T], `predictive`: "
         "lowest predicted cost",
     )
-    order: list[StrictInt] = Field(
-        [2, 3, 4, 5, 6],
-        min_length=1,
-        description="mode numbers: the order of `cyclic` and the candidates of `predictive`",
+    order: list[StrictInt] = default(
+        [2, 3, 4, 5, 6], "mode numbers: the order of `cyclic` and the candidates of `predictive`", min_length=1
     )
-    period_s: Positive = Field(1.0, description="switching period Delta T")
-    least_margin_m: float = Field(
-        0.0, description="minimum support margin; a mode with a smaller or equal margin counts as tipping"
+    period_s: Positive = default(1.0, "switching period Delta T")
+    least_margin_m: float = default(
+        0.0, "minimum support margin; a mode with a smaller or equal margin counts as tipping"
     )
-    when_blocked: bool = Field(
-        False, description="enter the switching state automatically when a command cannot be executed; the target waits"
+    when_blocked: bool = default(
+        False, "enter the switching state automatically when a command cannot be executed; the target waits"
     )
-    release_fraction: Annotated[float, Field(gt=0, lt=1)] = Field(
+    release_fraction: Annotated[float, Field(gt=0, lt=1)] = default(
         0.6,
-        description="when_blocked: leave the switching state once every base joint is within this fraction of its "
-        "limit (assumed)",
+        "when_blocked: leave the switching state once every base joint is within this fraction of its limit (assumed)",
     )
-    prediction_step_s: Positive = Field(0.02, description="time step of the prediction (assumed)")
+    prediction_step_s: Positive = default(0.02, "time step of the prediction (assumed)")
 
 
 class Config(Script):
     """Task-space controller of the snake; SI units unless the key has another unit."""
 
     type: Literal["task_space"] = "task_space"
-    period_s: Positive = Field(0.005, description="control period (assumed)")
-    rates_at: Literal["middle", "start"] = Field(
-        "middle", description="instant of the period for which the held rates are computed (assumed)"
+    period_s: Positive = default(0.005, "control period (assumed)")
+    rates_at: Literal["middle", "start"] = default(
+        "middle", "instant of the period for which the held rates are computed (assumed)"
     )
-    plant_substeps: int = Field(1, ge=1, le=100, description="integration steps of the kinematic plant per period")
-    state: Literal["measured", "estimated", "feedforward"] = Field(
+    plant_substeps: int = default(1, "integration steps of the kinematic plant per period", ge=1, le=100)
+    state: Literal["measured", "estimated", "feedforward"] = default(
         "measured",
-        description="state for the control law: `measured` pose, pose `estimated` from measured joint angles, or "
+        "state for the control law: `measured` pose, pose `estimated` from measured joint angles, or "
         "`feedforward` from commanded joint angles",
     )
-    gain: Positive | list[Positive] = Field(
-        2.0, description="gain K [1/s]: one value, or one per controlled variable (six, then the shape points)"
+    gain: Positive | list[Positive] = default(
+        2.0, "gain K [1/s]: one value, or one per controlled variable (six, then the shape points)"
     )
-    null_gain: NonNegative = Field(0.1, description="null-space gain k_eta")
-    null_form: Literal["safe", "paper"] = Field(
-        "safe",
-        description="null-space motion; `paper`: eq 14, `safe`: eq 14 with W^-1 eta, which never increases the cost",
+    null_gain: NonNegative = default(0.1, "null-space gain k_eta")
+    null_form: Literal["safe", "paper"] = default(
+        "safe", "null-space motion; `paper`: eq 14, `safe`: eq 14 with W^-1 eta, which never increases the cost"
     )
-    null_start_s: NonNegative = Field(0.0, description="start time of the null-space motion")
-    weight_joint: Positive | list[Positive] = Field(
-        1.0, description="weight W of the joint rates: one value, or one per joint"
-    )
-    weight_wheel: Positive = Field(
-        0.01, description="weight W of the active wheels; with large values the joint rates chatter"
-    )
-    cost: Literal["eq19", "eq20", "eq20_min"] = Field(
+    null_start_s: NonNegative = default(0.0, "start time of the null-space motion")
+    weight_joint: Positive | list[Positive] = default(1.0, "weight W of the joint rates: one value, or one per joint")
+    weight_wheel: Positive = default(0.01, "weight W of the active wheels; with large values the joint rates chatter")
+    cost: Literal["eq19", "eq20", "eq20_min"] = default(
         "eq19",
-        description="null-space cost; `eq19`: joint angles, `eq20`: adds 1/norm of the signed support distances, as "
+        "null-space cost; `eq19`: joint angles, `eq20`: adds 1/norm of the signed support distances, as "
         "printed, `eq20_min`: adds 1/smallest support distance, smoothed",
     )
-    cost_matrix: list[NonNegative] | None = Field(
-        None, description="diagonal of K_V; default: [T] V.B (head yaw 15, head pitch 0.015, base 9.6, 4.8, 2.4, ...)"
+    cost_matrix: list[NonNegative] | None = default(
+        None, "diagonal of K_V; default: [T] V.B (head yaw 15, head pitch 0.015, base 9.6, 4.8, 2.4, ...)"
     )
-    cost_angle_weight: NonNegative = Field(1.0, description="weight a_1 of the joint angles in eq 20 (assumed)")
-    cost_support_weight_m: NonNegative = Field(
-        1.0, description="weight a_2 of the support distances in eq 20 (assumed)"
-    )
-    limit_policy: Literal["none", "saturate", "allocate"] = Field(
+    cost_angle_weight: NonNegative = default(1.0, "weight a_1 of the joint angles in eq 20 (assumed)")
+    cost_support_weight_m: NonNegative = default(1.0, "weight a_2 of the support distances in eq 20 (assumed)")
+    limit_policy: Literal["none", "saturate", "allocate"] = default(
         "allocate",
-        description="treatment of joint limits; `allocate`: a joint at its limit is excluded from the allocation, and "
+        "treatment of joint limits; `allocate`: a joint at its limit is excluded from the allocation, and "
         "the target waits if no solution is left, `saturate`: joints are clamped, `none`: limits are ignored",
     )
-    rate_limit_rad_s: Positive = Field(
-        4.7, description="maximum joint rate: no-load speed of the MX-106 at 12 V, 45 rpm (data sheet)"
+    rate_limit_rad_s: Positive = default(
+        4.7, "maximum joint rate: no-load speed of the MX-106 at 12 V, 45 rpm (data sheet)"
     )
-    limit_rate_per_s: Positive = Field(
-        20.0, description="maximum joint rate towards a limit, per angle left to the limit [1/s] (assumed)"
+    limit_rate_per_s: Positive = default(
+        20.0, "maximum joint rate towards a limit, per angle left to the limit [1/s] (assumed)"
     )
-    damping_sigma: NonNegative = Field(
+    damping_sigma: NonNegative = default(
         0.2,
-        description="singular value below which the weakest direction is damped, as a fraction of the smallest "
+        "singular value below which the weakest direction is damped, as a fraction of the smallest "
         "singular value of B W^-1/2 in the reference posture (head raised, base straight) (assumed)",
     )
-    damping_factor: NonNegative = Field(
-        0.4, description="damping at the singularity, as a fraction of the same singular value (assumed)"
+    damping_factor: NonNegative = default(
+        0.4, "damping at the singularity, as a fraction of the same singular value (assumed)"
     )
-    shape_points_rad: dict[str, float] | None = Field(
+    shape_points_rad: dict[str, float] | None = default(
         None,
-        description="shape controllable points: target angle [rad] for each named joint; default: 110 deg for the "
-        "last head joint",
+        "shape controllable points: target angle [rad] for each named joint; default: 110 deg for the last head joint",
     )
-    modes: dict[int, list[int]] | None = Field(
-        None, description="lifted wheel pairs for each mode number; default: [T] Table II"
-    )
-    fixing_mode: StrictInt = Field(1, description="mode of the fixing state, also the mode at the start")
-    commands_wait: bool = Field(
+    modes: dict[int, list[int]] | None = default(None, "lifted wheel pairs for each mode number; default: [T] Table II")
+    fixing_mode: StrictInt = default(1, "mode of the fixing state, also the mode at the start")
+    commands_wait: bool = default(
         True,
-        description="commands are delayed while the target waits; false: commands keep their times, and motion that "
+        "commands are delayed while the target waits; false: commands keep their times, and motion that "
         "the target cannot follow is lost, as with a live operator",
     )
     switching: Switching = Field(default_factory=Switching, description="switching state")

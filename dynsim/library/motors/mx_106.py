@@ -10,10 +10,8 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import Field
-
 from dynsim.compile.protocols import BuildContext
-from dynsim.config.base import NonNegative, Positive
+from dynsim.config.base import NonNegative, Positive, default
 from dynsim.model.drives import Servo, ServoParameters
 
 
@@ -21,17 +19,15 @@ class Config(ServoParameters):
     """Servo with 8.4 N m and 45 rpm; gain, gear friction and rotor inertia are not from the data sheet."""
 
     type: Literal["mx_106"]
-    voltage_V: Positive = Field(12.0, description="supply voltage of the data sheet; also limits the voltage")
-    stall_torque_N_m: Positive = Field(8.4, description="stall torque (data sheet)")
-    no_load_speed_rad_per_s: Positive = Field(4.71, description="no-load speed, 45 rpm (data sheet)")
-    nominal_torque_N_m: Positive | None = Field(1.68, description="continuous torque: a fifth of the stall torque")
-    k_p_V_per_rad: NonNegative = Field(
-        58.6, description="gain in position mode: 41 N m/rad, fitted to the measured sag of T2 Snake-3"
+    voltage_V: Positive = default(12.0, "supply voltage of the data sheet; also limits the voltage")
+    stall_torque_N_m: Positive = default(8.4, "stall torque (data sheet)")
+    no_load_speed_rad_per_s: Positive = default(4.71, "no-load speed, 45 rpm (data sheet)")
+    nominal_torque_N_m: Positive | None = default(1.68, "continuous torque: a fifth of the stall torque")
+    k_p_V_per_rad: NonNegative = default(
+        58.6, "gain in position mode: 41 N m/rad, fitted to the measured sag of T2 Snake-3"
     )
-    coulomb_friction_N_m: NonNegative = Field(
-        0.8, description="gear friction, fitted to the measured sag of T2 Snake-3"
-    )
-    rotor_inertia_kg_m2: NonNegative = Field(0.01, description="rotor inertia at the output shaft (assumed)")
+    coulomb_friction_N_m: NonNegative = default(0.8, "gear friction, fitted to the measured sag of T2 Snake-3")
+    rotor_inertia_kg_m2: NonNegative = default(0.01, "rotor inertia at the output shaft (assumed)")
 
 
 def build(config: Config, context: BuildContext) -> Servo:

@@ -9,10 +9,8 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import Field
-
 from dynsim.compile.protocols import BuildContext
-from dynsim.config.base import NonNegative, Positive
+from dynsim.config.base import NonNegative, Positive, default
 from dynsim.model.drives import Servo, ServoParameters
 
 
@@ -20,13 +18,13 @@ class Config(ServoParameters):
     """Servo with 2.5 N m and 55 rpm; gain and rotor inertia are not from the data sheet."""
 
     type: Literal["mx_28"]
-    voltage_V: Positive = Field(12.0, description="supply voltage of the data sheet; also limits the voltage")
-    stall_torque_N_m: Positive = Field(2.5, description="stall torque (data sheet)")
-    no_load_speed_rad_per_s: Positive = Field(5.76, description="no-load speed, 55 rpm (data sheet)")
-    nominal_torque_N_m: Positive | None = Field(0.5, description="continuous torque: a fifth of the stall torque")
-    mode: Literal["position", "velocity"] = Field("velocity", description="quantity that the servo controls")
-    k_v_V_s_per_rad: NonNegative = Field(20.0, description="gain in velocity mode (assumed)")
-    rotor_inertia_kg_m2: NonNegative = Field(2e-4, description="rotor inertia at the output shaft (assumed)")
+    voltage_V: Positive = default(12.0, "supply voltage of the data sheet; also limits the voltage")
+    stall_torque_N_m: Positive = default(2.5, "stall torque (data sheet)")
+    no_load_speed_rad_per_s: Positive = default(5.76, "no-load speed, 55 rpm (data sheet)")
+    nominal_torque_N_m: Positive | None = default(0.5, "continuous torque: a fifth of the stall torque")
+    mode: Literal["position", "velocity"] = default("velocity", "quantity that the servo controls")
+    k_v_V_s_per_rad: NonNegative = default(20.0, "gain in velocity mode (assumed)")
+    rotor_inertia_kg_m2: NonNegative = default(2e-4, "rotor inertia at the output shaft (assumed)")
 
 
 def build(config: Config, context: BuildContext) -> Servo:

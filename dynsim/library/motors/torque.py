@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import Field
-
 from dynsim.compile.protocols import BuildContext
-from dynsim.config.base import Positive
+from dynsim.config.base import Positive, default
 from dynsim.model.drives import DriveParameters, TorqueSource, limit
 
 
@@ -15,7 +13,7 @@ class Config(DriveParameters):
     """Torque source that follows `controller.torques` within its limit."""
 
     type: Literal["torque"]
-    limit_N_m: Positive | None = Field(None, description="torque limit; N at a prismatic joint; default: no limit")
+    limit_N_m: Positive | None = default(None, "torque limit; N at a prismatic joint; default: no limit")
 
 
 def build(config: Config, context: BuildContext) -> TorqueSource:

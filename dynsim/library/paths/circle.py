@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 
 from dynsim.compile.control import HandPath
 from dynsim.compile.protocols import BuildContext
-from dynsim.config.base import Positive, StrictConfig, Vector3, unit_vector
+from dynsim.config.base import Positive, StrictConfig, Vector3, default, unit_vector
 
 
 class Config(StrictConfig):
@@ -19,12 +19,10 @@ class Config(StrictConfig):
     type: Literal["circle"]
     center_m: Vector3 = Field(description="centre in the world")
     radius_m: Positive = Field(description="radius")
-    normal: Vector3 = Field([0.0, 0.0, 1.0], description="normal of the plane")
-    start: Vector3 = Field(
-        [1.0, 0.0, 0.0], description="direction from the centre to the first point, projected onto the plane"
-    )
-    period_s: Positive = Field(10.0, description="duration of one turn")
-    clockwise: bool = Field(False, description="clockwise about the normal")
+    normal: Vector3 = default([0.0, 0.0, 1.0], "normal of the plane")
+    start: Vector3 = default([1.0, 0.0, 0.0], "direction from the centre to the first point, projected onto the plane")
+    period_s: Positive = default(10.0, "duration of one turn")
+    clockwise: bool = default(False, "clockwise about the normal")
 
     @model_validator(mode="after")
     def _check(self) -> Self:

@@ -11,7 +11,7 @@ from pydantic import Field
 from dynsim.compile.control import HandPath
 from dynsim.compile.protocols import BuildContext
 from dynsim.compile.references.splines import minimum_jerk
-from dynsim.config.base import NonNegative, Positive, StrictConfig, Vector3
+from dynsim.config.base import NonNegative, Positive, StrictConfig, Vector3, default
 
 
 class Config(StrictConfig):
@@ -20,7 +20,7 @@ class Config(StrictConfig):
     type: Literal["line"]
     from_m: Vector3 = Field(description="first point in the world")
     to_m: Vector3 = Field(description="last point in the world")
-    start_s: NonNegative = Field(0.0, description="start time of the motion")
+    start_s: NonNegative = default(0.0, "start time of the motion")
     duration_s: Positive = Field(description="duration of the motion")
 
     def position(self, t: NDArray[np.float64]) -> NDArray[np.float64]:

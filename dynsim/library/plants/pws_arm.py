@@ -14,7 +14,7 @@ from pydantic import Field, field_validator, model_validator
 
 from dynsim.compile.protocols import BuildContext
 from dynsim.compile.scene import BASE_WHEEL_WIDTH
-from dynsim.config.base import NonNegative, Pair, Positive, StrictConfig, Vector3, error_at
+from dynsim.config.base import NonNegative, Pair, Positive, StrictConfig, Vector3, default, error_at
 from dynsim.errors import ModelError
 from dynsim.library import families
 from dynsim.model.description import Array, Frame, Inertia, Link, Robot, vector
@@ -34,16 +34,12 @@ ArmChoice: Any = families.union("plant", only=("serial_arm", "urdf_arm"))
 class WheelConfig(StrictConfig):
     """Both wheels: solid discs with separate motors, at axle height r."""
 
-    mass_kg: NonNegative = Field(0.25, description="mass of each wheel")
-    radius_m: Positive = Field(0.05, description="radius r of each wheel")
-    inertia_axle_kg_m2: NonNegative | None = Field(
-        None, description="moment of inertia about the axle; default: m r²/2"
-    )
-    inertia_across_kg_m2: NonNegative | None = Field(
-        None, description="moment of inertia across the axle; default: m r²/4"
-    )
-    damping_N_m_s_per_rad: NonNegative = Field(0.0, description="viscous damping of each wheel")
-    motor: MotorChoice | None = Field(None, description="motor of each wheel; default: no motor")
+    mass_kg: NonNegative = default(0.25, "mass of each wheel")
+    radius_m: Positive = default(0.05, "radius r of each wheel")
+    inertia_axle_kg_m2: NonNegative | None = default(None, "moment of inertia about the axle; default: m r²/2")
+    inertia_across_kg_m2: NonNegative | None = default(None, "moment of inertia across the axle; default: m r²/4")
+    damping_N_m_s_per_rad: NonNegative = default(0.0, "viscous damping of each wheel")
+    motor: MotorChoice | None = default(None, "motor of each wheel; default: no motor")
 
     @model_validator(mode="after")
     def _check_moments(self) -> Self:
@@ -66,37 +62,32 @@ class WheelConfig(StrictConfig):
 class Mount(StrictConfig):
     """Mounting pose of the arm in the frame of the base."""
 
-    position_m: Vector3 = Field([0.0, 0.0, 0.1], description="position of the arm's base")
-    yaw_deg: float = Field(0.0, description="rotation about the vertical axis")
+    position_m: Vector3 = default([0.0, 0.0, 0.1], "position of the arm's base")
+    yaw_deg: float = default(0.0, "rotation about the vertical axis")
 
 
 class Base(StrictConfig):
     """Mobile base; its frame is on the floor below the middle of the axle, with x forward and z up."""
 
-    position_m: Pair = Field([0.0, 0.0], description="initial x and y in the world")
-    heading_deg: float = Field(0.0, description="initial heading")
-    mass_kg: NonNegative = Field(4.0, description="mass of the body without wheels")
-    com_m: Vector3 = Field([0.05, 0.0, 0.08], description="centre of mass of the body without wheels")
-    inertia_kg_m2: list[float] = Field(
+    position_m: Pair = default([0.0, 0.0], "initial x and y in the world")
+    heading_deg: float = default(0.0, "initial heading")
+    mass_kg: NonNegative = default(4.0, "mass of the body without wheels")
+    com_m: Vector3 = default([0.05, 0.0, 0.08], "centre of mass of the body without wheels")
+    inertia_kg_m2: list[float] = default(
         [0.03, 0.0, 0.0, 0.05, 0.0, 0.06],
+        "inertia tensor xx, xy, xz, yy, yz, zz of the body without wheels, about its centre of mass",
         min_length=6,
         max_length=6,
-        description="inertia tensor xx, xy, xz, yy, yz, zz of the body without wheels, about its centre of mass",
     )
-    wheel: WheelConfig = Field(WheelConfig(), description="both wheels")
-    track_m: Positive = Field(0.3, description="distance between the wheels")
-    caster_m: Vector3 = Field(
-        [0.15, 0.0, 0.0], description="contact point of the caster with the floor, without friction"
-    )
-    wheel_friction: Positive = Field(
-        0.8, description="coefficient of friction between wheels and floor, for the traction demand"
-    )
-    on_overturn: Literal["warn", "stop"] = Field(
+    wheel: WheelConfig = default(WheelConfig(), "both wheels")
+    track_m: Positive = default(0.3, "distance between the wheels")
+    caster_m: Vector3 = default([0.15, 0.0, 0.0], "contact point of the caster with the floor, without friction")
+    wheel_friction: Positive = default(0.8, "coefficient of friction between wheels and floor, for the traction demand")
+    on_overturn: Literal["warn", "stop"] = default(
         "warn",
-        description="reaction to overturning: `warn` and continue as if the base were held down, or `stop` the run "
-        "(exit code 3)",
+        "reaction to overturning: `warn` and continue as if the base were held down, or `stop` the run (exit code 3)",
     )
-    mount: Mount = Field(Mount(), description="mounting pose of the arm")
+    mount: Mount = default(Mount(), "mounting pose of the arm")
 
     @field_validator("caster_m")
     @classmethod
@@ -114,7 +105,7 @@ class Config(StrictConfig):
     """Mobile base with an arm."""
 
     type: Literal["pws_arm"]
-    base: Base = Field(Base(), description="mobile base")
+    base: Base = default(Base(), "mobile base")
     arm: ArmChoice = Field(description="arm on the base: a `serial_arm` or `urdf_arm`")
 
     @model_validator(mode="after")

@@ -8,7 +8,17 @@ import numpy as np
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from dynsim.compile.protocols import BuildContext
-from dynsim.config.base import BodyPoint, Limits, NonNegative, Positive, StrictConfig, Vector3, error_at, unit_vector
+from dynsim.config.base import (
+    BodyPoint,
+    Limits,
+    NonNegative,
+    Positive,
+    StrictConfig,
+    Vector3,
+    default,
+    error_at,
+    unit_vector,
+)
 from dynsim.library import families
 from dynsim.model.description import Inertia, Link, Robot, vector
 from dynsim.model.drives import Drive
@@ -25,34 +35,32 @@ LINKS_MAX = 100_000
 class LinkKeys(StrictConfig):
     """Keys of a joint and its link. The link extends from the joint along its +z axis."""
 
-    count: int = Field(1, ge=1, le=LINKS_MAX, description="number of equal links")
-    kind: Literal["revolute", "prismatic"] = Field("revolute", description="type of the joint")
-    axis: Literal["x", "y", "z"] | Vector3 = Field("y", description="joint axis in the link's frame")
-    length_m: NonNegative = Field(0.3, description="length of the link")
-    radius_m: Positive = Field(
+    count: int = default(1, "number of equal links", ge=1, le=LINKS_MAX)
+    kind: Literal["revolute", "prismatic"] = default("revolute", "type of the joint")
+    axis: Literal["x", "y", "z"] | Vector3 = default("y", "joint axis in the link's frame")
+    length_m: NonNegative = default(0.3, "length of the link")
+    radius_m: Positive = default(
         0.01,
-        description="radius of the solid cylinder that defines the inertia, and depth below a surface beyond which a "
+        "radius of the solid cylinder that defines the inertia, and depth below a surface beyond which a "
         "warning reports the link",
     )
-    mass_kg: NonNegative = Field(0.1, description="mass of the link")
-    com_m: Vector3 | None = Field(
-        None, description="centre of mass in the link's frame; default: the middle of the link"
-    )
-    inertia_kg_m2: list[float] | None = Field(
+    mass_kg: NonNegative = default(0.1, "mass of the link")
+    com_m: Vector3 | None = default(None, "centre of mass in the link's frame; default: the middle of the link")
+    inertia_kg_m2: list[float] | None = default(
         None,
+        "inertia tensor xx, xy, xz, yy, yz, zz about the centre of mass; default: solid cylinder",
         min_length=6,
         max_length=6,
-        description="inertia tensor xx, xy, xz, yy, yz, zz about the centre of mass; default: solid cylinder",
     )
-    damping_N_m_s_per_rad: NonNegative = Field(0.0, description="viscous damping of a revolute joint")
-    damping_N_s_per_m: NonNegative = Field(0.0, description="viscous damping of a prismatic joint")
-    friction_N_m: NonNegative = Field(0.0, description="dry friction of a revolute joint; unilateral law")
-    friction_N: NonNegative = Field(0.0, description="dry friction of a prismatic joint; unilateral law")
-    motor: MotorChoice | None = Field(None, description="motor of the joint; default: no motor")
-    limit_deg: Limits | None = Field(None, description="lower and upper stop of a revolute joint; default: no stops")
-    limit_m: Limits | None = Field(None, description="lower and upper stop of a prismatic joint; default: no stops")
-    initial_deg: float = Field(0.0, description="initial angle of a revolute joint")
-    initial_m: float = Field(0.0, description="initial position of a prismatic joint")
+    damping_N_m_s_per_rad: NonNegative = default(0.0, "viscous damping of a revolute joint")
+    damping_N_s_per_m: NonNegative = default(0.0, "viscous damping of a prismatic joint")
+    friction_N_m: NonNegative = default(0.0, "dry friction of a revolute joint; unilateral law")
+    friction_N: NonNegative = default(0.0, "dry friction of a prismatic joint; unilateral law")
+    motor: MotorChoice | None = default(None, "motor of the joint; default: no motor")
+    limit_deg: Limits | None = default(None, "lower and upper stop of a revolute joint; default: no stops")
+    limit_m: Limits | None = default(None, "lower and upper stop of a prismatic joint; default: no stops")
+    initial_deg: float = default(0.0, "initial angle of a revolute joint")
+    initial_m: float = default(0.0, "initial position of a prismatic joint")
 
     @field_validator("axis")
     @classmethod
@@ -128,23 +136,23 @@ class LinkConfig(LinkKeys):
 class BaseConfig(StrictConfig):
     """Pose of the base of a serial chain."""
 
-    position_m: Vector3 = Field([0.0, 0.0, 0.0], description="position of the first joint in the world")
-    yaw_deg: float = Field(0.0, description="rotation about the vertical axis")
+    position_m: Vector3 = default([0.0, 0.0, 0.0], "position of the first joint in the world")
+    yaw_deg: float = default(0.0, "rotation about the vertical axis")
 
 
 class Config(StrictConfig):
     """Serial chain: `chain` lists the links from the base to the hand, `link` sets defaults for all of them."""
 
     type: Literal["serial_arm"]
-    base: BaseConfig = Field(BaseConfig(), description="pose of the base")
-    gravity_m_s2: Vector3 = Field([0.0, 0.0, -9.81], description="gravitational acceleration")
+    base: BaseConfig = default(BaseConfig(), "pose of the base")
+    gravity_m_s2: Vector3 = default([0.0, 0.0, -9.81], "gravitational acceleration")
     # Omitted from resolved scenarios, where every entry of the chain is complete.
-    link: LinkKeys | None = Field(None, exclude=True, description="defaults for all entries of `chain`; default: none")
+    link: LinkKeys | None = default(None, "defaults for all entries of `chain`; default: none", exclude=True)
     chain: list[LinkConfig] = Field(min_length=1, description="links from the base to the hand")
-    initial_deg: list[float] | None = Field(
-        None, description="initial angles of all joints of a revolute chain; default: `initial_deg` of the links"
+    initial_deg: list[float] | None = default(
+        None, "initial angles of all joints of a revolute chain; default: `initial_deg` of the links"
     )
-    hand: BodyPoint | None = Field(None, description="controlled point; default: the end of the last link")
+    hand: BodyPoint | None = default(None, "controlled point; default: the end of the last link")
 
     @model_validator(mode="before")
     @classmethod

@@ -15,7 +15,7 @@ from pydantic import Field
 
 from dynsim.compile.protocols import BuildContext
 from dynsim.compile.snake_tree import GROUND, SnakeTree, lifting_joints, snake_tree
-from dynsim.config.base import NonNegative, Positive, StrictConfig
+from dynsim.config.base import NonNegative, Positive, StrictConfig, default
 from dynsim.errors import ModelError
 from dynsim.library import families
 from dynsim.model.drives import Drive
@@ -36,67 +36,62 @@ DrivenSide = Literal["left", "right", "none"]
 class JointLimits(StrictConfig):
     """Joint limits, symmetric about zero ([T] Table I)."""
 
-    yaw: Positive = Field(65.0, lt=180, description="limit of yaw joints [deg]")
-    pitch: Positive = Field(113.0, lt=180, description="limit of pitch joints [deg]")
+    yaw: Positive = default(65.0, "limit of yaw joints [deg]", lt=180)
+    pitch: Positive = default(113.0, "limit of pitch joints [deg]", lt=180)
 
 
 class JointStops(StrictConfig):
     """Mechanical stops of the joints, symmetric about zero."""
 
-    yaw: Positive | None = Field(None, lt=180, description="stop of yaw joints [deg]; default: `limits_deg.yaw`")
-    pitch: Positive | None = Field(None, lt=180, description="stop of pitch joints [deg]; default: `limits_deg.pitch`")
+    yaw: Positive | None = default(None, "stop of yaw joints [deg]; default: `limits_deg.yaw`", lt=180)
+    pitch: Positive | None = default(None, "stop of pitch joints [deg]; default: `limits_deg.pitch`", lt=180)
 
 
 class Lifting(StrictConfig):
     """Lifting of wheel pairs."""
 
-    clearance_m: Positive = Field(0.010, description="height of the lower wheel above the ground (assumed)")
-    blend_s: Positive = Field(0.25, description="time to lift or lower a pair (assumed)")
-    sag_compensation: bool = Field(
-        True, description="add the predicted deflection of the servos to the commands of pitch joints"
-    )
+    clearance_m: Positive = default(0.010, "height of the lower wheel above the ground (assumed)")
+    blend_s: Positive = default(0.25, "time to lift or lower a pair (assumed)")
+    sag_compensation: bool = default(True, "add the predicted deflection of the servos to the commands of pitch joints")
 
 
 class Dynamics(StrictConfig):
     """Additional parameters of the plant for `level: dynamic`."""
 
-    joint_servo: MotorChoice = Field({"type": "mx_106"}, description="servo of each joint ([T] IV.A)")
-    wheel_servo: MotorChoice = Field({"type": "mx_28"}, description="servo of each driven wheel ([T] IV.A)")
-    wheel_inertia_kg_m2: Positive = Field(
-        4e-5, description="moment of inertia of each wheel about its axle, without servo (assumed)"
+    joint_servo: MotorChoice = default({"type": "mx_106"}, "servo of each joint ([T] IV.A)")
+    wheel_servo: MotorChoice = default({"type": "mx_28"}, "servo of each driven wheel ([T] IV.A)")
+    wheel_inertia_kg_m2: Positive = default(
+        4e-5, "moment of inertia of each wheel about its axle, without servo (assumed)"
     )
-    bearing_drag_N_m_s_per_rad: NonNegative = Field(1e-4, description="viscous friction of each wheel (assumed)")
-    passive_wheels: Literal["bodies", "massless"] = Field(
-        "bodies",
-        description="model of passive wheels: rotating `bodies`, or `massless` points without rolling friction",
+    bearing_drag_N_m_s_per_rad: NonNegative = default(1e-4, "viscous friction of each wheel (assumed)")
+    passive_wheels: Literal["bodies", "massless"] = default(
+        "bodies", "model of passive wheels: rotating `bodies`, or `massless` points without rolling friction"
     )
     stops_deg: JointStops = Field(
         default_factory=JointStops,
         description="mechanical stops, not narrower than `limits_deg`, which limits the commands",
     )
     lifting: Lifting = Field(default_factory=Lifting, description="lifting of wheel pairs")
-    start: Literal["soft", "released"] = Field(
-        "soft",
-        description="initial state: `soft`, with the head raised from below and settled, or `released`, dropped at "
-        "t = 0",
+    start: Literal["soft", "released"] = default(
+        "soft", "initial state: `soft`, with the head raised from below and settled, or `released`, dropped at t = 0"
     )
 
 
 class GripperConfig(StrictConfig):
     """Soft gripper that hardens around an object; all values are assumed, see docs/snake.md."""
 
-    capture_m: Positive = Field(0.015, description="maximum distance from an object's grasp frame to capture it")
-    capture_deg: Positive = Field(23.0, lt=180, description="maximum angle to an object's grasp axis to capture it")
-    hardening_s: Positive = Field(1.0, description="time to harden")
-    softening_s: Positive = Field(0.5, description="time to soften")
-    stiffness_N_per_m: Positive = Field(5e3, description="stiffness along each axis when hardened")
-    damping_N_s_per_m: Positive = Field(20.0, description="damping along each axis when hardened")
-    bound_N: Positive = Field(20.0, description="force along an axis beyond which the object slips")
-    turning_stiffness_N_m_per_rad: Positive = Field(5.0, description="stiffness about each axis when hardened")
-    turning_damping_N_m_s_per_rad: Positive = Field(0.05, description="damping about each axis when hardened")
-    turning_bound_N_m: Positive = Field(0.8, description="torque about an axis beyond which the object slips")
-    lost_m: Positive = Field(0.015, description="slip beyond which the object is lost")
-    lost_deg: Positive = Field(29.0, lt=180, description="rotation beyond which the object is lost")
+    capture_m: Positive = default(0.015, "maximum distance from an object's grasp frame to capture it")
+    capture_deg: Positive = default(23.0, "maximum angle to an object's grasp axis to capture it", lt=180)
+    hardening_s: Positive = default(1.0, "time to harden")
+    softening_s: Positive = default(0.5, "time to soften")
+    stiffness_N_per_m: Positive = default(5e3, "stiffness along each axis when hardened")
+    damping_N_s_per_m: Positive = default(20.0, "damping along each axis when hardened")
+    bound_N: Positive = default(20.0, "force along an axis beyond which the object slips")
+    turning_stiffness_N_m_per_rad: Positive = default(5.0, "stiffness about each axis when hardened")
+    turning_damping_N_m_s_per_rad: Positive = default(0.05, "damping about each axis when hardened")
+    turning_bound_N_m: Positive = default(0.8, "torque about an axis beyond which the object slips")
+    lost_m: Positive = default(0.015, "slip beyond which the object is lost")
+    lost_deg: Positive = default(29.0, "rotation beyond which the object is lost", lt=180)
 
     def gripper(self, length: float) -> Gripper:
         """Return the gripper with its tip at ``length`` ahead of the head point [m]."""
@@ -119,44 +114,38 @@ class Config(StrictConfig):
     """Snake robot; SI units unless the key has another unit."""
 
     type: Literal["snake"] = "snake"
-    level: Literal["kinematic", "dynamic"] = Field(
-        "kinematic",
-        description="model; `kinematic`: no wheel slip and exact joints, `dynamic`: a tree of bodies with forces",
+    level: Literal["kinematic", "dynamic"] = default(
+        "kinematic", "model; `kinematic`: no wheel slip and exact joints, `dynamic`: a tree of bodies with forces"
     )
     dynamics: Dynamics = Field(default_factory=Dynamics, description="parameters of `level: dynamic`")
-    yaw_joints: int = Field(9, ge=2, le=200, description="number n of yaw joints of the whole robot")
-    head_joints: int = Field(
-        6, ge=0, description="number n_h of joints of the raised head part (yaw, pitch, yaw, ...), even"
-    )
-    link_length_m: Positive = Field(0.0905, description="distance l between neighbouring joint axes")
-    wheel_radius_m: Positive = Field(0.05, description="wheel radius r")
-    wheel_gap_m: Positive | list[Positive] | None = Field(
+    yaw_joints: int = default(9, "number n of yaw joints of the whole robot", ge=2, le=200)
+    head_joints: int = default(6, "number n_h of joints of the raised head part (yaw, pitch, yaw, ...), even", ge=0)
+    link_length_m: Positive = default(0.0905, "distance l between neighbouring joint axes")
+    wheel_radius_m: Positive = default(0.05, "wheel radius r")
+    wheel_gap_m: Positive | list[Positive] | None = default(
         None,
-        description="distance between the wheels of a pair: one value, or one per pair of the base part; "
+        "distance between the wheels of a pair: one value, or one per pair of the base part; "
         "default (assumed): 0.15 m for pairs 1, 3, 5, which carry batteries, and 0.12 m for the other pairs",
     )
-    driven_side: DrivenSide | list[DrivenSide] | None = Field(
-        None,
-        description="side of the active wheel: one value, or one per pair; default (assumed): left, right, left, ...",
+    driven_side: DrivenSide | list[DrivenSide] | None = default(
+        None, "side of the active wheel: one value, or one per pair; default (assumed): left, right, left, ..."
     )
     limits_deg: JointLimits = Field(
         default_factory=JointLimits, description="limits of the commanded joint angles; see `dynamics.stops_deg`"
     )
-    gripper_length_m: NonNegative = Field(
-        0.09, description="distance of the gripper tip ahead of the head point ([T] IV.B)"
-    )
+    gripper_length_m: NonNegative = default(0.09, "distance of the gripper tip ahead of the head point ([T] IV.B)")
     gripper: GripperConfig = Field(default_factory=GripperConfig, description="parameters of the gripper")
-    mass_kg: Positive = Field(10.0, description="mass of the whole robot, distributed evenly over its links (assumed)")
-    controlled_point: Literal["head", "gripper"] = Field(
-        "head", description="controlled point: head point ([T] V.A) or gripper tip ([T] V.D)"
+    mass_kg: Positive = default(10.0, "mass of the whole robot, distributed evenly over its links (assumed)")
+    controlled_point: Literal["head", "gripper"] = default(
+        "head", "controlled point: head point ([T] V.A) or gripper tip ([T] V.D)"
     )
-    initial_joints_rad: list[float] | None = Field(
+    initial_joints_rad: list[float] | None = default(
         None,
-        description="initial joint angles theta_1, psi_1, ...; zero yaw angles of the base part may be omitted; "
+        "initial joint angles theta_1, psi_1, ...; zero yaw angles of the base part may be omitted; "
         "default: [T] V.A, or a similar posture for other head parts",
     )
-    initial_base_pose: tuple[float, float, float] = Field(
-        (0.0, 0.0, 0.0), description="initial x [m] and y [m] of wheel pair 1, and yaw [rad] of the base part"
+    initial_base_pose: tuple[float, float, float] = default(
+        (0.0, 0.0, 0.0), "initial x [m] and y [m] of wheel pair 1, and yaw [rad] of the base part"
     )
 
 

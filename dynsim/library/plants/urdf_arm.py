@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from dynsim.compile.protocols import BuildContext
-from dynsim.config.base import BodyPoint, NonNegative, StrictConfig, Vector3, error_at
+from dynsim.config.base import BodyPoint, NonNegative, StrictConfig, Vector3, default, error_at
 from dynsim.config.problems import errors_at, suggest
 from dynsim.errors import ModelError
 from dynsim.library import families
@@ -26,8 +26,8 @@ MotorChoice: Any = families.union("motor")
 class PoseConfig(StrictConfig):
     """Pose of a body in the frame of its joint, R = Rz(yaw) Ry(pitch) Rx(roll)."""
 
-    position_m: Vector3 = Field([0.0, 0.0, 0.0], description="position of the body")
-    rpy_deg: Vector3 = Field([0.0, 0.0, 0.0], description="attitude of the body: roll, pitch, yaw")
+    position_m: Vector3 = default([0.0, 0.0, 0.0], "position of the body")
+    rpy_deg: Vector3 = default([0.0, 0.0, 0.0], "attitude of the body: roll, pitch, yaw")
 
 
 class Config(StrictConfig):
@@ -35,36 +35,32 @@ class Config(StrictConfig):
 
     type: Literal["urdf_arm"]
     file: str = Field(description="path of a URDF file, relative to the scenario file")
-    gravity_m_s2: Vector3 = Field([0.0, 0.0, -9.81], description="gravitational acceleration")
-    motor: MotorChoice | None = Field(
-        None, description="motor of all joints that are not in `motors` and not coupled to a leader; default: no motor"
+    gravity_m_s2: Vector3 = default([0.0, 0.0, -9.81], "gravitational acceleration")
+    motor: MotorChoice | None = default(
+        None, "motor of all joints that are not in `motors` and not coupled to a leader; default: no motor"
     )
-    motors: dict[str, MotorChoice] = Field({}, description="motors of the named joints")
-    damping_N_m_s_per_rad: NonNegative | None = Field(
-        None, description="viscous damping of all revolute joints; default: from the URDF"
+    motors: dict[str, MotorChoice] = default({}, "motors of the named joints")
+    damping_N_m_s_per_rad: NonNegative | None = default(
+        None, "viscous damping of all revolute joints; default: from the URDF"
     )
-    damping_N_s_per_m: NonNegative | None = Field(
-        None, description="viscous damping of all prismatic joints; default: from the URDF"
+    damping_N_s_per_m: NonNegative | None = default(
+        None, "viscous damping of all prismatic joints; default: from the URDF"
     )
-    friction_N_m: NonNegative | None = Field(
-        None, description="dry friction of all revolute joints; default: from the URDF"
+    friction_N_m: NonNegative | None = default(None, "dry friction of all revolute joints; default: from the URDF")
+    friction_N: NonNegative | None = default(None, "dry friction of all prismatic joints; default: from the URDF")
+    initial_deg: dict[str, float] = default(
+        {}, "initial angles of the named revolute joints; default: 0, or the value of the coupling"
     )
-    friction_N: NonNegative | None = Field(
-        None, description="dry friction of all prismatic joints; default: from the URDF"
+    initial_m: dict[str, float] = default(
+        {}, "initial positions of the named prismatic joints; default: 0, or the value of the coupling"
     )
-    initial_deg: dict[str, float] = Field(
-        {}, description="initial angles of the named revolute joints; default: 0, or the value of the coupling"
+    initial_pose: dict[str, PoseConfig] = default(
+        {}, "initial poses of the bodies of the named floating and planar joints"
     )
-    initial_m: dict[str, float] = Field(
-        {}, description="initial positions of the named prismatic joints; default: 0, or the value of the coupling"
-    )
-    initial_pose: dict[str, PoseConfig] = Field(
-        {}, description="initial poses of the bodies of the named floating and planar joints"
-    )
-    lock_deg: dict[str, float] = Field({}, description="angles of the named revolute joints that are locked")
-    lock_m: dict[str, float] = Field({}, description="positions of the named prismatic joints that are locked")
-    hand: BodyPoint | None = Field(
-        None, description="controlled point on a body or in a frame; default: the tip of the longest chain"
+    lock_deg: dict[str, float] = default({}, "angles of the named revolute joints that are locked")
+    lock_m: dict[str, float] = default({}, "positions of the named prismatic joints that are locked")
+    hand: BodyPoint | None = default(
+        None, "controlled point on a body or in a frame; default: the tip of the longest chain"
     )
 
     @model_validator(mode="after")

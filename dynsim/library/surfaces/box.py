@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from dynsim.compile.protocols import BuildContext
-from dynsim.config.base import Lengths, Positive, StrictConfig, Vector3, error_at
+from dynsim.config.base import Lengths, Positive, StrictConfig, Vector3, default, error_at
 from dynsim.model.surfaces import Box
 from dynsim.model.urdf.reader import rotation
 
@@ -19,8 +19,8 @@ class Config(StrictConfig):
     type: Literal["box"]
     center_m: Vector3 = Field(description="centre in the world")
     edges_m: Lengths = Field(description="edge lengths along x, y, z of the box")
-    rpy_deg: Vector3 = Field([0.0, 0.0, 0.0], description="rotation about x, y, z of the world, in this order")
-    edge_radius_m: Positive = Field(0.005, description="radius of the rounded edges, within the box")
+    rpy_deg: Vector3 = default([0.0, 0.0, 0.0], "rotation about x, y, z of the world, in this order")
+    edge_radius_m: Positive = default(0.005, "radius of the rounded edges, within the box")
 
     @model_validator(mode="after")
     def _check(self) -> Self:

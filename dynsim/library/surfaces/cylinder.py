@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field
 
 from dynsim.compile.protocols import BuildContext
-from dynsim.config.base import Direction, Positive, StrictConfig, Vector3, unit_vector
+from dynsim.config.base import Direction, Positive, StrictConfig, Vector3, default, unit_vector
 from dynsim.model.description import Quadric
 
 
@@ -19,7 +19,7 @@ class Config(StrictConfig):
     point_m: Vector3 = Field(description="point on the axis, in the world")
     axis: Direction = Field(description="direction of the axis")
     radius_m: Positive = Field(description="radius")
-    inside: bool = Field(False, description="whether the robot is inside")
+    inside: bool = default(False, "whether the robot is inside")
 
 
 def build(config: Config, context: BuildContext) -> Quadric:

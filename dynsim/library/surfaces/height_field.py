@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field, PrivateAttr, model_validator
 
 from dynsim.compile.protocols import BuildContext
-from dynsim.config.base import Positive, StrictConfig, Vector3, error_at
+from dynsim.config.base import Positive, StrictConfig, Vector3, default, error_at
 from dynsim.errors import DynsimError
 from dynsim.model.surfaces import HeightField
 from dynsim.record.csv_rows import SIZE_LIMIT, read_grid
@@ -33,8 +33,8 @@ class Config(StrictConfig):
     spacing_m: Annotated[list[Positive], Field(min_length=2, max_length=2)] = Field(
         description="grid spacing along x and y"
     )
-    origin_m: Vector3 = Field(
-        [0.0, 0.0, 0.0], description="position of the first height of the first row; z is added to all heights"
+    origin_m: Vector3 = default(
+        [0.0, 0.0, 0.0], "position of the first height of the first row; z is added to all heights"
     )
     # Read once: an edit of the file does not change a loaded scenario.
     _heights: list[list[float]] = PrivateAttr()

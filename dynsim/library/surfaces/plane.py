@@ -5,10 +5,9 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from pydantic import Field
 
 from dynsim.compile.protocols import BuildContext
-from dynsim.config.base import Direction, StrictConfig, Vector3, unit_vector
+from dynsim.config.base import Direction, StrictConfig, Vector3, default, unit_vector
 from dynsim.model.description import Quadric
 
 
@@ -16,8 +15,8 @@ class Config(StrictConfig):
     """Plane through `point_m`; the robot is on the side of `normal`."""
 
     type: Literal["plane"]
-    point_m: Vector3 = Field([0.0, 0.0, 0.0], description="point on the plane, in the world")
-    normal: Direction = Field([0.0, 0.0, 1.0], description="normal towards the robot")
+    point_m: Vector3 = default([0.0, 0.0, 0.0], "point on the plane, in the world")
+    normal: Direction = default([0.0, 0.0, 1.0], "normal towards the robot")
 
 
 def build(config: Config, context: BuildContext) -> Quadric:

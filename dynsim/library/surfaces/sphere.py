@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field
 
 from dynsim.compile.protocols import BuildContext
-from dynsim.config.base import Positive, StrictConfig, Vector3
+from dynsim.config.base import Positive, StrictConfig, Vector3, default
 from dynsim.model.description import Quadric
 
 
@@ -18,7 +18,7 @@ class Config(StrictConfig):
     type: Literal["sphere"]
     center_m: Vector3 = Field(description="centre in the world")
     radius_m: Positive = Field(description="radius")
-    inside: bool = Field(False, description="whether the robot is inside")
+    inside: bool = default(False, "whether the robot is inside")
 
 
 def build(config: Config, context: BuildContext) -> Quadric:
