@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.errors import RecordError
+from dynsim.record.quaternion import Array
 from dynsim.record.scene import Scene
 
 FORMAT = "dynsim-record-2"
@@ -72,12 +73,12 @@ class Event:
 class Content:
     """Complete content of a record file."""
 
-    time: NDArray[np.float64]
+    time: Array
     signals: Mapping[str, Signal] = field(default_factory=dict)
     summary: Mapping[str, Any] = field(default_factory=dict)
     provenance: Mapping[str, Any] = field(default_factory=dict)
     complete: bool = True
-    axes: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+    axes: Mapping[str, Array] = field(default_factory=dict)
     events: Sequence[Event] = ()
     scene: Scene | None = None
 

@@ -12,13 +12,12 @@ from pathlib import Path
 from typing import Literal, TextIO
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dynsim.errors import RecordError
+from dynsim.record.quaternion import Array
 from dynsim.record.record import Record
 from dynsim.system.files import replacing
 
-Array = NDArray[np.float64]
 Format = Literal["csv", "joint-trajectory", "urdf-log"]
 SUFFIX: dict[str, str] = {"csv": ".csv", "joint-trajectory": ".trajectory.yaml", "urdf-log": ".jsonl"}
 RATES = {"q": "v", "phi": "phi_dot", "rho": "rho_dot"}
@@ -84,9 +83,7 @@ def export_record(record: Record, path: Path, format_: Format, *, rate: float | 
     return path
 
 
-def joint_motion(
-    record: Record,
-) -> tuple[list[str], Array, Array, Array]:
+def joint_motion(record: Record) -> tuple[list[str], Array, Array, Array]:
     """Return joint names, time from 0 [s], positions and rates [rad, rad/s; m, m/s] of a record.
 
     Raises
@@ -129,14 +126,7 @@ def _in_both(record: Record, name: str, rate: str) -> list[str]:
     return [label for label in record.labels[name] if label in record.labels[rate]]
 
 
-def _write_csv(
-    record: Record,
-    file: TextIO,
-    joints: list[str],
-    time: Array,
-    q: Array,
-    v: Array,
-) -> None:
+def _write_csv(record: Record, file: TextIO, joints: list[str], time: Array, q: Array, v: Array) -> None:
     pairs = [(name, rate) for name, rate in RATES.items() if name in record and rate in record]
     units = [[record.units[pair[k]] for pair in pairs for _ in _in_both(record, *pair)] for k in (0, 1)]
     headings = [f"{joint} [{unit}]" for column in units for joint, unit in zip(joints, column, strict=True)]

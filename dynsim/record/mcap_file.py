@@ -14,18 +14,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dynsim._version import __version__
 from dynsim.errors import RecordError
 from dynsim.record.joint_motion import joint_motion
 from dynsim.record.poses import contact_positions, relative_pose
+from dynsim.record.quaternion import Array
 from dynsim.record.record import Record
 from dynsim.record.scene import WORLD
 from dynsim.record.urdf_text import WORLD_LINK, scene_urdf
 from dynsim.system.files import replacing
 
-Array = NDArray[np.float64]
 # Late subscribers receive the last message too, as is usual in ROS 2 for descriptions and static frames.
 _LATCHED = (
     "- history: 1\n  depth: 1\n  reliability: 1\n  durability: 1\n  deadline: {sec: 2147483647, nsec: 4294967295}\n"

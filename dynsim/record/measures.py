@@ -6,9 +6,9 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dynsim.record import Record
+from dynsim.record.quaternion import Array
 
 # Sinks of the electrical energy, in the order in which they are drawn and printed.
 SINKS = ("heat_joule", "loss_gear", "loss_joint", "heat_friction")
@@ -53,7 +53,7 @@ def energy_turnover(record: Record) -> float:
     return float(0.5 * total.max(initial=0.0))
 
 
-def hand_target(record: Record) -> NDArray[np.float64] | None:
+def hand_target(record: Record) -> Array | None:
     """Return the target of the hand, (T, 3) [m], or None: on the path or, for a measured run, at the joint goals."""
     return next((record[name] for name in ("target_position", "hand_position_goal") if name in record), None)
 
@@ -90,7 +90,7 @@ def hand_turn_error(record: Record, settle: float) -> dict[str, float | None]:
     return dict(zip(names, (_mean(angle**2, time) ** 0.5, float(angle.max())), strict=True))
 
 
-def least_loads(record: Record, steps: NDArray[np.float64]) -> NDArray[np.float64]:
+def least_loads(record: Record, steps: Array) -> Array:
     """Return the minimum loads of wheels and caster, (3,) [N], over all samples and over all steps.
 
     ``steps`` is the array of :func:`base_summary`; if it is empty, only the samples count.
@@ -99,9 +99,7 @@ def least_loads(record: Record, steps: NDArray[np.float64]) -> NDArray[np.float6
     return np.minimum(loads, steps[:3]) if len(steps) else loads
 
 
-def base_summary(
-    record: Record, settle: float, steps: NDArray[np.float64], travel: NDArray[np.float64]
-) -> dict[str, Any]:
+def base_summary(record: Record, settle: float, steps: Array, travel: Array) -> dict[str, Any]:
     """Summarise motion and stability of a mobile base; a value that is not defined is None.
 
     Parameters
@@ -120,13 +118,13 @@ def base_summary(
     tips = [event.time for event in record.events if event.kind == TIP_OVER]
     traction, labels = record["traction_demand"], record.labels["wheel_load"]
 
-    def least(values: NDArray[np.float64], since: float) -> float | None:
+    def least(values: Array, since: float) -> float | None:
         margins = [*values[record.time >= since].tolist(), *(0.0 for time in tips if time >= since)]
         if np.isfinite(steps).all() and len(steps) and since == -np.inf:
             margins.append(float(steps[-1]))
         return min(margins, default=None)
 
-    def named(loads: NDArray[np.float64] | None) -> dict[str, float] | None:
+    def named(loads: Array | None) -> dict[str, float] | None:
         return None if loads is None else dict(zip(labels, loads.tolist(), strict=True))
 
     return {
@@ -150,6 +148,6 @@ def overturns_settled(record: Record, settle: float) -> float | None:
     return min(late, default=None)
 
 
-def _mean(values: NDArray[np.float64], time: NDArray[np.float64]) -> float:
+def _mean(values: Array, time: Array) -> float:
     """Return the mean over time (trapezoidal rule)."""
     return float(np.trapezoid(values, time) / (time[-1] - time[0]))

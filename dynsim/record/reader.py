@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from dynsim.errors import RecordError, brief
 from dynsim.record.content import FORMAT, TIME, Content, Event, Signal, check_name, check_signal, check_time, is_numeric
+from dynsim.record.quaternion import Array
 from dynsim.record.scene import Scene
 from dynsim.system.files import check_complete
 from dynsim.system.inputs import is_file
@@ -250,7 +251,7 @@ class _Reader:
             scene=Scene.from_json(scene) if scene else None,
         )
 
-    def _times(self, path: str) -> NDArray[np.float64]:
+    def _times(self, path: str) -> Array:
         times = self._numbers(path)
         check_time(times, _describe(path))
         return times.astype(np.float64, copy=False)

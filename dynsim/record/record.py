@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from dynsim.errors import MissingEntry, RecordError, brief
 from dynsim.record import export, reader
 from dynsim.record.content import TIME, Content, Event, Signal, check_name, check_signal, check_time
+from dynsim.record.quaternion import Array
 from dynsim.record.scene import Scene
 from dynsim.system.files import replacing
 
@@ -109,12 +110,12 @@ class Record(Content):
     """
 
     def __init__(self, time: ArrayLike, *, provenance: Mapping[str, Any] | None = None) -> None:
-        self.time: NDArray[np.float64] = np.asarray(time, dtype=np.float64)
+        self.time: Array = np.asarray(time, dtype=np.float64)
         self.signals: dict[str, Signal] = {}
         self.summary = {}
         self.provenance = provenance or {}
         self.complete = True
-        self.axes: dict[str, NDArray[np.float64]] = {}
+        self.axes: dict[str, Array] = {}
         self.events: list[Event] = []
         self.scene: Scene | None = None
 
@@ -195,7 +196,7 @@ class Record(Content):
         check_time(axis, f"time axis {name!r}")
         self.axes[name] = axis
 
-    def times(self, name: str) -> NDArray[np.float64]:
+    def times(self, name: str) -> Array:
         """Return the sample times of a signal.
 
         Parameters

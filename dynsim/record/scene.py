@@ -12,10 +12,10 @@ from functools import cache
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from dynsim.errors import RecordError
-from dynsim.record.quaternion import of_matrix, product, rotated
+from dynsim.record.quaternion import Array, of_matrix, product, rotated
 
 if TYPE_CHECKING:
     from pydantic import TypeAdapter
@@ -199,7 +199,7 @@ class SceneSurface(_Finite):
             kind, parameters = "quadric", {}
         return cls(name, (vector3(Q[0]), vector3(Q[1]), vector3(Q[2])), vector3(b), float(c), kind, **parameters)
 
-    def value(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def value(self, points: Array) -> Array:
         """Return C at points, (…, 3) → (…)."""
         if self.kind == "box":
             core = 0.5 * np.array(self.edges) - (self.radius or 0.0)
@@ -211,7 +211,7 @@ class SceneSurface(_Finite):
         bent = np.einsum("...i,ij,...j", points, np.array(self.Q), points)
         return np.asarray(0.5 * bent + points @ np.array(self.b) + self.c)
 
-    def gradient(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def gradient(self, points: Array) -> Array:
         """Return ∇C at points, (…, 3) → (…, 3)."""
         if self.kind in ("box", "height_field"):
             step = 1e-6
@@ -219,13 +219,13 @@ class SceneSurface(_Finite):
             return np.stack([self.value(ahead) - self.value(behind) for ahead, behind in ends], axis=-1) / (2.0 * step)
         return np.asarray(points @ np.array(self.Q) + np.array(self.b))
 
-    def normal(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def normal(self, points: Array) -> Array:
         """Return unit normals into the free side at points, (…, 3) → (…, 3); zero if ∇C is zero."""
         slope = self.gradient(points)
         size = np.linalg.norm(slope, axis=-1, keepdims=True)
         return np.asarray(slope / np.where(size > 0.0, size, 1.0))
 
-    def gap(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def gap(self, points: Array) -> Array:
         """Return signed distances [m] of points along ∇C, (…, 3) → (…); exact for plane, sphere and cylinder."""
         value, size, n = self.value(points), np.linalg.norm(self.gradient(points), axis=-1), self.normal(points)
         inner = size * size - 2.0 * value * np.einsum("...i,ij,...j", n, np.array(self.Q), n)
@@ -233,13 +233,13 @@ class SceneSurface(_Finite):
             return np.asarray(np.where(inner > 0.0, 2.0 * value / (size + np.sqrt(inner)), value / size))
 
     @property
-    def grid(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def grid(self) -> tuple[Array, Array]:
         """Grid coordinates x, (nx,), and y, (ny,), of a height field [m]."""
         start, heights = np.array(self.position), np.array(self.heights)
         x, y = (start[s] + np.array(self.spacing)[s] * np.arange(heights.shape[1 - s]) for s in (0, 1))
         return x, y
 
-    def _height(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _height(self, x: Array, y: Array) -> Array:
         """Return heights by bilinear interpolation; outside the grid, the height at its edge."""
         from scipy.ndimage import map_coordinates  # imported here because height fields are rare
 
@@ -428,7 +428,7 @@ def _four(values: ArrayLike) -> Quaternion:
     return w, x, y, z
 
 
-def _simple_kind(Q: NDArray[np.float64], b: NDArray[np.float64], c: float) -> tuple[Any, dict[str, Any]]:
+def _simple_kind(Q: Array, b: Array, c: float) -> tuple[Any, dict[str, Any]]:
     """Return the kind (plane, sphere, cylinder or quadric) of a quadric and its parameters."""
     if not Q.any():
         slope = np.linalg.norm(b)

@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from dynsim.record.quaternion import Array
 
 # Confidence level of the interval of the mean, and probability of the interval of the samples.
 LEVEL = 0.95

@@ -8,12 +8,10 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from dynsim.record.quaternion import rotated
+from dynsim.record.quaternion import Array, rotated
 from dynsim.record.scene import WORLD, Scene, Shape
 
-Array = NDArray[np.float64]
 Element = ElementTree.Element
 WORLD_LINK = "world"
 # URDF has no ball joint; viewers position such bodies by their frames.

@@ -8,7 +8,6 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dynsim.compile.control import JointControl
 from dynsim.compile.mobility import immobile
@@ -499,7 +498,7 @@ def check_start(
     scenario: Scenario,
     model: Model,
     touching: Sequence[Contact],
-    q: NDArray[np.float64] | None = None,
+    q: Array | None = None,
     depth: float = START_TOLERANCE,
 ) -> None:
     """Check that every contact is on a body of the robot and starts on its surface.

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr, StrictInt, field_validator, model_validator
 
 from dynsim.compile.protocols import BuildContext
@@ -185,7 +184,7 @@ FORCE_COLUMNS = ("t_s", "fx_N", "fy_N", "fz_N")
 TORQUE_COLUMNS = ("mx_N_m", "my_N_m", "mz_N_m")
 
 # Times, shape (K + 1,) [s], and coefficients of the cubic polynomials of the six components in between, (K, 6, 4).
-Pieces = tuple[NDArray[np.float64], NDArray[np.float64]]
+Pieces = tuple[Array, Array]
 
 
 class WrenchConfig(BodyPoint):
@@ -227,7 +226,7 @@ class Sampled(WrenchConfig):
         """Return the sample times and the polynomials between them."""
         return self._pieces
 
-    def _interpolate(self, times: list[float], values: NDArray[np.float64]) -> Pieces:
+    def _interpolate(self, times: list[float], values: Array) -> Pieces:
         """Interpolate ``values``, shape (T, 6); raise ValueError if rounding makes the curve inaccurate or infinite."""
         knots = np.array(times)
         try:
@@ -241,7 +240,7 @@ class Sampled(WrenchConfig):
             raise ValueError("cannot be interpolated: numbers too large, or samples too close in time")
         return knots, coefficients
 
-    def _coefficients(self, knots: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _coefficients(self, knots: Array, values: Array) -> Array:
         if self.interpolation == "spline":
             from scipy.interpolate import CubicSpline  # the import takes 0.3 s
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from dynsim.compile.control import BasePath
 from dynsim.compile.protocols import BuildContext
 from dynsim.compile.references.splines import minimum_jerk
 from dynsim.config.base import NonNegative, Positive, StrictConfig, default
+from dynsim.model.description import Array
 
 
 class Config(StrictConfig):
@@ -27,7 +27,7 @@ class Config(StrictConfig):
     duration_s: Positive = Field(description="duration of the motion")
     start_s: NonNegative = default(0.0, "start time of the motion")
 
-    def motion(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
+    def motion(self, t: Array) -> Array:
         """Return distance R ψ [m] and turn ψ = α s(x) [rad] at times t [s], shape (T, 2)."""
         turn = np.deg2rad(self.angle_deg) * minimum_jerk(t, self.start_s, self.duration_s)
         return np.stack([self.radius_m * turn, turn], axis=1)

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr, model_validator
 from scipy.interpolate import PchipInterpolator
 
@@ -16,6 +15,7 @@ from dynsim.compile.protocols import BuildContext
 from dynsim.compile.references.plane_curve import AlongCurve, PlaneCurve, seen_from_start
 from dynsim.config.base import StrictConfig, default, error_at
 from dynsim.errors import ModelError
+from dynsim.model.description import Array
 from dynsim.record.csv_rows import read_table
 
 PLACES = ("t_s", "x_m", "y_m")
@@ -38,7 +38,7 @@ class Config(StrictConfig):
         None, "frame of x_m and y_m: `world`, or `start` (the base at its start, x ahead); default: world"
     )
     # Read once: an edit of the file does not change a loaded scenario.
-    _rows: NDArray[np.float64] = PrivateAttr()
+    _rows: Array = PrivateAttr()
     _are_rates: bool = PrivateAttr()
 
     @model_validator(mode="after")
@@ -60,7 +60,7 @@ class Rates:
 
     rates: PchipInterpolator
 
-    def motion(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
+    def motion(self, t: Array) -> Array:
         """Return the integrals of V and ω, distance [m] and turn [rad], at times t [s], shape (T, 2)."""
         return np.asarray(self.rates.antiderivative()(np.clip(t, *self.rates.x[[0, -1]])))
 
@@ -90,7 +90,7 @@ def build(config: Config, context: BuildContext) -> BasePath:
     return AlongCurve(curve, PchipInterpolator(times, distance))
 
 
-def _along(points: NDArray[np.float64]) -> tuple[list[int], NDArray[np.float64]]:
+def _along(points: Array) -> tuple[list[int], Array]:
     """Return the rows that define the curve, and the chord length at every row [m], which never decreases."""
     kept = [0]
     begin, *others = points.tolist()

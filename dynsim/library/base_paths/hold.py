@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dynsim.compile.control import BasePath
 from dynsim.compile.protocols import BuildContext
 from dynsim.config.base import StrictConfig
+from dynsim.model.description import Array
 
 
 class Config(StrictConfig):
@@ -17,7 +17,7 @@ class Config(StrictConfig):
 
     type: Literal["hold"]
 
-    def motion(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
+    def motion(self, t: Array) -> Array:
         """Return zero distance and turn at times t [s], shape (T, 2)."""
         return np.zeros((len(t), 2))
 

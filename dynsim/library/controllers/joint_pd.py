@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import Any, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, field_validator, model_validator
 
 from dynsim.compile.bracing import MIN_N
@@ -23,7 +22,7 @@ from dynsim.errors import ModelError
 from dynsim.library import families
 from dynsim.library.controllers.operator import OperatorConfig
 from dynsim.model.base_pose import base_row
-from dynsim.model.description import Contact, Robot
+from dynsim.model.description import Array, Contact, Robot
 from dynsim.model.drives import Motor, Servo, TorqueSource
 from dynsim.system.memo import recall
 
@@ -45,7 +44,7 @@ class Orientation(StrictConfig):
 
     rpy_deg: Vector3 = Field(description="rotation about x, y, z of the world, in this order")
 
-    def matrix(self) -> NDArray[np.float64]:
+    def matrix(self) -> Array:
         """Return the axes of the body as columns, shape (3, 3)."""
         from dynsim.model.urdf.reader import rotation
 
@@ -90,11 +89,11 @@ class JointPath(StrictConfig):
         return self
 
     @property
-    def values(self) -> NDArray[np.float64]:
+    def values(self) -> Array:
         """Positions at the waypoints [rad or m]."""
         return np.array(self.positions_m) if self.angles_deg is None else np.deg2rad(self.angles_deg)
 
-    def positions(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
+    def positions(self, times: Array) -> Array:
         """Return the spline [rad or m] at times [s]."""
         return clamped_cubic(self.times_s, self.values, times, self.ends == "rest")
 
@@ -203,7 +202,7 @@ def build(config: Config, context: BuildContext) -> JointControl:
     if config.base is not None:
         with errors_at("controller", "base", "path"):
             base_path = families.build("base_path", config.base.path, context, BasePath)
-    times, positions = np.zeros(0), dict[str, NDArray[np.float64]]()
+    times, positions = np.zeros(0), dict[str, Array]()
     planned = config.brace is not None or config.feed_forward != "none"
     if config.joints or config.torques or path is not None or base_path is not None or planned:
         times = _knots(_spacing(config), context.duration)
@@ -255,9 +254,7 @@ def _teleop(operator: OperatorConfig, context: BuildContext) -> TeleopOptions:
     )
 
 
-def _planned(
-    config: Config, context: BuildContext, times: NDArray[np.float64], positions: dict[str, NDArray[np.float64]]
-) -> NDArray[np.float64]:
+def _planned(config: Config, context: BuildContext, times: Array, positions: dict[str, Array]) -> Array:
     """Return the voltages of the motors along the references, (T, na)."""
     if config.brace is None:
         return planned_voltages(context.model, times, positions, {}, whole=config.feed_forward == "dynamics")
@@ -339,7 +336,7 @@ def _spacing(config: Config) -> float:
     return min(config.knot_spacing_s, max(nearest / KNOTS_BETWEEN, config.knot_spacing_s / MOST_FINER))
 
 
-def _knots(spacing: float, duration: float) -> NDArray[np.float64]:
+def _knots(spacing: float, duration: float) -> Array:
     """Return the times of the samples of the reference splines [s]."""
     segments = duration / spacing
     if segments > SEGMENTS_MAX:
@@ -351,7 +348,7 @@ def _knots(spacing: float, duration: float) -> NDArray[np.float64]:
     return np.linspace(0.0, duration, max(int(np.ceil(segments)), 6) + 1)
 
 
-def _wheel_angles(robot: Robot, path: BasePath, times: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
+def _wheel_angles(robot: Robot, path: BasePath, times: Array) -> dict[str, Array]:
     """Return references of the two wheels [rad]; empty if the base does not move, so that the wheels hold."""
     assert robot.base is not None
     keys = ("controller", "base", "path")
@@ -373,9 +370,7 @@ def _wheel_angles(robot: Robot, path: BasePath, times: NDArray[np.float64]) -> d
     return dict(zip(robot.base.wheels, angles.T, strict=True))
 
 
-def _base_coordinates(
-    robot: Robot, positions: dict[str, NDArray[np.float64]], times: NDArray[np.float64]
-) -> NDArray[np.float64] | None:
+def _base_coordinates(robot: Robot, positions: dict[str, Array], times: Array) -> Array | None:
     """Return wheel angles [rad], x and y [m] of the base at the reference times, (T, 4); None if the base holds."""
     if robot.base is None or not any(wheel in positions for wheel in robot.base.wheels):
         return None
@@ -393,7 +388,7 @@ def _base_coordinates(
 _GAINS = {"k_p": ("k_p_V_per_rad", 500.0), "k_d": ("k_d_V_s_per_rad", 20.0)}
 
 
-def _gains(config: Config, robot: Robot, name: str) -> NDArray[np.float64]:
+def _gains(config: Config, robot: Robot, name: str) -> Array:
     """Return one gain per motor, shape (na,): from the controller for DC motors, from a servo, 0 for torque sources."""
     (key, default), motors = _GAINS[name], robot.motors
     gain, circuits = getattr(config, key), [isinstance(motor, Motor) for motor in motors]

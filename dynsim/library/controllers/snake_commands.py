@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, field_validator, model_validator
 
 from dynsim.config.base import NonNegative, Positive, StrictConfig, default
 from dynsim.config.problems import suggest
+from dynsim.model.description import Array
 from dynsim.snake.description import FIXING, SWITCHING, CommandBlock, Feedback
 
 Coordinates = tuple[float, float, float, float, float, float]
@@ -61,7 +61,7 @@ class Ramp(TargetMotion):
     displacement: Coordinates = Field(description="displacement in x, y, z [m] and alpha, beta, gamma [rad]")
     profile: Profile = default("linear", "progress in time: `linear`, or `smooth` (minimum jerk, from rest to rest)")
 
-    def offset(self, s: NDArray[np.float64]) -> NDArray[np.float64]:
+    def offset(self, s: Array) -> Array:
         """Return the displacement at progress s in [0, 1], shape (T, 6)."""
         return s[:, None] * np.array(self.displacement)
 
@@ -78,7 +78,7 @@ class Circle(TargetMotion):
     backward: bool = default(False, "plane xy: move backward from the start point")
     turn_head: bool = default(True, "plane xy: the yaw angle follows the tangent")
 
-    def offset(self, s: NDArray[np.float64]) -> NDArray[np.float64]:
+    def offset(self, s: Array) -> Array:
         """Return the displacement at progress s in [0, 1], shape (T, 6)."""
         angle = 2.0 * np.pi * self.turns * s
         out = np.zeros((len(s), 6))
@@ -106,7 +106,7 @@ class DoorArc(TargetMotion):
     hinge: Literal["left", "right"] = default("left", "side of the hinge")
     opening: Literal["pull", "push"] = default("pull", "direction in which the door opens")
 
-    def offset(self, s: NDArray[np.float64]) -> NDArray[np.float64]:
+    def offset(self, s: Array) -> Array:
         """Return the displacement at progress s in [0, 1], shape (T, 6)."""
         angle = np.deg2rad(self.angle_deg) * s
         left = 1.0 if self.hinge == "left" else -1.0

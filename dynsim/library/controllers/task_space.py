@@ -11,7 +11,6 @@ from __future__ import annotations
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, StrictInt, field_validator, model_validator
 
 from dynsim.compile.protocols import BuildContext
@@ -20,6 +19,7 @@ from dynsim.errors import ModelError
 from dynsim.jit.kernel import integers, reals
 from dynsim.library.controllers.snake_commands import STATES as MODE_STATES
 from dynsim.library.controllers.snake_commands import Script, ScriptedSource, TimedScript
+from dynsim.model.description import Array
 from dynsim.snake import controller
 from dynsim.snake import support as stability
 from dynsim.snake import ticks as ss
@@ -317,7 +317,7 @@ def _shape_points(config: Config, plant: SnakeDescription, model: SnakeModel) ->
     return [names.index(name) for name in points], list(points.values())
 
 
-def _per_entry(key: str, value: float | list[float], count: int) -> NDArray[np.float64]:
+def _per_entry(key: str, value: float | list[float], count: int) -> Array:
     if isinstance(value, list) and len(value) != count:
         raise ModelError(f"controller.{key} must have {count} entries, got {len(value)}")
     return np.ones(count) * np.asarray(value)

@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from dynsim.compile.control import HandPath
 from dynsim.compile.protocols import BuildContext
 from dynsim.config.base import Positive, StrictConfig, Vector3, default, unit_vector
+from dynsim.model.description import Array
 
 
 class Config(StrictConfig):
@@ -29,13 +29,13 @@ class Config(StrictConfig):
         self._directions()
         return self
 
-    def _directions(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _directions(self) -> tuple[Array, Array]:
         normal = unit_vector(self.normal, "normal")
         start = np.array(self.start)
         first = unit_vector(list(start - normal * float(normal @ start)), "start, seen along the normal,")
         return first, np.cross(normal, first)
 
-    def position(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
+    def position(self, t: Array) -> Array:
         """Return c + R (e₁ cos ωt ± e₂ sin ωt) at times t [s], shape (T, 3) [m]."""
         first, second = self._directions()
         angle = 2.0 * np.pi / self.period_s * np.asarray(t) * (-1.0 if self.clockwise else 1.0)

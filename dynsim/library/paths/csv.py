@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr, model_validator
 from scipy.interpolate import PchipInterpolator
 
 from dynsim.compile.control import HandPath
 from dynsim.compile.protocols import BuildContext
 from dynsim.config.base import StrictConfig
+from dynsim.model.description import Array
 from dynsim.record.csv_rows import read_rows
 
 COLUMNS = ("t_s", "x_m", "y_m", "z_m")
@@ -31,7 +31,7 @@ class Config(StrictConfig):
         _check_curve(self._rows, self.file)
         return self
 
-    def position(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
+    def position(self, t: Array) -> Array:
         """Return the positions at times t [s], shape (T, 3) [m]."""
         curve = _curve(self._rows)
         return curve(np.clip(t, curve.x[0], curve.x[-1]))

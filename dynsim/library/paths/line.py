@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from dynsim.compile.control import HandPath
 from dynsim.compile.protocols import BuildContext
 from dynsim.compile.references.splines import minimum_jerk
 from dynsim.config.base import NonNegative, Positive, StrictConfig, Vector3, default
+from dynsim.model.description import Array
 
 
 class Config(StrictConfig):
@@ -23,7 +23,7 @@ class Config(StrictConfig):
     start_s: NonNegative = default(0.0, "start time of the motion")
     duration_s: Positive = Field(description="duration of the motion")
 
-    def position(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
+    def position(self, t: Array) -> Array:
         """Return a + (b − a) s(x) with s = 10x³ − 15x⁴ + 6x⁵ at times t [s], shape (T, 3) [m]."""
         a, b = np.array(self.from_m), np.array(self.to_m)
         return a + np.outer(minimum_jerk(t, self.start_s, self.duration_s), b - a)

@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from dynsim.compile.control import HandPath
 from dynsim.compile.protocols import BuildContext
 from dynsim.compile.references.splines import clamped_cubic
 from dynsim.config.base import StrictConfig, Vector3, check_waypoints
+from dynsim.model.description import Array
 
 
 class Config(StrictConfig):
@@ -26,7 +26,7 @@ class Config(StrictConfig):
         check_waypoints(self.times_s, self.points_m, "points_m")
         return self
 
-    def position(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
+    def position(self, t: Array) -> Array:
         """Return the positions at times t [s], shape (T, 3) [m]."""
         return clamped_cubic(self.times_s, np.array(self.points_m), t)
 
