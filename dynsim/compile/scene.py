@@ -83,10 +83,10 @@ def _shared(values: Iterable[float]) -> float | None:
 
 def drawn_surface(name: str, surface: Surface) -> SceneSurface:
     """Return a surface in the form stored in a scene."""
-    nothing = np.zeros((3, 3))
+    empty = SceneSurface.of_quadric(name, np.zeros((3, 3)), np.zeros(3), 0.0)
     if isinstance(surface, Box):
         return replace(
-            SceneSurface.of_quadric(name, nothing, np.zeros(3), 0.0),
+            empty,
             kind="box",
             position=vector3(surface.centre),
             orientation=quaternion(surface.axes.T),
@@ -98,7 +98,7 @@ def drawn_surface(name: str, surface: Surface) -> SceneSurface:
         heights, dx = _thinned(heights.T, dx)
         heights, dy = _thinned(heights.T, dy)
         return replace(
-            SceneSurface.of_quadric(name, nothing, np.zeros(3), 0.0),
+            empty,
             kind="height_field",
             position=vector3([*surface.origin, 0.0]),
             spacing=(dx, dy),

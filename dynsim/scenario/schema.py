@@ -412,23 +412,23 @@ class Solid(StrictConfig):
     @property
     def inertia(self) -> Inertia:
         """Inertia about the centre: I_x = m (b² + c²)/12 (box), I = 2 m r²/5 (sphere), I_z = m r²/2 (cylinder)."""
-        if self.size_m is not None:
-            squares = np.array(self.size_m) ** 2
+        if self.shape == "box":
+            squares = np.array(self.dimensions) ** 2
             return Inertia(self.mass_kg, np.zeros(3), np.diag(self.mass_kg * (squares.sum() - squares) / 12.0))
-        radius = float(self.radius_m or 0.0)
-        if self.length_m is None:
+        radius, *length = self.dimensions
+        if self.shape == "sphere":
             return Inertia.solid_sphere(self.mass_kg, radius, np.zeros(3))
-        return replace(Inertia.solid_cylinder(self.mass_kg, radius, self.length_m), com=np.zeros(3))
+        return replace(Inertia.solid_cylinder(self.mass_kg, radius, *length), com=np.zeros(3))
+
+    @property
+    def dimensions(self) -> tuple[float, ...]:
+        """Edges of a box, radius of a sphere, radius and length of a cylinder [m]."""
+        return tuple(self.size_m or [x for x in (self.radius_m, self.length_m) if x is not None])
 
     @property
     def solid(self) -> Shape:
         """Shape for display."""
-        if self.size_m is not None:
-            return Shape("box", tuple(self.size_m), colour=COLOUR)
-        radius = float(self.radius_m or 0.0)
-        if self.length_m is None:
-            return Shape("sphere", (radius,), colour=COLOUR)
-        return Shape("cylinder", (radius, self.length_m), colour=COLOUR)
+        return Shape(self.shape, self.dimensions, colour=COLOUR)
 
     @property
     def spheres(self) -> tuple[Array, float]:
@@ -437,13 +437,13 @@ class Solid(StrictConfig):
         A box touches with its corners, a cylinder with a sphere inside each end: contact is exact for a lying pipe;
         an upright pipe stands on a sphere.
         """
-        if self.size_m is not None:
+        if self.shape == "box":
             signs = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
-            return signs * self.size_m, 0.0
-        radius = float(self.radius_m or 0.0)
-        if self.length_m is None:
+            return signs * self.dimensions, 0.0
+        radius, *length = self.dimensions
+        end = max(0.5 * sum(length) - radius, 0.0)
+        if self.shape == "sphere":
             return np.zeros((1, 3)), radius
-        end = max(0.5 * self.length_m - radius, 0.0)
         return np.array([[0.0, 0.0, -end], [0.0, 0.0, end]]), radius
 
 

@@ -14,6 +14,7 @@ import stat
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -129,7 +130,7 @@ def replacing(path: Path, *, durable: bool = False) -> Iterator[BinaryIO]:
     RecordError
         If ``path`` is not a regular file or cannot be written (no space, no permission); an older file is unchanged.
     """
-    with _Draft(path) as draft:
+    with _draft(path) as draft:
         yield draft.stream
         draft.complete(durable)
         draft.publish()
@@ -150,7 +151,7 @@ def replace_together(folder: Path, contents: Mapping[str, bytes | memoryview]) -
     if len(places) < len(contents):
         raise RecordError(f"cannot write to {folder}: two of {', '.join(contents)} are links to the same file")
     with ExitStack() as open_drafts:
-        drafts = [open_drafts.enter_context(_Draft(folder / name)) for name in contents]
+        drafts = [open_drafts.enter_context(_draft(folder / name)) for name in contents]
         for draft, content in zip(drafts, contents.values(), strict=True):
             with _one_line_errors(draft.path):
                 draft.stream.write(content)
@@ -216,68 +217,14 @@ def _one_line_errors(path: Path) -> Iterator[None]:
         raise RecordError(f"cannot write {path}: {_reason(error)}; nothing was changed there") from error
 
 
+@dataclass(frozen=True)
 class _Draft:
-    """Content for ``path`` in a temporary file next to it; errors within its ``with`` name the path."""
+    """Content for ``path`` in a temporary file, which becomes the file ``target``."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def __enter__(self) -> _Draft:
-        with _one_line_errors(self.path):
-            existing = self._existing()
-            # Only this process uses the name: the file must not exist, and a link of that name is not followed.
-            self._temporary = self._target.with_name(f".dynsim-{os.urandom(8).hex()}.tmp")
-            try:
-                self.stream: BinaryIO = self._temporary.open("x+b")
-                self._take_over(existing)
-            except FileExistsError:  # not our file
-                raise
-            except BaseException:
-                self._discard()
-                raise
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: object) -> None:
-        """Close, and remove the temporary file if it was not published."""
-        self._discard()
-        if isinstance(error, (OSError, UnicodeEncodeError)):
-            with _one_line_errors(self.path):
-                raise error
-
-    def _discard(self) -> None:
-        # A signal may have come before the stream was known.
-        with suppress(OSError, AttributeError):
-            self.stream.close()
-        with suppress(OSError):
-            self._temporary.unlink()
-
-    def _existing(self) -> os.stat_result | None:
-        """Check the existing file at the path, and determine which file to replace."""
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            existing: os.stat_result | None = os.stat(self.path)
-        except FileNotFoundError:
-            existing = None
-        if existing is not None and stat.S_ISDIR(existing.st_mode):
-            raise IsADirectoryError(0, "is a folder, not a file")
-        names = [os.fspath(self.path), *([os.readlink(self.path)] if self.path.is_symlink() else ())]
-        if (existing is not None and not stat.S_ISREG(existing.st_mode)) or any(map(_STREAM.fullmatch, names)):
-            raise OSError(0, "is a device, pipe or socket; write to a file and copy it there")
-        self._target = Path(os.path.realpath(self.path))
-        if existing is not None and not os.access(self._target, os.W_OK):
-            raise PermissionError(0, "the file is write-protected")
-        _remove_left_behind(self._target.parent)
-        return existing
-
-    def _take_over(self, existing: os.stat_result | None) -> None:
-        """Give the temporary file owner and mode of the file that it replaces."""
-        descriptor = self.stream.fileno()
-        if existing is not None and hasattr(os, "fchmod"):
-            with suppress(OSError):  # only root may change the owner; otherwise the file remains ours
-                if (existing.st_uid, existing.st_gid) != (os.geteuid(), os.getegid()):
-                    os.fchown(descriptor, existing.st_uid, existing.st_gid)
-            with suppress(OSError):  # a file system without modes
-                os.fchmod(descriptor, stat.S_IMODE(existing.st_mode))
+    path: Path
+    target: Path
+    temporary: Path
+    stream: BinaryIO
 
     def complete(self, durable: bool) -> None:
         """Flush the complete content to the system, and to the disk if ``durable``."""
@@ -289,7 +236,55 @@ class _Draft:
         """Replace the file at the path by the content."""
         if not hasattr(os, "fchmod"):
             self.stream.close()  # Windows cannot rename an open file
-        os.replace(self._temporary, self._target)
+        os.replace(self.temporary, self.target)
+
+
+@contextmanager
+def _draft(path: Path) -> Iterator[_Draft]:
+    """Provide a temporary file next to a file; errors name the file. It is removed unless the block publishes it."""
+    with _one_line_errors(path):
+        existing = _existing(path)
+        target = Path(os.path.realpath(path))
+        if existing is not None and not os.access(target, os.W_OK):
+            raise PermissionError(0, "the file is write-protected")
+        _remove_left_behind(target.parent)
+        # Only this process uses the name: the file must not exist, and a link of that name is not followed.
+        temporary = target.with_name(f".dynsim-{os.urandom(8).hex()}.tmp")
+        stream = temporary.open("x+b")
+        try:
+            if existing is not None:
+                _take_over(stream.fileno(), existing)
+            yield _Draft(path, target, temporary, stream)
+        finally:
+            with suppress(OSError):
+                stream.close()
+            with suppress(OSError):
+                temporary.unlink()
+
+
+def _existing(path: Path) -> os.stat_result | None:
+    """Return the status of the existing file at a path; raise OSError if it is not a regular file."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        existing: os.stat_result | None = os.stat(path)
+    except FileNotFoundError:
+        existing = None
+    if existing is not None and stat.S_ISDIR(existing.st_mode):
+        raise IsADirectoryError(0, "is a folder, not a file")
+    names = [os.fspath(path), *([os.readlink(path)] if path.is_symlink() else ())]
+    if (existing is not None and not stat.S_ISREG(existing.st_mode)) or any(map(_STREAM.fullmatch, names)):
+        raise OSError(0, "is a device, pipe or socket; write to a file and copy it there")
+    return existing
+
+
+def _take_over(descriptor: int, existing: os.stat_result) -> None:
+    """Give a file owner and mode of the file that it replaces."""
+    if hasattr(os, "fchmod"):
+        with suppress(OSError):  # only root may change the owner; otherwise the file remains ours
+            if (existing.st_uid, existing.st_gid) != (os.geteuid(), os.getegid()):
+                os.fchown(descriptor, existing.st_uid, existing.st_gid)
+        with suppress(OSError):  # a file system without modes
+            os.fchmod(descriptor, stat.S_IMODE(existing.st_mode))
 
 
 def _reason(error: Exception) -> str:

@@ -133,7 +133,8 @@ def build(config: Config, context: BuildContext) -> Robot:
     arm = families.build("plant", config.arm, context, Robot)
     base, wheel = config.base, config.base.wheel
     axle, across = wheel.moments
-    mount = _turn(np.deg2rad(base.mount.yaw_deg)), np.array(base.mount.position_m)
+    yaw = np.deg2rad(base.mount.yaw_deg)
+    mount, turned = (_turn(yaw), np.array(base.mount.position_m)), of_turn((0.0, 0.0, 1.0), yaw)
     parts, wheels, motors = [_body(base), arm.fixed_inertia.placed(*mount)], (f"{BASE}.left", f"{BASE}.right"), []
     for joint, side in zip(wheels, (0.5, -0.5), strict=True):
         hub = vector(0.0, side * base.track_m, wheel.radius_m)
@@ -153,7 +154,7 @@ def build(config: Config, context: BuildContext) -> Robot:
         R_PJ=_turn(np.deg2rad(base.heading_deg)),
         p_PJ=np.array([*base.position_m, 0.0]),
         damping=wheel.damping_N_m_s_per_rad,
-        shapes=(*_shapes(base), *(shape.placed(mount[1], _quaternion(base)) for shape in arm.fixed_shapes)),
+        shapes=(*_shapes(base), *(shape.placed(mount[1], turned) for shape in arm.fixed_shapes)),
         armature=axle,
     )
     rows = wheeled(body, wheel.radius_m, base.track_m)
@@ -198,10 +199,6 @@ def _body(base: Base) -> Inertia:
 def _turn(yaw: float) -> Array:
     c, s = math.cos(yaw), math.sin(yaw)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-
-
-def _quaternion(base: Base) -> Any:
-    return tuple(of_turn((0.0, 0.0, 1.0), np.deg2rad(base.mount.yaw_deg)).tolist())
 
 
 def _mounted(link: Link, R: Array, p: Array) -> Link:

@@ -96,16 +96,6 @@ class LinkConfig(LinkKeys):
         return self
 
     @property
-    def damping(self) -> float:
-        """Viscous damping D of the joint [N m s/rad, or N s/m if prismatic]."""
-        return self.damping_N_s_per_m if self.kind == "prismatic" else self.damping_N_m_s_per_rad
-
-    @property
-    def friction(self) -> float:
-        """Dry friction of the joint [N m, or N if prismatic]."""
-        return self.friction_N if self.kind == "prismatic" else self.friction_N_m
-
-    @property
     def initial(self) -> float:
         """Initial position [rad, or m if prismatic]."""
         return self.initial_m if self.kind == "prismatic" else float(np.deg2rad(self.initial_deg))
@@ -228,8 +218,9 @@ def build(config: Config, context: BuildContext) -> Robot:
                     inertia=group.inertia(),
                     R_PJ=turn if first else np.eye(3),
                     p_PJ=np.array(config.base.position_m) if first else vector(0.0, 0.0, reach),
-                    damping=group.damping,
-                    friction=group.friction,
+                    # The key of the other kind of joint is zero.
+                    damping=group.damping_N_m_s_per_rad + group.damping_N_s_per_m,
+                    friction=group.friction_N_m + group.friction_N,
                     lower=group.limits[0],
                     upper=group.limits[1],
                     radius=group.radius_m,
