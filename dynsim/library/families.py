@@ -14,7 +14,6 @@ import pkgutil
 import traceback
 import typing
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from types import ModuleType, UnionType
@@ -33,22 +32,15 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 
-@dataclass(frozen=True)
-class Family:
-    """Location of a family's members, and the text constants a module needs in addition to ``Config`` and ``build``."""
-
-    package: str
-    group: str
-    texts: tuple[str, ...] = ()
-
-
-FAMILIES = {
-    "plant": Family("dynsim.library.plants", "dynsim.plants", ("ENGINE",)),
-    "controller": Family("dynsim.library.controllers", "dynsim.controllers", ("ENGINE",)),
-    "path": Family("dynsim.library.paths", "dynsim.paths"),
-    "base_path": Family("dynsim.library.base_paths", "dynsim.base_paths"),
-    "surface": Family("dynsim.library.surfaces", "dynsim.surfaces"),
-    "motor": Family("dynsim.library.motors", "dynsim.motors"),
+# Families, with the text constants that a module needs in addition to ``Config`` and ``build``. The members of a plant
+# are in the package ``dynsim.library.plants`` and in the entry points ``dynsim.plants``.
+FAMILIES: Mapping[str, tuple[str, ...]] = {
+    "plant": ("ENGINE",),
+    "controller": ("ENGINE",),
+    "path": (),
+    "base_path": (),
+    "surface": (),
+    "motor": (),
 }
 
 
@@ -59,12 +51,12 @@ _imported: dict[tuple[str, str], ModuleType] = {}
 @cache
 def _modules(family: str) -> tuple[str, ...]:
     """Return the names of the modules in the package of a family."""
-    package = importlib.import_module(FAMILIES[family].package)
+    package = importlib.import_module(f"dynsim.library.{family}s")
     return tuple(sorted(info.name for info in pkgutil.iter_modules(package.__path__) if not info.ispkg))
 
 
 def _module(family: str, name: str) -> ModuleType:
-    return importlib.import_module(f"{FAMILIES[family].package}.{name}")
+    return importlib.import_module(f"dynsim.library.{family}s.{name}")
 
 
 @cache
@@ -85,7 +77,7 @@ def _entry_points(family: str) -> Mapping[str, list[EntryPoint]]:
     from importlib.metadata import entry_points
 
     points: dict[str, list[EntryPoint]] = {}
-    for point in entry_points(group=FAMILIES[family].group):
+    for point in entry_points(group=f"dynsim.{family}s"):
         points.setdefault(point.name, []).append(point)
     return points
 
@@ -210,7 +202,7 @@ def _plugin(family: str, name: str) -> ModuleType:
     except (Exception, SystemExit) as error:
         reason = f"importing {point.value!r} fails with {type(error).__name__}: {' '.join(str(error).split())[:200]}"
         raise PluginError(_unusable(family, point, reason)) from error
-    if defect := _defect(module, FAMILIES[family], name):
+    if defect := _defect(module, family, name):
         raise PluginError(_unusable(family, point, f"{point.value!r} {defect}"))
     _imported[family, name] = module
     return module
@@ -225,7 +217,7 @@ def _title(point: EntryPoint) -> str:
     return f"{point.dist.name} {point.dist.version}" if point.dist else point.value
 
 
-def _defect(module: Any, family: Family, name: str) -> str:
+def _defect(module: Any, family: str, name: str) -> str:
     """Return why a module cannot be a member with this name, or "" if it can."""
     if not isinstance(module, ModuleType):
         return "is not a module; the entry point must refer to a module"
@@ -241,7 +233,7 @@ def _defect(module: Any, family: Family, name: str) -> str:
         inspect.signature(build_).bind(None, None)
     except (TypeError, ValueError):
         return "has a build that does not accept (config, context)"
-    for text in family.texts:
+    for text in FAMILIES[family]:
         if not isinstance(getattr(module, text, None), str):
             return f'has no string {text}, such as "dynamics"'
     return ""

@@ -340,6 +340,11 @@ class Guide(StrictConfig):
         axis = unit_vector(self.axis, "axis")
         return replace(link, kind=self.KIND, axis=axis, damping=damping, friction=friction, lower=lower, upper=upper)
 
+    def _spring(self, name: str, link: Link, stiffness: float, **ends: Any) -> Tie | None:
+        """Return the spring of an object between its link and the world; None without stiffness."""
+        tie = Tie(f"{name}.spring", link.name, WORLD, link.axis, stiffness, 0.0, **ends)
+        return tie if stiffness > 0.0 else None
+
 
 class Hinge(Guide):
     """Hinge of an object, such as a door."""
@@ -362,9 +367,8 @@ class Hinge(Guide):
 
     def spring(self, name: str, link: Link) -> Tie | None:
         """Return the return spring between the link and the world; None without stiffness."""
-        angle, law = math.radians(self.rest_deg), (self.spring_N_m_per_rad, 0.0)
-        tie = Tie(f"{name}.spring", link.name, WORLD, link.axis, *law, turns=True, rest=angle, attitude=link.R_PJ.T)
-        return tie if self.spring_N_m_per_rad > 0.0 else None
+        rest = math.radians(self.rest_deg)
+        return self._spring(name, link, self.spring_N_m_per_rad, turns=True, rest=rest, attitude=link.R_PJ.T)
 
 
 class Slide(Guide):
@@ -390,9 +394,7 @@ class Slide(Guide):
 
     def spring(self, name: str, link: Link) -> Tie | None:
         """Return the spring between the link and the world; None without stiffness."""
-        law, at = (self.spring_N_per_m, 0.0), link.p_PJ
-        tie = Tie(f"{name}.spring", link.name, WORLD, link.axis, *law, other_point=at, rest=self.rest_m)
-        return tie if self.spring_N_per_m > 0.0 else None
+        return self._spring(name, link, self.spring_N_per_m, other_point=link.p_PJ, rest=self.rest_m)
 
 
 class Solid(StrictConfig):

@@ -52,7 +52,7 @@ def test_these_are_all_members_and_each_has_what_its_family_asks_for(family: str
     types = [get_args(module.Config.model_fields["type"].annotation) for module in FAMILIES[family]]
     assert types == [(name,) for name in families.shipped(family)]
     for name, module in zip(families.shipped(family), FAMILIES[family], strict=True):
-        assert families._defect(module, families.FAMILIES[family], name) == ""
+        assert families._defect(module, family, name) == ""
 
 
 @pytest.mark.parametrize("family", ["surface", "motor", "path", "base_path"])

@@ -68,7 +68,7 @@ def dotted(text: str) -> set[str]:
     """Dotted names that begin with dynsim, one of its modules or a name that it exports; no groups of entry points."""
     roots = {"dynsim", *dynsim.__all__, *(path.stem for path in PACKAGE.iterdir())}
     names = re.findall(r"`([A-Za-z_]\w*(?:\.\w+)+)(?:\([^`]*\))?`", prose(text))
-    groups = {family.group for family in FAMILIES.values()}
+    groups = {f"dynsim.{family}s" for family in FAMILIES}
     return {name for name in names if name.split(".")[0] in roots and not name.endswith(".py")} - groups
 
 
@@ -144,7 +144,7 @@ def test_a_name_that_is_not_there_is_found(wrong: str) -> None:
 
 def test_what_sources_name_exists() -> None:
     """Modules, functions and classes by their whole names, in docstrings, comments and texts."""
-    groups = {family.group for family in FAMILIES.values()}
+    groups = {f"dynsim.{family}s" for family in FAMILIES}
     named = {
         (name, path.relative_to(PACKAGE).as_posix())
         for path in PACKAGE.rglob("*.py")
