@@ -367,8 +367,8 @@ class Hinge(Guide):
 
     def spring(self, name: str, link: Link) -> Tie | None:
         """Return the return spring between the link and the world; None without stiffness."""
-        rest = math.radians(self.rest_deg)
-        return self._spring(name, link, self.spring_N_m_per_rad, turns=True, rest=rest, attitude=link.R_PJ.T)
+        angle = math.radians(self.rest_deg)
+        return self._spring(name, link, self.spring_N_m_per_rad, turns=True, rest=angle, attitude=link.R_PJ.T)
 
 
 class Slide(Guide):
@@ -397,19 +397,44 @@ class Slide(Guide):
         return self._spring(name, link, self.spring_N_per_m, other_point=link.p_PJ, rest=self.rest_m)
 
 
-class Solid(StrictConfig):
-    """Homogeneous solid: a box, a sphere, or a cylinder along its z axis."""
+# Keys of mass and size that each shape requires; the other keys do not apply to it.
+SIZES = {
+    "box": ("mass_kg", "size_m"),
+    "sphere": ("mass_kg", "radius_m"),
+    "cylinder": ("mass_kg", "radius_m", "length_m"),
+    "parts": ("parts",),
+}
 
-    mass_kg: Positive = Field(description="mass")
-    shape: Literal["box", "sphere", "cylinder"] = default("box", "shape")
+
+class Sized(StrictConfig):
+    """Mass, shape and size of an object or a part."""
+
+    mass_kg: Positive | None = default(None, "mass; with `shape: parts` the sum of the masses of the parts")
+    shape: Literal["box", "sphere", "cylinder", "parts"] = default("box", "shape")
     size_m: Lengths | None = default(None, "edge lengths of a box along its axes")
     radius_m: Positive | None = default(None, "radius of a sphere or cylinder")
     length_m: Positive | None = default(None, "length of a cylinder along its z axis")
 
     @model_validator(mode="after")
-    def _check_size(self) -> Self:
-        _check_sizes(self)
+    def _check_sizes(self) -> Self:
+        subject, remedy = f"a {self.shape}", "remove it"
+        if self.shape == "parts":
+            subject, remedy = "shape: parts", "set it for each part and remove it here"
+        for key in ("parts", "mass_kg", "size_m", "radius_m", "length_m"):
+            needed, missing = key in SIZES[self.shape], getattr(self, key, None) is None
+            if needed and missing:
+                raise error_at(key, f"is required for {subject}")
+            if not needed and not missing:
+                remedy = "remove it, or set shape: parts" if key == "parts" else remedy
+                raise error_at(key, f"does not apply to {subject}; {remedy}")
         return self
+
+
+class Solid(Sized):
+    """Homogeneous solid: a box, a sphere, or a cylinder along its z axis."""
+
+    mass_kg: Positive = Field(description="mass")
+    shape: Literal["box", "sphere", "cylinder"] = default("box", "shape")
 
     @property
     def inertia(self) -> Inertia:
@@ -447,20 +472,6 @@ class Solid(StrictConfig):
         if self.shape == "sphere":
             return np.zeros((1, 3)), radius
         return np.array([[0.0, 0.0, -end], [0.0, 0.0, end]]), radius
-
-
-SIZES = {"box": ("size_m",), "sphere": ("radius_m",), "cylinder": ("radius_m", "length_m")}
-
-
-def _check_sizes(solid: Solid | SceneObject) -> None:
-    """Raise an error if a size that the shape requires is missing, or a size does not apply to it."""
-    needed = SIZES[solid.shape]
-    for key in ("size_m", "radius_m", "length_m"):
-        if (getattr(solid, key) is None) == (key in needed):
-            text = (
-                f"is required for a {solid.shape}" if key in needed else f"does not apply to a {solid.shape}; remove it"
-            )
-            raise error_at(key, text)
 
 
 class Part(Solid):
@@ -509,14 +520,9 @@ class ObjectWheel(StrictConfig):
         )
 
 
-class SceneObject(StrictConfig):
+class SceneObject(Sized):
     """Object: a solid box, sphere or cylinder, or a rigid body of several parts."""
 
-    mass_kg: Positive | None = default(None, "mass; with `shape: parts` the sum of the masses of the parts")
-    shape: Literal["box", "sphere", "cylinder", "parts"] = default("box", "shape")
-    size_m: Lengths | None = default(None, "edge lengths of a box along its axes")
-    radius_m: Positive | None = default(None, "radius of a sphere or cylinder")
-    length_m: Positive | None = default(None, "length of a cylinder along its z axis")
     parts: Annotated[dict[str, Part], Field(min_length=1)] | None = default(
         None, "named solids, fixed to each other, for `shape: parts`"
     )
@@ -530,24 +536,12 @@ class SceneObject(StrictConfig):
     grasp: Grasp | None = default(None, "grasp pose for a gripper; default: it cannot be gripped")
 
     @model_validator(mode="after")
-    def _check_size(self) -> Self:
+    def _check_joint(self) -> Self:
         if self.hinge is not None and self.slide is not None:
             raise error_at("slide", "conflicts with hinge; remove one of the two")
         if self.joint is not None and self.wheels:
             on = "hinge" if self.hinge is not None else "slide"
             raise error_at("wheels", f"requires a free object, but this object has a {on}; remove one of the two")
-        if self.shape == "parts":
-            for key in ("mass_kg", "size_m", "radius_m", "length_m"):
-                if getattr(self, key) is not None:
-                    raise error_at(key, "does not apply to shape: parts; set it for each part and remove it here")
-            if self.parts is None:
-                raise error_at("parts", "is required for shape: parts")
-            return self
-        if self.parts is not None:
-            raise error_at("parts", f"does not apply to a {self.shape}; remove it, or set shape: parts")
-        if self.mass_kg is None:
-            raise error_at("mass_kg", f"is required for a {self.shape}")
-        _check_sizes(self)
         return self
 
     @property
@@ -758,11 +752,6 @@ class Contacts(StrictConfig):
     def compliance(self, point: ContactPoint | None = None) -> tuple[float, float]:
         """Return stiffness [N/m] (0: rigid) and damping [N s/m] of a point, or of all contacts."""
         return self.of(point, "stiffness_N_per_m") or 0.0, self.of(point, "damping_N_s_per_m")
-
-    @property
-    def other_keys(self) -> tuple[str, ...]:
-        """Keys that only the other contact law uses."""
-        return BILATERAL_KEYS if self.law == "unilateral" else UNILATERAL_KEYS
 
     @model_validator(mode="after")
     def _check_coefficients(self) -> Self:
@@ -1069,7 +1058,7 @@ class Scenario:
                 del resolved[section]
         contacts = self.config.contacts
         for part in (resolved["contacts"], *resolved["contacts"]["points"].values()):
-            for key in contacts.other_keys:
+            for key in BILATERAL_KEYS if contacts.law == "unilateral" else UNILATERAL_KEYS:
                 part.pop(key, None)
         # Omit keys without effect, unless the scenario sets them.
         for keys in idle_keys(self.config):
