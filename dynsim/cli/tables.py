@@ -173,18 +173,18 @@ def _table(title: object, **options: Any) -> Table:
     return Table(title=escaped_line(title), title_justify="left", **{"box": box.SIMPLE_HEAD, **options})
 
 
+def _value(summary: Summary, source: str | Callable[[Summary], Any]) -> Any:
+    return summary.get(source) if isinstance(source, str) else source(summary)
+
+
 def _rows(
     summaries: Sequence[Summary], shown: Sequence[Summary], compared: bool = False
 ) -> Iterator[tuple[str, list[str]]]:
     """Yield the rows that any run has, with a cell for each run shown; if ``compared``, also ratios of energies."""
     for heading, source, show in _ROWS:
-
-        def cell(summary: Summary, source: Any = source, show: Any = show) -> str:
-            value = summary.get(source) if isinstance(source, str) else source(summary)
-            return "–" if value is None else show(value)
-
-        if any(cell(summary) != "–" for summary in summaries):
-            yield escaped_line(heading), [cell(summary) for summary in shown]
+        if any(_value(summary, source) is not None for summary in summaries):
+            values = [_value(summary, source) for summary in shown]
+            yield escaped_line(heading), ["–" if value is None else show(value) for value in values]
     least = min(summary.get("electrical_energy_J") or 0.0 for summary in summaries)
     if compared and least > 0.0:
         yield "energy, times the minimum", [f"{summary['electrical_energy_J'] / least:.3g}" for summary in shown]
