@@ -30,7 +30,7 @@ from dynsim.engine.gripper import (
     refuse_capture,
     state_text,
 )
-from dynsim.engine.outcome import check_size, interrupted, raise_stopped
+from dynsim.engine.outcome import check_size, interrupted, run_to_end
 from dynsim.engine.recording import pictured_parts, provenance
 from dynsim.engine.snake_control import OBSTACLES, SnakeControl, control_periods, copy_of
 from dynsim.errors import ModelError, SimulationStopped
@@ -683,9 +683,9 @@ def simulate(
     run = prepare(scenario, source)
     with kernels_logged(log, "kinematic snakes"):
         run.load_kernels()
-    stop: SimulationStopped | None = None
     started = clock.perf_counter()
-    try:
+
+    def work() -> None:
         log.info("%s: integrating %g s in %d control periods", scenario.title, scenario.duration_s, run.ticks)
         while run.tick < run.ticks:
             _check_wall(run, clock.perf_counter() - started, scenario.integrator.wall_limit_s)
@@ -693,20 +693,13 @@ def simulate(
             if progress is not None:
                 progress(run.time)
             interruption.check()
-        interruption.keep()
-    except SimulationStopped as stopped:
-        interruption.keep()
-        stop = stopped
-    except KeyboardInterrupt:
-        interruption.keep()
-        interruption.answered()
-        stop = interrupted(scenario, run.time, run.postures())
-    wall = clock.perf_counter() - started
-    log.info("%s: integrated %d control periods in %.3f s", scenario.title, run.tick, wall)
-    record = make_record(run, scenario, wall, pictured)
-    if stop is not None:
-        raise_stopped(stop, record)
-    return record
+
+    def record() -> Record:
+        wall = clock.perf_counter() - started
+        log.info("%s: integrated %d control periods in %.3f s", scenario.title, run.tick, wall)
+        return make_record(run, scenario, wall, pictured)
+
+    return run_to_end(work, lambda: interrupted(scenario, run.time, run.postures()), record)
 
 
 def _check_wall(run: SnakeRun, spent: float, limit: float | None) -> None:

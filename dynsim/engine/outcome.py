@@ -1,12 +1,14 @@
-"""Size check of a record, and exceptions of incomplete runs, for both engines."""
+"""Size check of a record, and the end of complete and incomplete runs, for both engines."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NoReturn
 
 from dynsim.errors import ScenarioError, SimulationInterrupted, SimulationStopped
 from dynsim.record import Record
 from dynsim.scenario import Scenario
+from dynsim.system import interruption
 
 
 def check_size(scenario: Scenario, rows: int, columns: int) -> None:
@@ -46,3 +48,39 @@ def raise_stopped(stop: SimulationStopped, record: Record) -> NoReturn:
         mark_stopped(stop, record)
     stop.record = record
     raise stop
+
+
+def run_to_end(
+    work: Callable[[], None], interrupt: Callable[[], SimulationInterrupted], record: Callable[[], Record]
+) -> Record:
+    """Do the work of a run and return its record; from its end on, signals are postponed.
+
+    Parameters
+    ----------
+    work : callable
+        Runs to the end.
+    interrupt : callable
+        Returns the exception for a run that Ctrl-C ended.
+    record : callable
+        Returns the record up to now.
+
+    Raises
+    ------
+    SimulationStopped
+        If the run ended early; ``error.record`` is its record.
+    """
+    stop: SimulationStopped | None = None
+    try:
+        work()
+        interruption.keep()
+    except SimulationStopped as ended:
+        interruption.keep()
+        stop = ended
+    except KeyboardInterrupt:
+        interruption.keep()
+        interruption.answered()
+        stop = interrupt()
+    result = record() if stop is None or stop.record is None else stop.record
+    if stop is not None:
+        raise_stopped(stop, result)
+    return result

@@ -203,7 +203,7 @@ STALLED_S = 1e-5
 # proportional to it and limits the steps; ten milliseconds of such slip are a nanometre [m/s].
 SLOWEST = 1e-7
 # More steps than any run needs.
-_EVERY_STEP = 1 << 62
+EVERY_STEP = 1 << 62
 
 
 @dataclass(frozen=True)
@@ -440,7 +440,7 @@ def follow_lines(scenario: Scenario, q: Array, phases: Sequence[Phase]) -> Array
         run.clock[ki.END] = end
         run.count[[ki.STATUS, ki.STARTED]] = ki.RUNNING, 0
         while run.count[ki.STATUS] == ki.RUNNING:
-            driver.advance(system, prepared.workspace, run, _EVERY_STEP)
+            driver.advance(system, prepared.workspace, run, EVERY_STEP)
             run.count[ki.LOGGED] = 0
         if run.count[ki.STATUS] != ki.FINISHED:
             raise SimulationStopped(

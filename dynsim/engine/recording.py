@@ -473,7 +473,7 @@ def make_record(
     prepared: Prepared,
     wall: float,
     *,
-    pushed: Sequence[int] | None = None,
+    pushed: Sequence[int] = (),
     pushes: Sequence[AppliedWrench] = (),
     happened: Sequence[Event] = (),
     base_as_planned: bool = True,
@@ -491,7 +491,7 @@ def make_record(
     wall : float
         Wall-clock time of the integration [s].
     pushed : sequence of int, optional
-        Indices of the caller's wrenches (the last of the loads) that have been set; default: no such wrenches.
+        Indices of the loads that are wrenches of the caller and have been set.
     pushes : sequence of AppliedWrench, optional
         These wrenches, in the order of time, if the scenario has sensors on links.
     happened : sequence of Event, optional
@@ -564,7 +564,7 @@ def make_record(
     return record
 
 
-def _end(record: Record, prepared: Prepared, pushed: Sequence[int] | None, begun: float, *, within: bool) -> Record:
+def _end(record: Record, prepared: Prepared, pushed: Sequence[int], begun: float, *, within: bool) -> Record:
     """Return all integrals at the end of the summarised interval, as a record of one sample.
 
     For a whole run, whose tallies count up to its present time, the end may be later than the last sample. If samples
@@ -582,9 +582,9 @@ def _end(record: Record, prepared: Prepared, pushed: Sequence[int] | None, begun
     return end
 
 
-def _add_energies(record: Record, prepared: Prepared, pushed: Sequence[int] | None) -> None:
+def _add_energies(record: Record, prepared: Prepared, pushed: Sequence[int]) -> None:
     """Add integrals of powers, and energies of impacts and of the scheme."""
-    run, robot = prepared.run, prepared.model.robot
+    run = prepared.run
     for integral, (name, text) in zip(_by_column(run.states("ledger")), INTEGRALS.items(), strict=True):
         record.add(name, integral, "J", description=text)
     if prepared.system.unilateral is not None:
@@ -595,8 +595,8 @@ def _add_energies(record: Record, prepared: Prepared, pushed: Sequence[int] | No
     if run.states("elastic").size:
         for integral, (name, text) in zip(_by_column(run.states("elastic")), ELASTIC.items(), strict=True):
             record.add(name, integral, "J", description=text)
-    others = 0 if pushed is None else len(robot.bodies)
-    shown = [*range(len(prepared.loads) - others), *(pushed or ())]
+    # Wrenches of the caller have no coefficients.
+    shown = [k for k, load in enumerate(prepared.loads) if len(load.coefficients) or k in pushed]
     if shown:
         labels = tuple(prepared.loads[k].name for k in shown)
         record.add("work_loads", run.states("load")[:, shown], "J", labels=labels, description="∫ W·V dt of each load")

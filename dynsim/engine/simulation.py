@@ -12,6 +12,7 @@ import logging
 import math
 import time as clock
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from copy import copy
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -20,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dynsim.compile.clearance import by_surface, sinking
-from dynsim.compile.control import END_SLACK, JointControl
+from dynsim.compile.control import END_SLACK
 from dynsim.compile.model import Model
 from dynsim.compile.posture import holding_torques, load_forces, static_margin
 from dynsim.compile.references.teleop import VelocitySource
@@ -41,14 +42,14 @@ from dynsim.engine.brakes import Brakes, projection_loss
 from dynsim.engine.linearization import Linearization, linearized
 from dynsim.engine.link_sensors import AppliedWrench
 from dynsim.engine.operator import EncodedCommands, Operator
-from dynsim.engine.outcome import interrupted, mark_stopped, raise_stopped
+from dynsim.engine.outcome import interrupted, mark_stopped, raise_stopped, run_to_end
 from dynsim.engine.prepare import Prepared, at_start, prepare, sample_times
 from dynsim.engine.recording import make_record
 from dynsim.engine.soundness import unstable_loop
 from dynsim.engine.stepped import GUARDS, Snapshot, State, Touch, event_name, own_guards, take_log
 from dynsim.engine.stopping import last_state, stopped
 from dynsim.engine.trace import Trace
-from dynsim.errors import ModelError, ScenarioError, SimulationStopped, brief, first_few
+from dynsim.errors import ModelError, ScenarioError, SimulationInterrupted, SimulationStopped, brief, first_few
 from dynsim.integrators import driver
 from dynsim.integrators import run as ki
 from dynsim.integrators.run import state_within
@@ -71,8 +72,6 @@ log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 
-# Maximum number of steps in one call of compiled code, which can return earlier, see dynsim.engine.stopping.
-_PIECE = 1 << 62
 # Limits on caller ticks: their number (kinds are bits of an integer), and their period [s].
 MOST_TICKS, SHORTEST_PERIOD = 60, 1e-9
 # Ticks within this of the requested time count as at that time, relative to it.
@@ -84,6 +83,10 @@ FASTEST_LANDING = 5.0
 SERVO_MODES = {"position": ka.POSITION_MODE, "velocity": ka.VELOCITY_MODE, "off": ka.OFF}
 # Buffers that kernels write samples to, and tables of callbacks: their sizes change.
 _BUFFERS = {f"run.{field}": field for field in ("sample_time", "sample", "output")}
+# Attributes in a snapshot, copied.
+_SAVED = (
+    "_time", "_happened", "_pushed", "_past_pushes", "_base_as_planned", "_frozen", "_due", "_samples_end", "_window",
+)  # fmt: skip
 _TABLES = {f"run.{field}": field for field in ("tick", "tick_table", "event", "event_table")}
 
 
@@ -137,6 +140,9 @@ class Simulation:
     ((201, 10), False)
     """
 
+    # Whether the records of exceptions have scenes.
+    _pictured = True
+
     def __init__(
         self,
         scenario: Scenario,
@@ -162,16 +168,7 @@ class Simulation:
             raise ScenarioError(f"duration must be later than the start at t = {start:g} s, got {end:g} s")
         self._scenario = scenario
         self._end = min(end, _FAR)
-        # A separate memo: other runs must not share tables that the caller may change.
-        with remembering(Memo()):
-            self._prepared = prepare(
-                scenario,
-                pushable=True,
-                times=np.full(1, np.inf),
-                end=self._end,
-                motors=motors,
-                starts=state is None,
-            )
+        self._prepared = self._prepare(end=self._end, motors=motors, starts=state is None)
         if (unstable := unstable_loop(scenario, self._prepared)) is not None:
             # Live sessions may never make a record, whose summary contains this warning.
             log.warning("%s: %s", scenario.title, unstable[0])
@@ -232,6 +229,12 @@ class Simulation:
             raise ScenarioError("operator requires a scenario with controller.operator")
         self._tick_handlers = [handler for handler in (encoded, self._operator) if handler is not None]
         self._own_calls = tuple(self._calls)
+
+    def _prepare(self, **options: Any) -> Prepared:
+        """Compile the scenario to kernel arrays, see :func:`dynsim.engine.prepare.prepare`."""
+        # A separate memo: other runs must not share tables that the caller may change.
+        with remembering(Memo()):
+            return prepare(self._scenario, pushable=True, times=np.full(1, np.inf), **options)
 
     def _tick_handler(self, source: Any, state: State | None) -> Operator | SnakePilot | None:
         """Return the handler that rewrites references at its ticks, or None without an operator or snake controller."""
@@ -409,7 +412,7 @@ class Simulation:
         except SimulationStopped as stop:
             if stop.record is None:  # raised by a controller, e.g. if the task of a snake has failed
                 self._ended_by = stop
-                raise_stopped(stop, self.record())
+                raise_stopped(stop, self.record(pictured=self._pictured))
             raise
 
     def _advanced(self, until: float) -> State:
@@ -1095,12 +1098,9 @@ class Simulation:
         """Return the snapshot; one taken within an operator's tick may only be restored immediately."""
         arrays = {name: array.copy() for name, array in self._arrays().items()}
         tick_handlers = [handler.saved_state() for handler in self._tick_handlers]
-        trace, happened, pushed = self._trace.snapshot(), tuple(self._happened), frozenset(self._pushed)
-        shown = (pushed, tuple(self._past_pushes), self._base_as_planned, self._prepared.behind_brakes)
-        due, window = tuple(self._due), (self._samples_end, self._window)
-        return Snapshot(
-            self._token, arrays, self._time, trace, happened, *shown, self._frozen, tick_handlers, due, window
-        )
+        attributes = {name: copy(getattr(self, name)) for name in _SAVED}
+        behind_brakes = self._prepared.behind_brakes
+        return Snapshot(self._token, arrays, self._trace.snapshot(), behind_brakes, tick_handlers, attributes)
 
     def restore(self, snapshot: Snapshot) -> None:
         """Restore a snapshot of this simulation; it then continues bit-identically.
@@ -1143,14 +1143,11 @@ class Simulation:
         for name, array in self._arrays().items():
             array[...] = snapshot.arrays[name]
         self._trace.restore(snapshot.trace)
-        self._time, self._frozen, self._happened = snapshot.time, snapshot.frozen, list(snapshot.happened)
-        self._pushed, self._base_as_planned = set(snapshot.pushed), snapshot.base_as_planned
-        self._past_pushes = list(snapshot.pushes)
+        for name, value in snapshot.attributes.items():
+            setattr(self, name, copy(value))
         self._prepared = replace(self._prepared, behind_brakes=snapshot.behind_brakes)
         for handler, kept in zip(self._tick_handlers, snapshot.tick_handlers, strict=True):
             handler.restore(kept)
-        self._due = list(snapshot.due)
-        self._samples_end, self._window = snapshot.window
 
     def record(self, scenario: Scenario | None = None, *, pictured: bool = True) -> Record:
         """Return the record of the trace so far, with a summary of the run up to now.
@@ -1197,10 +1194,10 @@ class Simulation:
             finally:
                 self._restore_arrays(before)
         record.complete = self.finished
-        if self._failed():
-            mark_stopped(stopped(self._scenario, self._prepared), record)
-        elif self._ended_by is not None:
+        if self._ended_by is not None:
             mark_stopped(self._ended_by, record)
+        elif self._failed():
+            mark_stopped(stopped(self._scenario, self._prepared), record)
         return record
 
     def _end_here(self) -> None:
@@ -1354,21 +1351,27 @@ class Simulation:
             self._refill(run.clock[ki.TIME] + run.clock[ki.STEP])
             run = self._prepared.run
         run.clock[ki.HOLD] = min(until, self._hold_time(until))
-        begun = clock.perf_counter()
-        raised = self._run_piece(_PIECE, interruption.check)
-        self._wall += clock.perf_counter() - begun
+        raised = self._run_piece(self._look)
         self._collect_due(raised)
         self._call_due()
         if raised is not None:
             self._time = max(self._time, float(self._prepared.run.clock[ki.TIME]))
             raise raised
 
-    def _run_piece(self, limit: int, look: Callable[[], None]) -> BaseException | None:
+    def _look(self) -> None:
+        """Check for signals while compiled code runs."""
+        interruption.check()
+
+    def _run_piece(self, look: Callable[[], None]) -> BaseException | None:
         """Run one piece of compiled code and return the exception raised meanwhile by ``look`` or by a signal."""
         if not self._loaded:
-            stopping.load(self._prepared)
+            prepared = self._prepared
+            size = prepared.model.n, len(prepared.contacts), len(prepared.stops)
+            recall("kernels", partial(stopping.load, prepared), prepared.choice.method, *size)
             self._loaded = True
-        self._prepared, raised = stopping.advance(self._prepared, limit, self._watch, look, self._kernel)
+        begun = clock.perf_counter()
+        self._prepared, raised = stopping.advance(self._prepared, self._watch, look, self._kernel)
+        self._wall += clock.perf_counter() - begun
         return raised
 
     def _collect_due(self, raised: BaseException | None) -> None:
@@ -1403,7 +1406,7 @@ class Simulation:
                 self._calling = None
 
     def _raise_stopped(self) -> None:
-        raise_stopped(stopped(self._scenario, self._prepared), self.record())
+        raise_stopped(stopped(self._scenario, self._prepared), self.record(pictured=self._pictured))
 
     def _failed(self) -> bool:
         """Return whether the run has ended before its regular end."""
@@ -1450,7 +1453,7 @@ class Simulation:
                 run = self._prepared.run
             run.clock[ki.HOLD], run.clock[ki.END] = self._hold_time(until), until
             # The end here is only part of an operation: pending signals keep waiting.
-            raised = self._run_piece(_PIECE, lambda: None)
+            raised = self._run_piece(lambda: None)
             # Callbacks and their snapshots must not see this end.
             run = self._prepared.run
             run.clock[ki.END] = self._end
@@ -1564,11 +1567,12 @@ def check(scenario: Scenario, started: Callable[[Start], None]) -> Start:
     return start
 
 
-def commanded_by_python(scenario: Scenario, control: JointControl) -> bool:
+def commanded_by_python(scenario: Scenario) -> bool:
     """Return whether Python code sets commands at ticks: an operator, a snake's controller, or encoders."""
-    sensors = scenario.config.sensors
+    controller, sensors = scenario.controller, scenario.config.sensors
+    operated = controller is not None and getattr(controller, "operator", None) is not None
     encoded = sensors is not None and sensors.encoders is not None
-    return encoded or control.teleop is not None or control.task_space is not None
+    return operated or encoded or (controller is not None and controller.type == "task_space")
 
 
 def _begin(scenario: Scenario, prepared: Prepared) -> None:
@@ -1581,7 +1585,7 @@ def _begin(scenario: Scenario, prepared: Prepared) -> None:
     SimulationStopped
         If forces do not exist or cannot last.
     """
-    if not prepared.contacts or commanded_by_python(scenario, prepared.control):
+    if not prepared.contacts or commanded_by_python(scenario):
         return
     stopping.load(prepared)
     work = partial(driver.advance, prepared.system, prepared.workspace, prepared.run, 0)
@@ -1662,90 +1666,61 @@ def _margins(scenario: Scenario, model: Model, contacts: Sequence[Contact]) -> t
 # Complete runs: integrate the coupled system and make the record.
 
 
-# More steps than any run needs.
-_ALL = 1 << 62
 # Ticks between checks for Ctrl-C and progress updates.
 TICKS = 10
 
 
-def simulate(scenario: Scenario, progress: Progress | None = None, *, pictured: bool = True) -> Record:
-    """Simulate the scenario, see :func:`dynsim.engine.simulate`."""
-    if scenario.controller is not None and scenario.controller.type == "task_space":
-        # Do not prepare twice: preparation raises the head of a snake.
-        return _stepped(scenario, progress, pictured)
-    prepared = prepare(scenario, progress)
-    if commanded_by_python(scenario, prepared.control):
-        return _stepped(scenario, progress, pictured)
-    size = prepared.model.n, len(prepared.contacts), len(prepared.stops)
-    # Load or compile the kernels here, so that it does not count as integration time.
-    recall("kernels", partial(stopping.load, prepared), prepared.choice.method, *size)
-    if (unstable := unstable_loop(scenario, prepared)) is not None:
-        log.warning("%s: %s", scenario.title, unstable[0])
-    watch, run = stopping.WallWatch(scenario.integrator.wall_limit_s), prepared.run
+class _WholeRun(Simulation):
+    """Run of a scenario to its end that nobody but its own controllers changes, and that reports its progress."""
 
-    def look() -> None:
-        if progress is not None:
-            progress(float(run.clock[ki.TIME]), SIMULATION)
+    def __init__(self, scenario: Scenario, progress: Progress | None, pictured: bool) -> None:
+        self._progress, self._pictured, self._ticked = progress, pictured, commanded_by_python(scenario)
+        # With ticks it has no end, as in a session: a step that ends at a tick and one at the end of a run may differ.
+        super().__init__(scenario, duration=math.inf if self._ticked else None)
+        if self._ticked:
+            self.end_samples(scenario.duration_s)
+
+    def _prepare(self, **options: Any) -> Prepared:
+        # Ticks change tables, which other runs must not share.
+        with remembering(Memo() if self._ticked else None):
+            return prepare(self._scenario, self._progress, pushable=self._ticked, **options)
+
+    def _look(self) -> None:
+        if self._progress is not None:
+            self._progress(float(self._prepared.run.clock[ki.TIME]), SIMULATION)
         interruption.check()
 
-    own = own_guards(prepared)
-    happened: list[Event] = []
-    stop: SimulationStopped | None = None
-    started = clock.perf_counter()
-    try:
-        look()
-        log.info("%s: integrating %g s by %s", scenario.title, scenario.duration_s, prepared.choice.method)
-        while run.count[ki.STATUS] == ki.RUNNING:
-            prepared, raised = stopping.advance(prepared, _ALL, watch, look)
-            run = prepared.run
-            happened += [Event(time, *(event_name(prepared, e) or own[e])) for time, e in take_log(run)]
-            if raised is not None:
-                raise raised
-            look()
-        interruption.keep()
-    except KeyboardInterrupt:
-        interruption.keep()
-        interruption.answered()
-        stop = interrupted(scenario, float(run.clock[ki.TIME]), last_state(prepared, run.y))
-    wall = clock.perf_counter() - started
-    log.info("%s: integrated %g s in %d steps, %.3f s", scenario.title, run.clock[ki.TIME], run.count[ki.STEPS], wall)
-    record = make_record(scenario, prepared, wall, happened=happened, pictured=pictured)
-    if stop is None and run.count[ki.STATUS] != ki.FINISHED:
-        stop = stopped(scenario, prepared)
-    if stop is not None:
-        raise_stopped(stop, record)
-    return record
-
-
-def _stepped(scenario: Scenario, progress: Progress | None, pictured: bool) -> Record:
-    """Simulate with ticks of an operator, a snake's script or encoders, bit-identical to the public stepper."""
-
-    # No end, as in a session: a step that ends at a tick and one at the end of a run may differ.
-    simulation = Simulation(scenario, duration=math.inf)
-    simulation.end_samples(scenario.duration_s)
-    prepared, operator, k = simulation._prepared, simulation.operator, 0
-    # The stepper has separate sample times; this call refuses a record that is too large.
-    sample_times(scenario, prepared.run.layout, prepared.run.columns, len(prepared.model.robot.links))
-    rate = operator.rate if operator is not None else 1.0 / (prepared.control.sample_time or 1.0)
-    stop: SimulationStopped | None = None
-    try:
-        while simulation.time < scenario.duration_s:
-            k += TICKS
+    def work(self) -> None:
+        """Integrate to the end."""
+        end, method, ticks, period = self._scenario.duration_s, self._prepared.choice.method, 0, math.inf
+        if self._ticked:
+            period = self._prepared.control.sample_time or 1.0 if self._operator is None else self._operator.period
+        self._look()
+        log.info("%s: integrating %g s by %s", self._scenario.title, end, method)
+        while self._time < end and not self.finished:
+            ticks += TICKS
             # A signal within a callback would leave references half written.
             interruption.keep()
-            simulation.advance(min(k / rate, scenario.duration_s))
-            if progress is not None:
-                progress(simulation.time, SIMULATION)
+            self.advance(min(ticks * period, end))
             interruption.heed()
-            interruption.check()
-    except SimulationStopped as ended:
-        stop = ended
-    except KeyboardInterrupt:
-        interruption.answered()
-        stop = interrupted(scenario, simulation.time, {})
-    interruption.keep()
-    record = simulation.record(scenario, pictured=pictured)
-    if stop is not None:
-        raise_stopped(stop, record)
+            self._look()
+
+    def interrupt(self) -> SimulationInterrupted:
+        """Return the exception for Ctrl-C."""
+        self._ended_by = interrupted(self._scenario, self._time, last_state(self._prepared, self._prepared.run.y))
+        return self._ended_by
+
+    def result(self) -> Record:
+        """Return the record up to now."""
+        run = self._prepared.run
+        steps, wall = run.count[ki.STEPS], self._wall
+        log.info("%s: integrated %g s in %d steps, %.3f s", self._scenario.title, run.clock[ki.TIME], steps, wall)
+        return self.record(pictured=self._pictured)
+
+
+def simulate(scenario: Scenario, progress: Progress | None = None, *, pictured: bool = True) -> Record:
+    """Simulate the scenario, see :func:`dynsim.engine.simulate`."""
+    run = _WholeRun(scenario, progress, pictured)
+    record = run_to_end(run.work, run.interrupt, run.result)
     record.complete = True
     return record

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dynsim.engine.link_sensors import AppliedWrench
 from dynsim.engine.prepare import Prepared
 from dynsim.engine.trace import TraceState
 from dynsim.integrators import events
 from dynsim.integrators import run as ki
 from dynsim.integrators.contacts import events as contact_events
-from dynsim.record import Event, Record
+from dynsim.record import Record
 from dynsim.record.measures import TIP_OVER
 
 Array = NDArray[np.float64]
@@ -172,14 +171,7 @@ class Snapshot:
 
     owner: object
     arrays: dict[str, NDArray[Any]]
-    time: float
     trace: TraceState
-    happened: tuple[Event, ...]
-    pushed: frozenset[int]
-    pushes: tuple[AppliedWrench, ...]
-    base_as_planned: bool
     behind_brakes: Mapping[str, float]
-    frozen: bool
     tick_handlers: list[dict[str, Any]]
-    due: tuple[Callable[[Any], None], ...]
-    window: tuple[float, tuple[Snapshot, float] | None]
+    attributes: dict[str, Any]

@@ -21,7 +21,7 @@ from dynsim.dynamics.derivative import derivative
 from dynsim.dynamics.state import block
 from dynsim.engine.compilation import kernels_logged
 from dynsim.engine.force_indeterminacy import contact_point, paradox
-from dynsim.engine.prepare import Prepared, right_hand_side
+from dynsim.engine.prepare import EVERY_STEP, Prepared, right_hand_side
 from dynsim.engine.soundness import unstable_stop
 from dynsim.errors import SimulationStopped
 from dynsim.integrators import driver
@@ -189,13 +189,9 @@ def _short_steps(prepared: Prepared) -> int:
 
 
 def advance(
-    prepared: Prepared,
-    limit: int,
-    watch: WallWatch,
-    look: Callable[[], None],
-    kernel: Callable[..., None] | None = None,
+    prepared: Prepared, watch: WallWatch, look: Callable[[], None], kernel: Callable[..., None]
 ) -> tuple[Prepared, BaseException | None]:
-    """Run one piece of up to ``limit`` steps, see :func:`dynsim.integrators.driver.advance`.
+    """Run one piece, see :func:`dynsim.integrators.driver.advance`.
 
     In addition to the status values of the kernels, STATUS may be OUT_OF_TIME or STUCK.
 
@@ -203,14 +199,12 @@ def advance(
     ----------
     prepared : Prepared
         Prepared run.
-    limit : int
-        Maximum number of steps.
     watch : WallWatch
         Watch of the run.
     look : callable
         Called regularly; may raise.
-    kernel : callable, optional
-        Stepping function of :func:`dynsim.integrators.driver.direct`; default: ``driver.advance``.
+    kernel : callable
+        Stepping function of :func:`dynsim.integrators.driver.direct`.
 
     Returns
     -------
@@ -219,7 +213,7 @@ def advance(
     raised : BaseException or None
         Exception raised by ``look`` or by a signal.
     """
-    run, few, kernel = prepared.run, min(_short_steps(prepared), limit), kernel or driver.advance
+    run, few = prepared.run, _short_steps(prepared)
     ended, raised = True, None
 
     def ask() -> None:
@@ -236,8 +230,8 @@ def advance(
         # Not if the caller has to act first. (A pending step at the start is to be accepted.)
         count = run.count
         due = count[ki.STATUS] == ki.RUNNING and count[ki.PENDING] == count[ki.TICKED] == count[ki.LOGGED] == 0
-    if due and limit > few:
-        remainder = partial(kernel, prepared.system, prepared.workspace, run, limit - few)
+    if due:
+        remainder = partial(kernel, prepared.system, prepared.workspace, run, EVERY_STEP)
         ended, raised = run_in_thread(remainder, ask, both)
     watch.spend()
     if not ended:

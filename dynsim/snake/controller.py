@@ -23,6 +23,7 @@ from dynsim.snake.kinematics import (
     pose_of_point,
     walk_chain,
     wrap_angle,
+    zero_arrays,
 )
 from dynsim.snake.support import Cost, Support, cost_gradient, new_support
 
@@ -79,26 +80,16 @@ def new_work(model: SnakeModel) -> ControlWork:
     """Allocate the workspace of :func:`control_input`."""
     joints = model.head_joints + model.base_joints
     rows, inputs = model.base_joints + 4 + model.wheels, joints + model.wheels
-    return ControlWork(
-        frame=np.zeros((3, 3)),
+    sizes = {"frame": (3, 3), "A": (rows, 6), "B": (rows, inputs), "error": 6, "withheld": 1}
+    sizes |= dict.fromkeys(("lower", "reflector"), (inputs, inputs))
+    sizes |= dict.fromkeys(("row", "beta", "rhs", "solution", "singular", "gradient", "null_part", "u"), inputs)
+    return zero_arrays(
+        ControlWork,
+        sizes,
         chain=new_chain(model),
         support=new_support(model),
-        A=np.zeros((rows, 6)),
-        B=np.zeros((rows, inputs)),
         rows=np.zeros(rows, dtype=np.int64),
-        row=np.zeros(inputs),
         ones=np.ones(inputs),
-        lower=np.zeros((inputs, inputs)),
-        reflector=np.zeros((inputs, inputs)),
-        beta=np.zeros(inputs),
-        rhs=np.zeros(inputs),
-        solution=np.zeros(inputs),
-        singular=np.zeros(inputs),
-        error=np.zeros(6),
-        gradient=np.zeros(inputs),
-        null_part=np.zeros(inputs),
-        u=np.zeros(inputs),
-        withheld=np.zeros(1),
         at_limit=np.zeros(joints, dtype=np.int64),
     )
 

@@ -54,20 +54,18 @@ class Chain(NamedTuple):
     link_centre: np.ndarray  # (n_h + 2 n_b, 3)
 
 
+def zero_arrays(kind, sizes, **others):
+    """Return a named tuple of zero arrays with these sizes by field; ``others`` are its other fields."""
+    return kind(**{name: np.zeros(size) for name, size in sizes.items()}, **others)
+
+
 def new_chain(model: SnakeModel) -> Chain:
     """Allocate the workspace of :func:`walk_chain`."""
     joints, pairs = model.head_joints + model.base_joints, model.base_joints + 1
-    links = model.head_joints + 2 * model.base_joints
-    return Chain(
-        np.zeros((3, 3)),
-        np.zeros((joints, 3)),
-        np.zeros((joints, 3)),
-        np.zeros((pairs, 3)),
-        np.zeros((pairs, 3)),
-        np.zeros((pairs, 3)),
-        np.zeros((pairs, 3)),
-        np.zeros((links, 3)),
-    )
+    rows = {"rate_axis": 3, "link_centre": model.head_joints + 2 * model.base_joints}
+    rows |= dict.fromkeys(("joint_position", "joint_axis"), joints)
+    rows |= dict.fromkeys(("pair_position", "pair_x", "pair_y", "pair_z"), pairs)
+    return zero_arrays(Chain, {name: (count, 3) for name, count in rows.items()})
 
 
 @internal_kernel

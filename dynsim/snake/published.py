@@ -12,8 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dynsim.record import Record
-from dynsim.snake.description import COORDINATES, SnakeDescription
-from dynsim.snake.kinematics import pose_of_point
+from dynsim.snake.description import COORDINATES
 from dynsim.snake.lifting import snake_geometry
 
 Table = list[list[str]]  # the first row has the headings
@@ -152,44 +151,6 @@ PUSHES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, -1.0)}
 PLATE = "plate"
 # Depth of the target in the plate at which f_z is evaluated [m]; the paper does not specify it.
 DEPTH_Z = 0.07
-# Target of the last pitch joint of the head part, [T] IV.C.3 [rad].
-LAST_PITCH = np.deg2rad(110.0)
-# Number of starts of the search for a posture; 20 starts find all solutions that 300 starts find.
-STARTS = 60
-
-
-def push_posture(d: SnakeDescription, push: Push) -> np.ndarray | None:
-    """Return the joint angles of a push-test posture, shape (n_phi,) [rad], or None without a solution.
-
-    The paper specifies only z_h, y_h and the shape of the base part. The head is level and points along x, psi3 is at
-    its target, and the two joints in the middle of the base part share the bend (assumed). The other five head joints
-    determine five coordinates. Among several solutions within the limits, the solution with the smallest angles is
-    used.
-    """
-    from scipy.optimize import least_squares  # imported here because it takes long to load
-
-    model, base = d.arrays(), np.zeros(d.base_joints)
-    if push.l_shape:
-        base[[2, 3]] = np.pi / 4.0
-    wanted = np.array([push.beside, push.height, 0.0, 0.0, 0.0])
-
-    def posture(angles: np.ndarray) -> np.ndarray:
-        return np.concatenate([angles, [LAST_PITCH], base])
-
-    def off(angles: np.ndarray) -> np.ndarray:
-        w = np.zeros(6)
-        pose_of_point(model, np.zeros(3), posture(angles), np.zeros((3, 3)), w)
-        return w[1:] - wanted
-
-    random, best = np.random.default_rng(0), None
-    lower, upper = d.lower[:5], d.upper[:5]
-    for _ in range(STARTS):
-        solution = least_squares(
-            off, random.uniform(lower, upper), bounds=(lower, upper), xtol=1e-14, ftol=1e-14, gtol=1e-14
-        )
-        if np.abs(solution.fun).max() < 1e-9 and (best is None or solution.x @ solution.x < best @ best - 1e-9):
-            best = solution.x
-    return None if best is None else posture(best)
 
 
 class Pushed(NamedTuple):
@@ -347,12 +308,9 @@ def _same_wheels(record: Record) -> str:
 
 
 def _cost(record: Record) -> str:
-    return f"{record['cost'][0]:.2f} -> {record['cost'][-1]:.2f}; largest increase per sample {_rise(record):.1e}"
-
-
-def _rise(record: Record) -> float:
-    """Return the largest increase of V per sample within a mode; negative if V always decreases."""
-    return float(np.diff(record["cost"])[np.diff(record["mode"]) == 0].max())
+    # Negative if V always decreases within a mode.
+    rise = np.diff(record["cost"])[np.diff(record["mode"]) == 0].max()
+    return f"{record['cost'][0]:.2f} -> {record['cost'][-1]:.2f}; largest increase per sample {rise:.1e}"
 
 
 def _error(name: str, scale: float) -> Callable[[Record], str]:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dynsim.jit.kernel import internal_kernel, kernel
-from dynsim.snake.kinematics import SnakeModel
+from dynsim.snake.kinematics import SnakeModel, zero_arrays
 
 COST_ANGLES = 0  # eq 19
 COST_SUPPORT_NORM = 1  # eq 20 as printed: 1 / norm of the distances to all sides
@@ -47,18 +47,10 @@ class Support(NamedTuple):
 def new_support(model: SnakeModel) -> Support:
     """Allocate the workspace of :func:`support_polygon`, :func:`cost_value` and :func:`cost_gradient`."""
     contacts, joints = 2 * (model.base_joints + 1), model.head_joints + model.base_joints
-    return Support(
-        np.zeros((contacts, 2)),
-        np.zeros(contacts, dtype=np.int64),
-        np.zeros(contacts, dtype=np.int64),
-        np.zeros(contacts + 1, dtype=np.int64),
-        np.zeros(contacts),
-        np.zeros(contacts),
-        np.zeros(3),
-        np.zeros((joints, 2)),
-        np.zeros(joints),
-        np.zeros(joints),
-    )
+    sizes = {"contact": (contacts, 2), "distance": contacts, "length": contacts, "centre": 3}
+    sizes |= {"centre_slope": (joints, 2), "slope": joints, "length_slope": joints}
+    owner, order, hull = (np.zeros(size, dtype=np.int64) for size in (contacts, contacts, contacts + 1))
+    return zero_arrays(Support, sizes, owner=owner, order=order, hull=hull)
 
 
 @internal_kernel

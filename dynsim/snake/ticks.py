@@ -10,7 +10,14 @@ import numpy as np
 from dynsim.jit.kernel import internal_kernel, kernel
 from dynsim.snake import controller
 from dynsim.snake.controller import ControlWork, control_input, estimate_from_joints, new_work, sigma_min
-from dynsim.snake.kinematics import SnakeModel, constraint_matrices, pose_of_point, walk_chain, wrap_angle
+from dynsim.snake.kinematics import (
+    SnakeModel,
+    constraint_matrices,
+    pose_of_point,
+    walk_chain,
+    wrap_angle,
+    zero_arrays,
+)
 from dynsim.snake.support import cost_value, polygon_area, support_polygon
 
 # Data of the tick loop: schedule, state of plant and controller, workspace, recorded rows.
@@ -100,57 +107,28 @@ class SnakeTrace(NamedTuple):
 def new_state(model: SnakeModel) -> SnakeState:
     """Return a zero state."""
     joints = model.head_joints + model.base_joints
-    return SnakeState(
-        base=np.zeros(3),
-        phi=np.zeros(joints),
-        rho=np.zeros(model.wheels),
-        w_target=np.zeros(6),
-        w_hat=np.zeros(6),
-        phi_hat=np.zeros(joints),
-        counts=np.zeros(COUNTS_SIZE, dtype=np.int64),
-        progress=np.zeros(2),
-    )
+    sizes = {"base": 3, "phi": joints, "rho": model.wheels, "w_target": 6, "w_hat": 6, "phi_hat": joints, "progress": 2}
+    return zero_arrays(SnakeState, sizes, counts=np.zeros(COUNTS_SIZE, dtype=np.int64))
 
 
 def new_tick_workspace(model: SnakeModel) -> TickWorkspace:
     """Allocate the workspace of :func:`run_ticks`."""
-    joints = model.head_joints + model.base_joints
-    return TickWorkspace(
-        work=new_work(model),
-        base_rate=np.zeros(3),
-        base_sum=np.zeros(3),
-        base_stage=np.zeros(3),
-        phi_stage=np.zeros(joints),
-        normal=np.zeros((3, 4)),
-        px=np.zeros(model.base_joints),
-        py=np.zeros(model.base_joints),
-        pose=np.zeros(6),
-        target=np.zeros(6),
-        rate=np.zeros(6),
-        origin=np.zeros(3),
-    )
+    sizes = {"phi_stage": model.head_joints + model.base_joints, "normal": (3, 4)}
+    sizes |= dict.fromkeys(("px", "py"), model.base_joints)
+    sizes |= dict.fromkeys(("base_rate", "base_sum", "base_stage", "origin"), 3)
+    sizes |= dict.fromkeys(("pose", "target", "rate"), 6)
+    return zero_arrays(TickWorkspace, sizes, work=new_work(model))
 
 
 def new_trace(model: SnakeModel, rows: int) -> SnakeTrace:
     """Allocate a recording of ``rows`` samples."""
-    joints = model.head_joints + model.base_joints
-    return SnakeTrace(
-        base=np.zeros((rows, 3)),
-        phi=np.zeros((rows, joints)),
-        rho=np.zeros((rows, model.wheels)),
-        u=np.zeros((rows, joints + model.wheels)),
-        w=np.zeros((rows, 6)),
-        w_target=np.zeros((rows, 6)),
-        w_hat=np.zeros((rows, 6)),
-        mode=np.zeros(rows, dtype=np.int64),
-        cost=np.zeros(rows),
-        sigma=np.zeros(rows),
-        margin=np.zeros(rows),
-        area=np.zeros(rows),
-        slip=np.zeros(rows),
-        at_limit=np.zeros((rows, joints), dtype=np.int64),
-        centre=np.zeros((rows, 3)),
-    )
+    joints, wheels = model.head_joints + model.base_joints, model.wheels
+    widths = {"base": 3, "phi": joints, "rho": wheels, "u": joints + wheels, "centre": 3}
+    widths |= dict.fromkeys(("w", "w_target", "w_hat"), 6)
+    sizes = {name: (rows, width) for name, width in widths.items()}
+    sizes |= dict.fromkeys(("cost", "sigma", "margin", "area", "slip"), rows)
+    mode, at_limit = np.zeros(rows, dtype=np.int64), np.zeros((rows, joints), dtype=np.int64)
+    return zero_arrays(SnakeTrace, sizes, mode=mode, at_limit=at_limit)
 
 
 # Kinematic plant of the snake: grounded wheels move the base; joints and wheels follow their commands.

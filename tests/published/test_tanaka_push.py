@@ -4,11 +4,14 @@ import csv
 
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
 
 from dynsim import load_scenario, simulate
 from dynsim.draw.figures.snake import draw_comparison
 from dynsim.scenario import build, shipped_scenarios, variant_names
-from dynsim.snake.published import PLATE, PUSHES, TABLE_IV, TABLE_V, push_posture, push_table, pushed
+from dynsim.snake.description import SnakeDescription
+from dynsim.snake.kinematics import pose_of_point
+from dynsim.snake.published import PLATE, PUSHES, TABLE_IV, TABLE_V, Push, push_table, pushed
 
 SCENARIO = "snake_push"
 POSTURES = TABLE_V | TABLE_IV
@@ -16,6 +19,42 @@ POSTURES = TABLE_V | TABLE_IV
 MISSING = ("viii", "x")
 THERE = tuple(posture for posture in POSTURES if posture not in MISSING)
 STRAIGHT = tuple(posture for posture in THERE if not POSTURES[posture].l_shape)
+# Target of the last pitch joint of the head part, [T] IV.C.3 [rad].
+LAST_PITCH = np.deg2rad(110.0)
+# Number of starts of the search for a posture; 20 starts find all solutions that 300 starts find.
+STARTS = 60
+
+
+def push_posture(d: SnakeDescription, push: Push) -> np.ndarray | None:
+    """Return the joint angles of a push-test posture, shape (n_phi,) [rad], or None without a solution.
+
+    The paper specifies only z_h, y_h and the shape of the base part. The head is level and points along x, psi3 is at
+    its target, and the two joints in the middle of the base part share the bend (assumed). The other five head joints
+    determine five coordinates. Among several solutions within the limits, the solution with the smallest angles is
+    used.
+    """
+    model, base = d.arrays(), np.zeros(d.base_joints)
+    if push.l_shape:
+        base[[2, 3]] = np.pi / 4.0
+    wanted = np.array([push.beside, push.height, 0.0, 0.0, 0.0])
+
+    def posture(angles: np.ndarray) -> np.ndarray:
+        return np.concatenate([angles, [LAST_PITCH], base])
+
+    def off(angles: np.ndarray) -> np.ndarray:
+        w = np.zeros(6)
+        pose_of_point(model, np.zeros(3), posture(angles), np.zeros((3, 3)), w)
+        return w[1:] - wanted
+
+    random, best = np.random.default_rng(0), None
+    lower, upper = d.lower[:5], d.upper[:5]
+    for _ in range(STARTS):
+        solution = least_squares(
+            off, random.uniform(lower, upper), bounds=(lower, upper), xtol=1e-14, ftol=1e-14, gtol=1e-14
+        )
+        if np.abs(solution.fun).max() < 1e-9 and (best is None or solution.x @ solution.x < best @ best - 1e-9):
+            best = solution.x
+    return None if best is None else posture(best)
 
 
 def test_variants_are_the_postures_that_exist_in_three_directions():
