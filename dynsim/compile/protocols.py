@@ -10,16 +10,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Protocol
 
-from dynsim.compile.control import BasePath, HandPath, JointControl
 from dynsim.compile.model import Model
 from dynsim.config.base import StrictConfig
 from dynsim.errors import ModelError
-from dynsim.model.description import Contact, Robot
-from dynsim.model.drives import Drive
-from dynsim.model.surfaces import Box, HeightField, Quadric
+from dynsim.model.description import Contact
 
 if TYPE_CHECKING:
-    from dynsim.snake.description import SnakeDescription, TaskSpaceController
+    from dynsim.snake.description import SnakeDescription
 
 
 @dataclass(frozen=True)
@@ -89,45 +86,3 @@ class Member(Protocol):
         ModelError
             If the object cannot be built.
         """
-
-
-class PlantModule(Member, Protocol):
-    """A machine; ``ENGINE`` is the engine that simulates it, "dynamics" (a Robot) or "kinematic" (a snake)."""
-
-    @property
-    def ENGINE(self) -> str: ...
-
-    def build(self, config: Any, context: BuildContext) -> Robot | SnakeDescription: ...
-
-
-class ControllerModule(Member, Protocol):
-    """A controller for plants of ``ENGINE``, built for ``context.model`` or ``context.snake``."""
-
-    @property
-    def ENGINE(self) -> str: ...
-
-    def build(self, config: Any, context: BuildContext) -> JointControl | TaskSpaceController: ...
-
-
-class PathModule(Member, Protocol):
-    """A path of the hand."""
-
-    def build(self, config: Any, context: BuildContext) -> HandPath: ...
-
-
-class BasePathModule(Member, Protocol):
-    """A path of a mobile base, built for ``context.model`` with a base."""
-
-    def build(self, config: Any, context: BuildContext) -> BasePath: ...
-
-
-class SurfaceModule(Member, Protocol):
-    """A surface that can be touched."""
-
-    def build(self, config: Any, context: BuildContext) -> Quadric | Box | HeightField: ...
-
-
-class MotorModule(Member, Protocol):
-    """A motor, built for ``context.joint``."""
-
-    def build(self, config: Any, context: BuildContext) -> Drive: ...

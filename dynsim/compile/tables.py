@@ -585,12 +585,14 @@ def _joint_kind(link: Link) -> int:
     return link.row.code
 
 
-# Quantities of each kind of motor that must be positive, and that must not be negative.
+# Quantities of each kind of motor that must be positive, with their units, and that must not be negative.
 _POSITIVE: dict[type, dict[str, str]] = {
-    Motor: {"torque_constant": "N m/A", "resistance": "ohm", "gear_ratio": "1"},
-    Servo: {"torque_constant": "N m/A", "resistance": "ohm", "coulomb_speed": "rad/s", "current_limit": "A"},
-    TorqueSource: {},
-}
+    Motor: {"torque_constant": "N m/A", "resistance": "ohm", "gear_ratio": "1", "voltage_limit": "V",
+            "current_limit": "A"},
+    Servo: {"torque_constant": "N m/A", "resistance": "ohm", "coulomb_speed": "rad/s", "current_limit": "A",
+            "voltage_limit": "V", "torque_limit": "N m"},
+    TorqueSource: {"torque_limit": "N m"},
+}  # fmt: skip
 _NOT_NEGATIVE: dict[type, tuple[str, ...]] = {
     Motor: ("rotor_inertia", "gear_damping", "dry_friction"),
     Servo: ("k_p", "k_d", "k_v", "armature", "reflected_damping", "coulomb_friction", "free_drag"),
@@ -613,12 +615,6 @@ def _check_motor(motor: Drive, joints: dict[str, Link]) -> None:
     for quantity in _NOT_NEGATIVE[type(motor)]:
         if not getattr(motor, quantity) >= 0.0:
             raise ModelError(f"motor of {motor.joint}: {quantity} {getattr(motor, quantity)} must be zero or positive")
-    if not isinstance(motor, TorqueSource) and not motor.voltage_limit > 0.0:
-        raise ModelError(f"motor of {motor.joint}: voltage limit {motor.voltage_limit} V must be positive")
-    if isinstance(motor, Motor) and not motor.current_limit > 0.0:
-        raise ModelError(f"motor of {motor.joint}: current limit {motor.current_limit} A must be positive")
-    if not isinstance(motor, Motor) and not motor.torque_limit > 0.0:
-        raise ModelError(f"motor of {motor.joint}: torque limit {motor.torque_limit} N m must be positive")
     if isinstance(motor, Servo) and joints[motor.joint].units[0] != "rad":
         raise ModelError(f"motor of {motor.joint}: a servo requires a revolute joint (here {joints[motor.joint].kind})")
 

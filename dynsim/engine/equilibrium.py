@@ -159,13 +159,10 @@ def balanced(
         elif k_p > 0.0 and abs(rate[a]) > AT_REST:
             jumps.append(f"the reference of {motor.joint} starts with {rate[a]:.3g} {unit[1]}")
     resistance = np.array([getattr(motor, "resistance", 0.0) for motor in motors])
-    said: tuple[str, ...] = (
-        ("initial.equilibrium: " + "; ".join(jumps) + ": the motion still jumps at the start; use a path that "
-         "starts at rest at the hand",)
-        if jumps
-        else ()
-    )  # fmt: skip
-    said += _moved(model, requested)
+    said = _moved(model, requested)
+    if jumps:
+        fix = "use a path that starts at rest at the hand"
+        said = (f"initial.equilibrium: {'; '.join(jumps)}: the motion still jumps at the start; {fix}", *said)
     return Balance(current, shift, float(resistance @ current**2), forces, said, on_edge)
 
 

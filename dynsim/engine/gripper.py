@@ -7,7 +7,7 @@ force, and stiffness added by hardening starts undeflected.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from dynsim.compile.model import Model
 from dynsim.engine.operator import Referenced
+from dynsim.engine.saved_state import Stateful
 from dynsim.engine.stepped import State
 from dynsim.errors import SimulationStopped
 from dynsim.model.description import Array
@@ -36,7 +37,7 @@ AT_REST, STUCK_FOR = 1e-3, 1.0
 
 
 @dataclass
-class GripperControl:
+class GripperControl(Stateful):
     """A gripper and the objects that it can hold.
 
     Attributes
@@ -58,6 +59,8 @@ class GripperControl:
     trace : list of (int, float)
         Mode and share after each period.
     """
+
+    SAVED = ("mode", "share", "held", "slipping", "stuck_since", "events", "trace")
 
     model: Model
     gripper: Gripper
@@ -81,16 +84,6 @@ class GripperControl:
     def state_in_words(self) -> str:
         """State as text for the pilot's page."""
         return state_text(self.mode, self.held)
-
-    def saved_state(self) -> GripperControl:
-        """Return a copy of the state and of the recorded samples."""
-        return replace(self, trace=list(self.trace))
-
-    def restore(self, kept: GripperControl) -> None:
-        """Restore the result of :meth:`saved_state`."""
-        for name in ("mode", "share", "held", "slipping", "stuck_since", "events"):
-            setattr(self, name, getattr(kept, name))
-        self.trace = list(kept.trace)
 
     def nearest(self, q: Array, gripper: Gripper | None = None) -> tuple[str, float, float]:
         """Return the nearest object at coordinates (nq,), see :func:`nearest_object`."""

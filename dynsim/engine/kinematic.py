@@ -518,18 +518,10 @@ class SnakeRun(SnakeControl):
             self.objects.command(now, bool(block[0]), w)
             changes = np.flatnonzero(block != block[0])
             periods = int(min([periods, self.objects.due(now), *changes[:1].tolist()]))
+        law, schedule, velocity = self.controller.law, self.controller.schedule, self.block.velocity
+        moving, stop = int(not self.recovering), int(self.controller.when_blocked)
         done, blocked = run_ticks(
-            self.model,
-            self.controller.law,
-            self.controller.schedule,
-            self.state,
-            self.block.velocity,
-            periods,
-            int(not self.recovering),
-            int(self.controller.when_blocked),
-            self.stride,
-            self.ws,
-            self.trace,
+            self.model, law, schedule, self.state, velocity, periods, moving, stop, self.stride, self.ws, self.trace
         )
         if done < 0:
             raise self.diverged()
@@ -632,19 +624,15 @@ def prepare(scenario: Scenario, source: CommandSource | None = None) -> SnakeRun
     """
     if scenario.controller is None or member("controller", scenario.controller.type).ENGINE != "kinematic":
         raise ModelError(f"plant {scenario.plant.type!r} (kinematic) requires controller.type: task_space")
-    if scenario.config.contacts.points:
-        raise ModelError(f"contacts.points is not supported by the kinematic plant {scenario.plant.type!r}; remove it")
-    if scenario.config.loads:
-        raise ModelError(
-            f"loads is not supported by the kinematic plant {scenario.plant.type!r}, which has no forces; remove it",
-            keys=("loads",),
-        )
-    if scenario.config.sensors is not None and scenario.config.sensors.wrench:
-        raise ModelError(
-            f"sensors.wrench is not supported by the kinematic plant {scenario.plant.type!r}, which has no forces; "
-            "remove it, or set plant.level: dynamic",
-            keys=("sensors", "wrench"),
-        )
+    config = scenario.config
+    for section, used, fix in (
+        ("contacts.points", config.contacts.points, "remove it"),
+        ("loads", config.loads, "remove it"),
+        ("sensors.wrench", config.sensors and config.sensors.wrench, "remove it, or set plant.level: dynamic"),
+    ):
+        if used:
+            plant = f"the kinematic plant {scenario.plant.type!r}, which has no forces"
+            raise ModelError(f"{section} is not supported by {plant}; {fix}", keys=tuple(section.split(".")))
     description = build.machine(scenario)
     assert isinstance(description, SnakeDescription)
     controller = build.snake_controller(scenario, description)

@@ -38,11 +38,6 @@ STEPS = tuple(1e-2 / 3.0**k for k in range(9))
 # Rows whose largest entry is below this count as zero [SI units].
 ZERO_ROW = 1e-6
 MODES = {ka.OPEN: "open", ka.SLIDING: "sliding", ka.STICKING: "sticking"}
-INPUTS = ("command", "reference", "reference_rate", "force", "torque")
-OUTPUTS = (
-    "q", "v", "current", "vdot", "voltage", "motor_torque", "hand_position",
-    "contact_normal_force", "contact_force", "contact_gap",
-)  # fmt: skip
 _AXES = "xyz"
 
 
@@ -100,7 +95,7 @@ def linearized(prepared: Prepared, inputs: Sequence[str], outputs: Sequence[str]
     read = np.array(list(columns.values()), dtype=int)
     n, x = len(frozen.x), frozen.x
     by_x, error_x = _jacobian(lambda d: frozen.rate_and_output(x + d, read), n)
-    parts = [_jacobian(partial(_along, entry, read), 1) for entry in entries.values()]
+    parts = [_jacobian(partial(entry, read), 1) for entry in entries.values()]
     by_u = np.hstack([np.zeros((n + len(read), 0)), *(part for part, _ in parts)])
     robot = prepared.model.robot
     circuits = [m.joint for a, m in enumerate(robot.motors) if prepared.system.drives.table[a, ka.CIRCUIT] >= 0]
@@ -122,10 +117,6 @@ def linearized(prepared: Prepared, inputs: Sequence[str], outputs: Sequence[str]
         },
         error=max([error_x, *(error for _, error in parts)]),
     )
-
-
-def _along(entry: Callable[[float, NDArray[Any]], Array], read: NDArray[Any], amount: Array) -> Array:
-    return entry(float(amount[0]), read)
 
 
 class _Frozen:
@@ -165,51 +156,42 @@ class _Frozen:
         derivative(system, self.time, y, self._latest, dy)
         return dy[: self._tracked]
 
-    def inputs(self) -> dict[str, dict[str, Callable[[float, NDArray[Any]], Array]]]:
-        """Return all inputs by family and label, as functions of the change and of the outputs to read."""
+    def inputs(self) -> dict[str, dict[str, Callable[[NDArray[Any], Array], Array]]]:
+        """Return all inputs by family and label, as functions of the outputs to read and of the change, (1,)."""
         joints = [motor.joint for motor in self._prepared.model.robot.motors]
         bodies = self._prepared.model.robot.bodies
         first = len(self._prepared.loads) - len(bodies)
 
-        def moved(change: Callable[[Any, float], None]) -> Callable[[float, NDArray[Any]], Array]:
-            def at(amount: float, read: NDArray[Any]) -> Array:
+        def moved(change: Callable[..., None], *place: int) -> Callable[[NDArray[Any], Array], Array]:
+            def at(read: NDArray[Any], amount: Array) -> Array:
                 system = copied(self._system)
-                change(system, amount)
+                change(system, float(amount[0]), *place)
                 return self.rate_and_output(self.x, read, system)
 
             return at
 
-        def command(a: int) -> Callable[[Any, float], None]:
-            def change(system: Any, amount: float) -> None:
-                system.drives.table[a, ka.SAMPLED] = ka.GIVEN
-                system.drives.input[a, ka.COMMAND] = self._asked[a] + amount
+        def command(system: Any, amount: float, a: int) -> None:
+            system.drives.table[a, ka.SAMPLED] = ka.GIVEN
+            system.drives.input[a, ka.COMMAND] = self._asked[a] + amount
 
-            return change
+        def reference(system: Any, amount: float, a: int, rate: int) -> None:
+            line = self._references[a].copy()
+            line[rate] += amount
+            system.reference.spline[a] = ka.REWRITTEN
+            system.drives.input[a, [ka.LINE_START, ka.LINE_RATE, ka.LINE_SINCE]] = *line, self.time
 
-        def reference(a: int, rate: int) -> Callable[[Any, float], None]:
-            def change(system: Any, amount: float) -> None:
-                line = self._references[a].copy()
-                line[rate] += amount
-                system.reference.spline[a] = ka.REWRITTEN
-                system.drives.input[a, [ka.LINE_START, ka.LINE_RATE, ka.LINE_SINCE]] = *line, self.time
-
-            return change
-
-        def push(k: int, component: int) -> Callable[[Any, float], None]:
-            def change(system: Any, amount: float) -> None:
-                start = system.loads.table[first + k, kl.DATA]
-                system.loads.data[start + kl.WRENCH + component] += amount
-
-            return change
+        def push(system: Any, amount: float, k: int, component: int) -> None:
+            start = system.loads.table[first + k, kl.DATA]
+            system.loads.data[start + kl.WRENCH + component] += amount
 
         motors = list(enumerate(joints))
         pushes = [(k, body, axis) for k, body in enumerate(bodies) for axis in range(3)]
         return {
-            "command": {joint: moved(command(a)) for a, joint in motors},
-            "reference": {joint: moved(reference(a, 0)) for a, joint in motors},
-            "reference_rate": {joint: moved(reference(a, 1)) for a, joint in motors},
-            "force": {f"{body}.{_AXES[axis]}": moved(push(k, axis)) for k, body, axis in pushes},
-            "torque": {f"{body}.{_AXES[axis]}": moved(push(k, 3 + axis)) for k, body, axis in pushes},
+            "command": {joint: moved(command, a) for a, joint in motors},
+            "reference": {joint: moved(reference, a, 0) for a, joint in motors},
+            "reference_rate": {joint: moved(reference, a, 1) for a, joint in motors},
+            "force": {f"{body}.{_AXES[axis]}": moved(push, k, axis) for k, body, axis in pushes},
+            "torque": {f"{body}.{_AXES[axis]}": moved(push, k, 3 + axis) for k, body, axis in pushes},
         }
 
     def outputs(self) -> dict[str, dict[str, int]]:

@@ -18,7 +18,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,7 @@ from dynsim.compile.references.splines import wheel_angles
 from dynsim.compile.references.teleop import BASE, HAND, VELOCITIES, TeleopOptions, VelocitySource
 from dynsim.dynamics import inverse_kinematics as kik
 from dynsim.dynamics.tables import workspace
+from dynsim.engine.saved_state import Stateful
 from dynsim.engine.stepped import State, Touch
 from dynsim.jit.kernel import reals
 from dynsim.model.base_pose import base_pose, base_row
@@ -45,7 +46,6 @@ ROUNDING = 1e-9
 """Tolerance of joint rates and accelerations, relative to their limits."""
 TIME_ROUNDING = 1e-9
 """Tolerance of the times of samples [s]."""
-_GOVERNOR_STATE = ("target", "velocity", "joints", "rates", "hindrance", "_path")
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class StoppingPath:
         return StoppingPath(self.velocity[1:], self.targets[1:], self.joints[1:])
 
 
-class HandGovernor:
+class HandGovernor(Stateful):
     """Moves the hand with commanded velocities from which it can stop in time.
 
     Attributes
@@ -77,6 +77,8 @@ class HandGovernor:
     hindrance : str
         Reason why the hand is slower than commanded; empty if it is not.
     """
+
+    SAVED = ("target", "velocity", "joints", "rates", "hindrance", "_path")
 
     def __init__(self, model: Model, options: TeleopOptions, q: Array, axes: Array) -> None:
         self._options, self._model, self._axes = options, model, axes
@@ -98,15 +100,6 @@ class HandGovernor:
         self.rates = v[columns].copy()
         jacobian = self._model.point_jacobian(*self._model.robot.hand, q)[:, columns]
         self.velocity = self._axes.T @ jacobian @ self.rates
-
-    def state(self) -> dict[str, Any]:
-        """Return the state: values that are replaced and never modified."""
-        return {name: getattr(self, name) for name in _GOVERNOR_STATE}
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Restore a state of this governor."""
-        for name, value in state.items():
-            setattr(self, name, value)
 
     def step(self, commanded: Array) -> None:
         """Advance one tick towards a velocity (3,) [m/s] that differs from the last by at most a h."""
@@ -190,19 +183,8 @@ class HandGovernor:
         targets = self.target + np.cumsum(velocities @ self._axes.T, axis=0) / options.rate
         q, joints, count = self._q.copy(), np.zeros((len(targets), len(self.joints))), len(targets)
         q[self._arrays.place] = self.joints
-        ended, _ = kik.follow_path(
-            self._model.arrays,
-            self._workspace,
-            self._arrays,
-            targets,
-            np.zeros((count, 0)),
-            0,
-            0,
-            count,
-            options.tolerance,
-            q,
-            joints,
-        )
+        model, ws, still = self._model.arrays, self._workspace, np.zeros((count, 0))
+        ended, _ = kik.follow_path(model, ws, self._arrays, targets, still, 0, 0, count, options.tolerance, q, joints)
         return (joints if ended == count else None), targets
 
 
@@ -211,11 +193,10 @@ Array = NDArray[np.float64]
 TICK_SLACK = 1e-9
 # Fraction of the commanded distance that may be lost without a warning: joint limits slow down starts slightly.
 MISSED = 0.01
-_STATE = ("ticks", "_moving", "_angles", "_base_velocity", "_free", "_commanded", "_missed")
 
 
 class Referenced(Protocol):
-    """A simulation whose references can be rewritten."""
+    """A simulation whose state can be read and whose references can be rewritten."""
 
     @property
     def state(self) -> State:
@@ -249,8 +230,10 @@ class Referenced(Protocol):
         """See :meth:`dynsim.engine.simulation.Simulation.set_lines`."""
 
 
-class OperatorPath:
+class OperatorPath(Stateful):
     """Commanded path of the hand: straight lines between the ticks."""
+
+    SAVED = ("points",)
 
     def __init__(self, rate: float, start: Array, time: float = 0.0) -> None:
         self.rate, self.time = rate, time
@@ -262,8 +245,10 @@ class OperatorPath:
         return np.stack([np.interp(t, ticks, column) for column in points.T], axis=1)
 
 
-class Operator:
+class Operator(Stateful):
     """Tick callback of a simulation; starts from the scenario's start or from the posture of a state."""
+
+    SAVED = ("ticks", "_moving", "_angles", "_base_velocity", "_free", "_commanded", "_missed", "path", "_hand")
 
     def __init__(
         self, model: Model, options: TeleopOptions, source: VelocitySource | None = None, state: State | None = None
@@ -313,12 +298,6 @@ class Operator:
         """Reason why the hand is slower than commanded; empty if it is not."""
         return "" if self._hand is None else self._hand.hindrance
 
-    def saved_state(self) -> dict[str, Any]:
-        """Return the state: values that are replaced and never modified."""
-        points = None if self.path is None else list(self.path.points)
-        hand = None if self._hand is None else self._hand.state()
-        return {name: getattr(self, name) for name in _STATE} | {"points": points, "hand": hand}
-
     def add_to(self, record: Record) -> None:
         """Add a warning if the hand has moved less than commanded; its actual motion is in the references."""
         missed = sum(distance for distance, _ in self._missed.values())
@@ -328,15 +307,6 @@ class Operator:
                 f"operator: the hand did not execute {missed:.3g} m of the commanded {self._commanded:.3g} m, mostly "
                 f"from t = {since:.4g} s on ({reason}); its target waited, and errors refer to the waiting target"
             )
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Restore a state of this operator."""
-        for name in _STATE:
-            setattr(self, name, state[name])
-        if self.path is not None:
-            self.path.points = list(state["points"])
-        if self._hand is not None:
-            self._hand.restore(state["hand"])
 
     def __call__(self, simulation: Referenced) -> None:
         """Rewrite the references for the interval up to the next tick."""
@@ -399,16 +369,7 @@ def _limited_change(velocity: Array, wanted: Array, allowed: float) -> Array:
 # Sensors of a sampled controller: sampling, noise, resolution, delay and hold.
 
 
-class Stateful(Protocol):
-    """A simulation whose state can be read."""
-
-    @property
-    def state(self) -> State:
-        """See :attr:`dynsim.engine.simulation.Simulation.state`."""
-        ...
-
-
-class SampledSensor:
+class SampledSensor(Stateful):
     """Sensor callback, called when a sample is due; :meth:`value` returns the last sample that has arrived.
 
     A sample of x is x + σ ξ with ξ standard normal, rounded to the resolution ρ if it is positive: ρ round(x/ρ).
@@ -429,6 +390,8 @@ class SampledSensor:
         Seed of the noise.
     """
 
+    SAVED = ("_samples", "_before", "_random")
+
     def __init__(
         self,
         read: Callable[[State], Array],
@@ -445,7 +408,7 @@ class SampledSensor:
         self._samples: deque[tuple[float, Array]] = deque()
         self._before: Array | None = None
 
-    def __call__(self, simulation: Stateful) -> None:
+    def __call__(self, simulation: Referenced) -> None:
         """Take a sample."""
         state = simulation.state
         x = self._read(state) + self._noise * self._random.standard_normal(len(self._noise))
@@ -466,18 +429,8 @@ class SampledSensor:
         value = self.value(time)
         return np.zeros_like(value) if self._before is None else (value - self._before) / self.period
 
-    def saved_state(self) -> dict[str, Any]:
-        """Return the state of the sensor."""
-        samples = list(self._samples)
-        return {"samples": samples, "before": self._before, "random": self._random.bit_generator.state}
 
-    def restore(self, kept: dict[str, Any]) -> None:
-        """Restore the result of :meth:`saved_state`."""
-        self._samples, self._before = deque(kept["samples"]), kept["before"]
-        self._random.bit_generator.state = kept["random"]
-
-
-class EncodedCommands:
+class EncodedCommands(Stateful):
     """Sampled controller that reads its joints through encoders and computes all commands at its ticks.
 
     q̂ is the last sample that has arrived. v̂ is its difference to the previous sample over their period, as in servo
@@ -496,6 +449,8 @@ class EncodedCommands:
     take : callable
         Computes the commands from measured positions and rates of the motors' joints, (na,) [rad or m, rad/s or m/s].
     """
+
+    SAVED = ("sensor", "_measured")
 
     def __init__(
         self, encoders: Encoders, seed: int, robot: Robot, period: float, take: Callable[[Array, Array], None]
@@ -519,21 +474,12 @@ class EncodedCommands:
         )
         self._measured: list[tuple[float, Array]] = []
 
-    def __call__(self, simulation: Stateful) -> None:
+    def __call__(self, simulation: Referenced) -> None:
         """Run one controller tick."""
         time = simulation.state.time
         measured = self.sensor.value(time)
         self._measured.append((time, measured))
         self._take(measured, self.sensor.rate(time))
-
-    def saved_state(self) -> dict[str, Any]:
-        """Return the state of the sensor and the measurements so far."""
-        return {"sensor": self.sensor.saved_state(), "measured": list(self._measured)}
-
-    def restore(self, kept: dict[str, Any]) -> None:
-        """Restore the result of :meth:`saved_state`."""
-        self.sensor.restore(kept["sensor"])
-        self._measured = list(kept["measured"])
 
     def add_to(self, record: Record) -> None:
         """Add the measured joint positions, held from tick to tick."""

@@ -119,23 +119,12 @@ def implicit_threshold(n: int) -> float:
     return (20.0 + (2.0 * n + 0.03 * n**2) / 11.0) * 3.3 / 6.0
 
 
-class DriveSlopes(NamedTuple):
-    """Derivatives of joint torques τ and current rates di/dt by q, v and i, at rest.
+def drive_slopes(model: Model, drives: ka.DriveArrays) -> tuple[Array, Array, Array, Array, Array, Array]:
+    """Return the derivatives of joint torques τ, and of current rates di/dt, by q, v and i, at rest.
 
-    Shapes: torques (n, n), (n, n) and (n, circuits); current rates (circuits, n), (circuits, n) and (circuits,
-    circuits). Held commands do not depend on the state.
+    They include drives and joint damping. Shapes: torques (n, n), (n, n) and (n, circuits); current rates (circuits,
+    n), (circuits, n) and (circuits, circuits). Held commands do not depend on the state.
     """
-
-    torque_q: Array
-    torque_v: Array
-    torque_i: Array
-    rate_q: Array
-    rate_v: Array
-    rate_i: Array
-
-
-def drive_slopes(model: Model, drives: ka.DriveArrays) -> DriveSlopes:
-    """Return the derivatives of the torques and currents of drives and joint damping."""
     n, circuits = model.n, int(model.robot.circuits)
     torque_q, torque_v, torque_i = np.zeros((n, n)), -np.diag(model.damping), np.zeros((n, circuits))
     rate_q, rate_v, rate_i = np.zeros((circuits, n)), np.zeros((circuits, n)), np.zeros((circuits, circuits))
@@ -148,7 +137,7 @@ def drive_slopes(model: Model, drives: ka.DriveArrays) -> DriveSlopes:
         elif kind == ka.POSITION_SERVO:
             by_q, by_v = servo_block(drives.motor, a, drives.table[a, ka.SERVO_MODE], sampled, 0.0, 0.0)
             torque_q[j, j], torque_v[j, j] = by_q, torque_v[j, j] + by_v
-    return DriveSlopes(torque_q, torque_v, torque_i, rate_q, rate_v, rate_i)
+    return torque_q, torque_v, torque_i, rate_q, rate_v, rate_i
 
 
 def fastest_rate(model: Model, contacts: Sequence[Contact], drives: ka.DriveArrays) -> float:

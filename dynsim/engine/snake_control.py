@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from dynsim.compile.control import JointControl
 from dynsim.compile.snake_tree import GROUND, SnakeTree, configuration, lifted_moments
+from dynsim.engine.saved_state import Stateful
 from dynsim.errors import ModelError, ScenarioError, SimulationStopped
 from dynsim.jit.kernel import integers, reals
 from dynsim.model.description import Array
@@ -61,11 +62,13 @@ SETTLE, RAISE, SETTLE_AGAIN = 0.5, 1.0, 1.0
 STEADY_TICKS = 4
 
 
-class WheelLifter:
+class WheelLifter(Stateful):
     """Heights of the wheel pairs over time, and the resulting angles of the pitch joints on their axles.
 
     Pairs are put down before other pairs are lifted.
     """
+
+    SAVED = ("_grounded", "_up", "_down")
 
     def __init__(self, robot: SnakeTree, grounded: Array) -> None:
         self._robot = robot
@@ -76,14 +79,6 @@ class WheelLifter:
         chosen = [servo for joint in robot.lifting_joints if isinstance(servo := servos[joint], Servo)]
         # Torque per angle of the position loop [N m/rad].
         self._stiffness = np.array([servo.k_p * servo.torque_constant / servo.resistance for servo in chosen])
-
-    def state(self) -> tuple[Array, Array, Array]:
-        """Return the state of the lifter."""
-        return self._grounded.copy(), self._up.copy(), self._down.copy()
-
-    def restore(self, state: tuple[Array, Array, Array]) -> None:
-        """Restore a state of this lifter."""
-        self._grounded, self._up, self._down = (part.copy() for part in state)
 
     def change(self, time: float, grounded: Array) -> None:
         """Set the grounded pairs, (pairs,) 1 or 0, from a time [s] on."""
@@ -263,7 +258,7 @@ class Refusal(NamedTuple):
 
 
 @dataclass
-class ModeSwitcher:
+class ModeSwitcher(Stateful):
     """Fixing and switching states: follows requests, and picks a mode at every switching time t_k = t_0 + k dT.
 
     Every mode change is tested by simulating the mode for one period with the present command. The robot tips if the
@@ -289,6 +284,8 @@ class ModeSwitcher:
     refusals : list of Refusal
         Modes that would tip, in the order of their tests.
     """
+
+    SAVED = ("row", "switching", "next_switch", "switches", "refusals", "_place")
 
     policy: Policy
     modes: ModeTable
@@ -377,10 +374,6 @@ class ModeSwitcher:
 OBSTACLES = ("joint limit", "rate limit", "singular posture", "attitude at beta = 90 deg", "release of the joints")
 
 
-def _no_commands() -> CommandBlock:
-    return CommandBlock(np.zeros((0, 6)), integers([]), integers([]))
-
-
 @dataclass
 class SnakeControl:
     """Robot, controller, known commands, state and recorded samples.
@@ -409,7 +402,7 @@ class SnakeControl:
     source: CommandSource
     ticks: int
     stride: int
-    block: CommandBlock = field(default_factory=_no_commands)
+    block: CommandBlock = field(default_factory=lambda: CommandBlock(np.zeros((0, 6)), integers([]), integers([])))
     block_start: int = 0
     blocked: bool = False
     recovering: bool = False
@@ -450,6 +443,13 @@ class SnakeControl:
     def mode(self) -> int:
         """Number of the present mode."""
         return self.controller.modes.numbers[self.state.counts[ss.MODE]]
+
+    @property
+    def hindrance(self) -> str:
+        """Reason why the target waits; empty if it does not."""
+        if self.recovering:
+            return OBSTACLES[-1]
+        return OBSTACLES[int(self.state.counts[ss.STILL_FOR]) - 1] if self.blocked else ""
 
     def postures(self) -> dict[str, list[float]]:
         """Return base, joint and wheel positions for a message."""

@@ -12,7 +12,7 @@ servos follow rates. The state that the controller uses:
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -23,7 +23,8 @@ from dynsim.compile.snake_tree import GROUND, HEAD, ROOT, SnakeTree
 from dynsim.engine.gripper import GripperControl
 from dynsim.engine.kinematic import add_task, effort, hold_last, task_summary, task_warnings
 from dynsim.engine.operator import Referenced, SampledSensor
-from dynsim.engine.snake_control import OBSTACLES, STEADY_TICKS, SnakeControl, WheelLifter, copy_of
+from dynsim.engine.saved_state import Stateful
+from dynsim.engine.snake_control import STEADY_TICKS, SnakeControl, WheelLifter, copy_of
 from dynsim.engine.stepped import State
 from dynsim.errors import SimulationStopped
 from dynsim.jit.kernel import FixedSignature
@@ -34,31 +35,16 @@ from dynsim.record import Record
 from dynsim.scenario.schema import Sensors
 from dynsim.snake import ticks as ss
 from dynsim.snake.description import CommandSource, TaskSpaceController
-from dynsim.snake.ticks import FEEDFORWARD, GIVEN, MEASURED, Schedule, SnakeTrace, command_tick, record_row
+from dynsim.snake.ticks import FEEDFORWARD, GIVEN, MEASURED, SnakeTrace, command_tick, record_row
 
 _ROOT_COORDINATES = 7
 # Interval of the overload checks, and duration of an overload after which the run ends [s].
 OVERLOAD_LOOK, OVERLOAD_TIME = 0.1, 0.5
 # The head is far below its target by more than this [m]; the robot has overturned at this tilt [rad] (assumed).
 SAG, OVERTURNED = 0.05, 0.8
-# Attributes of the switcher and of the pilot in a snapshot: their values are replaced, never modified in place.
-_SWITCHER = ("row", "switching", "next_switch", "switches", "_place")
-_OWN = (
-    "block",
-    "block_start",
-    "blocked",
-    "recovering",
-    "switch_due",
-    "_row",
-    "_added",
-    "_added_rate",
-    "_next_look",
-    "_commanded",
-    "_overloaded_since",
-)
 
 
-class SnakePilot(SnakeControl):
+class SnakePilot(Stateful, SnakeControl):
     """Control of a dynamic snake, called at the ticks of its simulation.
 
     Parameters
@@ -77,6 +63,10 @@ class SnakePilot(SnakeControl):
         Sensors through which the controller observes the robot.
     """
 
+    SAVED = (
+        "state", "gripper", "block", "block_start", "blocked", "recovering", "switch_due", "switcher", "grip",
+        "_lifter", "_row", "_added", "_added_rate", "_next_look", "_commanded", "_overloaded_since",
+    )  # fmt: skip
     path = None  # the record has the target as part of the controller state
 
     def __init__(
@@ -92,7 +82,9 @@ class SnakePilot(SnakeControl):
         assert isinstance(robot, SnakeTree)
         state_source = controller.schedule.state_source
         schedule = controller.schedule._replace(state_source=GIVEN if state_source == MEASURED else FEEDFORWARD)
-        controller = _with_schedules(controller, schedule)
+        # A predicted period continues from the present estimate, as feedforward does.
+        prediction = controller.prediction._replace(state_source=FEEDFORWARD)
+        controller = replace(controller, schedule=schedule, prediction=prediction)
         d = robot.description
         chosen = controller.source if source is None else source
         super().__init__(d, d.arrays(), controller, chosen, ticks, stride)
@@ -131,13 +123,6 @@ class SnakePilot(SnakeControl):
         self._seen: Any = None
         self.read_commands(waiting=False)
 
-    @property
-    def hindrance(self) -> str:
-        """Reason why the target waits; empty if it does not."""
-        if self.recovering:
-            return OBSTACLES[-1]
-        return OBSTACLES[int(self.state.counts[ss.STILL_FOR]) - 1] if self.blocked else ""
-
     def posture(self) -> tuple[Array, Array, Array]:
         """Return the actual posture instead of the controller's estimate, see :meth:`SnakeControl.posture`."""
         if self._seen is None:
@@ -168,18 +153,9 @@ class SnakePilot(SnakeControl):
             self._row, self._next_look = mode, 0
             self._lifter.change(time, self.controller.law.grounded[mode].astype(np.float64))
         self._commanded = max(self._commanded, row + 1)
-        blocked = self._command(
-            self.model,
-            self.controller.law,
-            self.controller.schedule,
-            state,
-            self.block.velocity,
-            int(not self.recovering),
-            int(self.controller.when_blocked),
-            self.ws,
-            row,
-            self.trace,
-        )
+        law, schedule, velocity = self.controller.law, self.controller.schedule, self.block.velocity
+        moving, slows = int(not self.recovering), int(self.controller.when_blocked)
+        blocked = self._command(self.model, law, schedule, state, velocity, moving, slows, self.ws, row, self.trace)
         if not math.isfinite(float(state.phi.sum())):
             raise self.diverged()
         self.end_period(bool(blocked))
@@ -284,37 +260,21 @@ class SnakePilot(SnakeControl):
         self._next_look = now + ticks
 
     def saved_state(self) -> dict[str, Any]:
-        """Return the state of the control and its recorded samples."""
-        switcher = self.switcher
-        return {
-            "state": copy_of(self.state),
+        """Return the state of the control, of its sensors and of the recorded samples."""
+        return super().saved_state() | {
             "trace": [array[: self._commanded].copy() for array in self.trace],
             "rates": self.ws.work.u.copy(),
-            "gripper": self.gripper.copy(),
-            "lifter": self._lifter.state(),
             "sensors": [sensor.saved_state() for sensor in self.sensors],
-            "switcher": {name: getattr(switcher, name) for name in _SWITCHER} | {"refusals": list(switcher.refusals)},
-            "own": {name: getattr(self, name) for name in _OWN},
-            "grip": None if self.grip is None else self.grip.saved_state(),
         }
 
-    def restore(self, kept: dict[str, Any]) -> None:
+    def restore(self, state: Mapping[str, Any]) -> None:
         """Restore the result of :meth:`saved_state`."""
-        for mine, array in zip(self.state, kept["state"], strict=True):
-            mine[...] = array
-        for mine, array in zip(self.trace, kept["trace"], strict=True):
+        super().restore(state)
+        for mine, array in zip(self.trace, state["trace"], strict=True):
             mine[: len(array)] = array
-        self.ws.work.u[...] = kept["rates"]
-        self.gripper[...] = kept["gripper"]
-        self._lifter.restore(kept["lifter"])
-        for sensor, part in zip(self.sensors, kept["sensors"], strict=True):
+        self.ws.work.u[...] = state["rates"]
+        for sensor, part in zip(self.sensors, state["sensors"], strict=True):
             sensor.restore(part)
-        for name, value in kept["switcher"].items():
-            setattr(self.switcher, name, list(value) if name == "refusals" else value)
-        for name, value in kept["own"].items():
-            setattr(self, name, value)
-        if self.grip is not None:
-            self.grip.restore(kept["grip"])
 
     def add_to(self, record: Record) -> None:
         """Add signals and summary of the control, and of joints and wheels by their snake names."""
@@ -347,7 +307,8 @@ class SnakePilot(SnakeControl):
             shown.rho[:], shown.counts[ss.MODE] = trace.rho[r], trace.mode[r]
             write_row(model, law, shown, self.ws, r, trace)
             w[r] = self.head_pose(q[r])
-            points.append(self._polyline(q[r]))
+            # Controlled point, joints and axles to the tail.
+            points.append(self.tree.joint_positions(q[r], self._tail)[self._line])
         slip = np.linalg.norm(record["contact_slip_velocity"], axis=2)
         trace.slip[:] = np.where(record["contact_normal_force"] > 0.0, slip, 0.0).max(axis=1)
         rate = dict(zip(record.labels["v"], v.T, strict=True))
@@ -368,15 +329,6 @@ class SnakePilot(SnakeControl):
             self.grip.add_to(record)
         summary = {**record.summary, **task_summary(self, record), **effort(record.summary)}
         record.summary = {**summary, "warnings": [*summary["warnings"], *task_warnings(self, record, summary)]}
-
-    def _polyline(self, q: Array) -> Array:
-        """Return controlled point, joints and axles to the tail at coordinates (nq,), (points, 3) [m]."""
-        return self.tree.joint_positions(q, self._tail)[self._line]
-
-
-def _with_schedules(controller: TaskSpaceController, schedule: Schedule) -> TaskSpaceController:
-    # A predicted period continues from the present estimate, as feedforward does.
-    return replace(controller, schedule=schedule, prediction=controller.prediction._replace(state_source=FEEDFORWARD))
 
 
 def _places(robot: SnakeTree, joints: tuple[str, ...]) -> Array:

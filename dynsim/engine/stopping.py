@@ -6,7 +6,7 @@ import logging
 import threading
 import time as clock
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -277,27 +277,21 @@ def short_step_reason(prepared: Prepared) -> str:
     if not by_number(run.method).explicit or not prepared.contacts or not np.isfinite(run.y).all():
         return ""
     changing = fastest(prepared)
-    if changing is None or not LEAST < step / changing.within < MOST:
+    if changing is None:
+        return ""
+    contact, speed, within = changing
+    if not LEAST < step / within < MOST:
         return ""
     return (
-        f"steps are as short as {step:.1e} s because {changing.contact} slips at {changing.speed:.3g} m/s and its "
-        f"friction changes within {changing.within:.3g} s; integrator.method: radau5 allows longer steps"
+        f"steps are as short as {step:.1e} s because {contact} slips at {speed:.3g} m/s and its "
+        f"friction changes within {within:.3g} s; integrator.method: radau5 allows longer steps"
     )
 
 
-@dataclass(frozen=True)
-class Changing:
-    """The contact whose friction alone changes fastest, its slip [m/s], and the joint time constant τ of all contacts
-    [s].
+def fastest(prepared: Prepared) -> tuple[str, float, float] | None:
+    """Return the contact whose friction alone changes fastest, its slip [m/s], and the joint time constant τ of all
+    contacts [s], at the state of the run; None if no friction changes.
     """
-
-    contact: str
-    speed: float
-    within: float
-
-
-def fastest(prepared: Prepared) -> Changing | None:
-    """Return the fastest change of friction at the state of the run; None if none changes."""
     system, run, ws, model = prepared.system, prepared.run, prepared.workspace, prepared.model
     unilateral = system.unilateral
     q = run.y[block(run.layout, "q")]
@@ -334,7 +328,7 @@ def fastest(prepared: Prepared) -> Changing | None:
     own = [float(np.trace(row @ left @ row.T @ damping)) for _, row, damping in slides]
     k = slides[int(np.argmax(own))][0]
     speed = float(np.linalg.norm(_slip(prepared, k)))
-    return Changing(prepared.contacts[k].name, speed, 1.0 / float(np.abs(np.linalg.eigvals(A)).max()))
+    return prepared.contacts[k].name, speed, 1.0 / float(np.abs(np.linalg.eigvals(A)).max())
 
 
 def _slip(prepared: Prepared, k: int) -> Array:

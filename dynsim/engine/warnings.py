@@ -56,6 +56,7 @@ SCHEME_LIMIT = 1e-2
 GAIN_LIMIT = 1e-3
 HALF_STEP_LIMIT = 2e-2
 PENETRATION_LIMIT_M = 1e-3
+MODEL_IT = "lower contacts.friction, or model the {} (contacts.stiffness_N_per_m with integrator.method: time_stepping)"
 
 
 def warnings_of(
@@ -109,9 +110,7 @@ def warnings_of(
     elif summary["constraint_drift_max_m"] > DRIFT_LIMIT_M:
         warnings.append(f"contacts drifted by {summary['constraint_drift_max_m']:.1e} m")
     warnings += _undetermined(record, prepared, stepping is not None)
-    warnings += _unpressed(record, prepared, begun)
-    warnings += _open_impacts(prepared)
-    warnings += _wedged(record, prepared)
+    warnings += _not_unique(record, prepared, begun)
     warnings += _slipping_start(record, prepared) or _moving_start(record, prepared)
     warnings += _sunk(record, sunk)
     warnings += _beyond_stops(robot, prepared.stops, prepared.control)
@@ -329,64 +328,38 @@ def _leaving(record: Record, contacts: Sequence[Contact], names: Sequence[str], 
     return _named(contacts, leaves.any(axis=0), names)
 
 
-def _unpressed(record: Record, prepared: Prepared, begun: float) -> list[str]:
-    """Warn of contacts that stick although no force presses them; then the motion is not unique."""
+def _not_unique(record: Record, prepared: Prepared, begun: float) -> list[str]:
+    """Warn of contacts that the law lets stick, leave or wedge although it has another solution too."""
     # The fraction refers to the whole run, even with a ring buffer, because samples do not show the pressing forces.
-    unilateral, time = prepared.system.unilateral, prepared.run.clock[ki.TIME] - begun
-    if unilateral is None or not time > 0.0:
-        return []
-    shares = unilateral.tally[:, ku.UNPRESSED] / time
-    stuck = [
-        f"{contact.name} ({percent(min(share, 1.0))} of the run)"
-        for contact, share in zip(prepared.contacts, shares, strict=True)
-        if share >= SHORT
-    ]
-    if not stuck:
-        return []
-    return [
-        f"the motion is not unique: no load presses {first_few(stuck)}, held by forces within the friction cones; "
-        "without these forces it would lift off, which also satisfies the contact law. This run keeps it closed, as "
-        "equally stiff supports would; lower contacts.friction, or model the supports (contacts.stiffness_N_per_m with "
-        "integrator.method: time_stepping)"
-    ]
-
-
-def _open_impacts(prepared: Prepared) -> list[str]:
-    """Warn of impacts in which contacts left although the law also has a solution that keeps them closed."""
-    if prepared.system.unilateral is None:
-        return []
-    left = [
-        f"{contact.name} ({tally[ku.OPEN_SINCE]:.6g} s)"
-        for contact, tally in zip(prepared.contacts, prepared.system.unilateral.tally, strict=True)
-        if tally[ku.OPEN_IMPACTS]
-    ]
-    if not left:
-        return []
-    return [
-        "the motion is not unique: impacts of other points or joint stops, the first at the time in brackets, lift "
-        f"{first_few(left)} off, although impulses within the friction cones could keep the contact closed (wedged), "
-        "which also satisfies the contact law; lower contacts.friction, or model the supports "
-        "(contacts.stiffness_N_per_m with integrator.method: time_stepping)"
-    ]
-
-
-def _wedged(record: Record, prepared: Prepared) -> list[str]:
-    """Warn of contacts that friction alone can wedge against their surface."""
-    if prepared.system.unilateral is None:
-        return []
-    names = [
+    law, time, warnings = prepared.system.unilateral, float(prepared.run.clock[ki.TIME]) - begun, list[str]()
+    if law is None:
+        return warnings
+    tallies = list(zip((contact.name for contact in prepared.contacts), law.tally, strict=True))
+    shares = {name: min(tally[ku.UNPRESSED] / time, 1.0) for name, tally in tallies if time > 0.0}
+    if stuck := [f"{name} ({percent(share)} of the run)" for name, share in shares.items() if share >= SHORT]:
+        warnings.append(
+            f"the motion is not unique: no load presses {first_few(stuck)}, held by forces within the friction cones; "
+            "without these forces it would lift off, which also satisfies the contact law. This run keeps it closed, "
+            f"as equally stiff supports would; {MODEL_IT.format('supports')}"
+        )
+    if left := [f"{name} ({tally[ku.OPEN_SINCE]:.6g} s)" for name, tally in tallies if tally[ku.OPEN_IMPACTS]]:
+        warnings.append(
+            "the motion is not unique: impacts of other points or joint stops, the first at the time in brackets, lift "
+            f"{first_few(left)} off, although impulses within the friction cones could keep the contact closed "
+            f"(wedged), which also satisfies the contact law; {MODEL_IT.format('supports')}"
+        )
+    wedged = [
         f"{wedge.contact.name} against {wedge.contact.surface_name} for coefficients from {wedge.least:.4g} on (here "
         f"{wedge.friction:.4g}, t = {wedge.time:.6g} s)"
         for wedge in wedges(prepared.model, prepared.contacts, record)
     ]
-    if not names:
-        return []
-    return [
-        f"the motion is not unique: friction alone can wedge {first_few(names)} without a load: no joint moves "
-        "the point along some direction inside its friction cone, so a force of any size along it, or none, satisfies "
-        "the contact law; lower contacts.friction, or model the surface "
-        "(contacts.stiffness_N_per_m with integrator.method: time_stepping)"
-    ]
+    if wedged:
+        warnings.append(
+            f"the motion is not unique: friction alone can wedge {first_few(wedged)} without a load: no joint moves "
+            "the point along some direction inside its friction cone, so a force of any size along it, or none, "
+            f"satisfies the contact law; {MODEL_IT.format('surface')}"
+        )
+    return warnings
 
 
 def _slipping_start(record: Record, prepared: Prepared) -> list[str]:
@@ -545,40 +518,35 @@ def coarse(stepping: dict[str, Any], scale: float) -> list[str]:
 
     ``scale`` is the turnover of the energy, at least the resolution of the ledger; zero before the first motion [J].
     """
-    step, worst = stepping["step_s"], stepping["scheme_loss_worst_J"]
+    step, worst, deepest = stepping["step_s"], stepping["scheme_loss_worst_J"], stepping["penetration_max_m"]
     # Missing for a ring buffer.
     blurred = stepping.get("half_step_energy_J", 0.0)
     # Only with compliant contacts or ties.
     made = stepping.get("scheme_gain_J", 0.0)
     warnings: list[str] = []
+
+    def warn(text: str, shorter: float) -> None:
+        fix = f"integrator.step_s is {step:g}: use {_shorter(shorter):g}"
+        warnings.append(f"time stepping: {text}; {fix}")
+
+    def part(energy: float, limit: float) -> str:
+        return f"{energy:.3g} J{{}}, {100 * energy / scale:.2g} % of the turnover (limit {100 * limit:g} %)"
+
     if scale > 0.0 and made > GAIN_LIMIT * scale:
-        warnings.append(
-            f"time stepping: the steps themselves add {made:.3g} J to compliant contacts or ties, "
-            f"{100 * made / scale:.2g} % of the turnover (limit {100 * GAIN_LIMIT:g} %); "
-            f"integrator.step_s is {step:g}: use {_shorter(_resolving(stepping, made / scale)):g}"
-        )
+        text = part(made, GAIN_LIMIT).format(" to compliant contacts or ties")
+        warn(f"the steps themselves add {text}", _resolving(stepping, made / scale))
     # Energy added by the steps is reported only once.
     another = worst > 0.0 or made <= GAIN_LIMIT * scale
     if scale > 0.0 and another and abs(worst) > SCHEME_LIMIT * scale:
-        warnings.append(
-            f"time stepping: the steps themselves {'removed' if worst > 0.0 else 'added'} up to {abs(worst):.3g} J, "
-            f"{100 * abs(worst) / scale:.2g} % of the turnover (limit {100 * SCHEME_LIMIT:g} %); "
-            f"integrator.step_s is {step:g}: use {_shorter(step * SCHEME_LIMIT * scale / abs(worst)):g}"
-        )
+        text = f"{'removed' if worst > 0.0 else 'added'} up to {part(abs(worst), SCHEME_LIMIT).format('')}"
+        warn(f"the steps themselves {text}", step * SCHEME_LIMIT * scale / abs(worst))
     if scale > 0.0 and blurred > HALF_STEP_LIMIT * scale:
-        warnings.append(
-            f"time stepping: the power changes so fast that the energy is known only to {blurred:.3g} J, "
-            f"{100 * blurred / scale:.2g} % of the turnover (limit {100 * HALF_STEP_LIMIT:g} %), the "
-            f"change if everything happened half a step later; integrator.step_s is {step:g}: use "
-            f"{_shorter(step * HALF_STEP_LIMIT * scale / blurred):g}"
-        )
-    deepest = stepping["penetration_max_m"]
+        text = f"the energy is known only to {part(blurred, HALF_STEP_LIMIT).format('')}"
+        text += ", the change if everything happened half a step later"
+        warn(f"the power changes so fast that {text}", step * HALF_STEP_LIMIT * scale / blurred)
     if deepest > PENETRATION_LIMIT_M:
-        warnings.append(
-            f"time stepping: points sink up to {1e3 * deepest:.3g} mm into their surfaces as they land (limit "
-            f"{1e3 * PENETRATION_LIMIT_M:g} mm); integrator.step_s is {step:g}: use "
-            f"{_shorter(step * PENETRATION_LIMIT_M / deepest):g}"
-        )
+        text = f"points sink up to {1e3 * deepest:.3g} mm into their surfaces as they land"
+        warn(f"{text} (limit {1e3 * PENETRATION_LIMIT_M:g} mm)", step * PENETRATION_LIMIT_M / deepest)
     return warnings
 
 

@@ -7,12 +7,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
-from dynsim.engine import SIMULATION, Progress, simulate
+from dynsim.engine import SIMULATION, simulate
 from dynsim.errors import ScenarioError, SimulationInterrupted, SimulationStopped, brief
 from dynsim.record import Record
 from dynsim.scenario import Scenario, load_scenario, variant_names
 from dynsim.studies.processes import WorkerInterrupted, WorkerLost, run_in_processes
-from dynsim.studies.sweep import csv_table, flat, is_scalar, is_text
+from dynsim.studies.sweep import csv_table, flat
 from dynsim.system.files import json_text, replace_together
 
 
@@ -109,7 +109,7 @@ def compare(
             if progress is not None and name in records:
                 progress(name, scenario.duration_s)
 
-        interrupted = run_in_processes(_simulate, scenarios.values(), jobs, take_late)
+        interrupted = run_in_processes(simulate, scenarios.values(), jobs, take_late)
     else:
         interrupted = False
         for name, scenario in scenarios.items():
@@ -136,19 +136,18 @@ def _combined_stop(stops: Mapping[str, SimulationStopped], left: list[str], inte
     return combined
 
 
-def _simulate(scenario: Scenario, look: Progress) -> Record:
-    """Simulate in a worker process."""
-    return simulate(scenario, look)
-
-
 def save_comparison(records: Mapping[str, Record], folder: Path) -> None:
     """Write ``comparison.json`` and ``comparison.csv``."""
     summaries = {name: record.summary for name, record in records.items()}
     runs = [flat(summary) for summary in summaries.values()]
     # Variants may differ in their numbers; numbers of contacts depend on the contact law.
-    names = dict.fromkeys(["variant", *(key for run in runs for key, value in run.items() if is_scalar(value))])
+    scalars = (
+        key for run in runs for key, value in run.items() if value is None or isinstance(value, (int, float, str))
+    )
+    names = dict.fromkeys(["variant", *scalars])
     contacts = dict.fromkeys(c["name"] for run in runs for c in run.get("contacts", ()))
-    keys = dict.fromkeys(k for run in runs for c in run.get("contacts", ()) for k, v in c.items() if not is_text(v))
+    entries = [entry for run in runs for contact in run.get("contacts", ()) for entry in contact.items()]
+    keys = dict.fromkeys(key for key, value in entries if not isinstance(value, str))
     rows = []
     for name, run in zip(summaries, runs, strict=True):
         touching = {f"{c['name']}.{key}": c.get(key) for c in run.get("contacts", ()) for key in keys}

@@ -44,16 +44,6 @@ def flat(summary: dict[str, Any]) -> dict[str, Any]:
     return summary | {f"base.{key}": value for key, value in base.items()} | motors
 
 
-def is_text(value: Any) -> bool:
-    """Return whether a value is text, which cannot be in a column of numbers."""
-    return isinstance(value, str)
-
-
-def is_scalar(value: Any) -> bool:
-    """Return whether a value is a number, text or None."""
-    return value is None or isinstance(value, (int, float, str))
-
-
 def is_finite(value: Any) -> bool:
     """Return whether a value is a number that is finite in double precision."""
     return isinstance(value, (int, float)) and abs(value) <= sys.float_info.max
@@ -202,7 +192,7 @@ def _line(row: SweepRow) -> str:
     return json.dumps(vars(row)) + "\n"
 
 
-def earlier_rows(folder: Path, header: Mapping[str, Any], resume: bool, tables: Iterable[str]) -> dict[str, SweepRow]:
+def earlier_rows(folder: Path, header: Mapping[str, Any], resume: bool) -> dict[str, SweepRow]:
     """Return the rows of the journal in a folder by identity, except lost ones.
 
     Parameters
@@ -213,8 +203,6 @@ def earlier_rows(folder: Path, header: Mapping[str, Any], resume: bool, tables: 
         Header of the new sweep, which the existing one must match.
     resume : bool
         Whether an existing sweep may be resumed.
-    tables : iterable of str
-        Names of the tables of a sweep.
 
     Raises
     ------
@@ -226,7 +214,7 @@ def earlier_rows(folder: Path, header: Mapping[str, Any], resume: bool, tables: 
     """
     journal = folder / JOURNAL
     if not journal.exists():
-        left = [name for name in tables if (folder / name).exists()]
+        left = [name for name in TABLES if (folder / name).exists()]
         if resume and left:
             raise RecordError(
                 f"{journal} is missing, although {left[0]} next to it belongs to a sweep; restore it, delete {left[0]} "
@@ -345,7 +333,7 @@ def run_sweep(
         plan.scenario(point)
     header = _header(plan)
     with held_folder(folder):
-        earlier = earlier_rows(folder, header, resume, TABLES)
+        earlier = earlier_rows(folder, header, resume)
         rows = {point.run: earlier[point.identity].placed(point) for point in points if point.identity in earlier}
         left = [point for point in points if point.run not in rows]
         failed = sum(row.status != OK for row in rows.values())

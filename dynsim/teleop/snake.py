@@ -21,7 +21,7 @@ from dynsim.engine.compilation import kernels_logged
 from dynsim.engine.kinematic import make_record, prepare
 from dynsim.engine.operator import Operator
 from dynsim.engine.simulation import Simulation
-from dynsim.engine.snake_control import OBSTACLES, SnakeControl
+from dynsim.engine.snake_control import SnakeControl
 from dynsim.engine.snake_pilot import SnakePilot
 from dynsim.engine.stepped import Touch
 from dynsim.errors import ScenarioError
@@ -308,10 +308,7 @@ class SnakeSession:
 
     def _hindrance(self) -> str:
         """Return the reason why the target waits."""
-        run = self._run
-        if run.recovering:
-            return OBSTACLES[-1]
-        return OBSTACLES[int(run.state.counts[ss.STILL_FOR]) - 1] if run.blocked else ""
+        return self._run.hindrance
 
     def joints(self) -> Mapping[str, Array]:
         """Return joints and wheels; rates are omitted because they are constant in a period (differences of angles)."""

@@ -4,20 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from types import SimpleNamespace
-from typing import get_args
+from typing import Any, Protocol, get_args
 
 import pytest
 
-from dynsim.compile.protocols import (
-    BasePathModule,
-    BuildContext,
-    ControllerModule,
-    Member,
-    MotorModule,
-    PathModule,
-    PlantModule,
-    SurfaceModule,
-)
+from dynsim.compile.control import BasePath, HandPath, JointControl
+from dynsim.compile.protocols import BuildContext, Member
 from dynsim.config.base import StrictConfig
 from dynsim.errors import ModelError
 from dynsim.library import families
@@ -29,6 +21,53 @@ from dynsim.library.motors import dc, mx_28, mx_106, servo, torque, wang_minami
 from dynsim.library.paths import circle, csv, line, waypoints
 from dynsim.library.plants import pws_arm, serial_arm, snake, urdf_arm
 from dynsim.library.surfaces import box, cylinder, height_field, plane, sphere
+from dynsim.model.description import Robot
+from dynsim.model.drives import Drive
+from dynsim.model.surfaces import Box, HeightField, Quadric
+from dynsim.snake.description import SnakeDescription, TaskSpaceController
+
+
+class PlantModule(Member, Protocol):
+    """A machine; ``ENGINE`` is the engine that simulates it, "dynamics" (a Robot) or "kinematic" (a snake)."""
+
+    @property
+    def ENGINE(self) -> str: ...
+
+    def build(self, config: Any, context: BuildContext) -> Robot | SnakeDescription: ...
+
+
+class ControllerModule(Member, Protocol):
+    """A controller for plants of ``ENGINE``, built for ``context.model`` or ``context.snake``."""
+
+    @property
+    def ENGINE(self) -> str: ...
+
+    def build(self, config: Any, context: BuildContext) -> JointControl | TaskSpaceController: ...
+
+
+class PathModule(Member, Protocol):
+    """A path of the hand."""
+
+    def build(self, config: Any, context: BuildContext) -> HandPath: ...
+
+
+class BasePathModule(Member, Protocol):
+    """A path of a mobile base, built for ``context.model`` with a base."""
+
+    def build(self, config: Any, context: BuildContext) -> BasePath: ...
+
+
+class SurfaceModule(Member, Protocol):
+    """A surface that can be touched."""
+
+    def build(self, config: Any, context: BuildContext) -> Quadric | Box | HeightField: ...
+
+
+class MotorModule(Member, Protocol):
+    """A motor, built for ``context.joint``."""
+
+    def build(self, config: Any, context: BuildContext) -> Drive: ...
+
 
 PLANTS: Sequence[PlantModule] = (pws_arm, serial_arm, snake, urdf_arm)
 CONTROLLERS: Sequence[ControllerModule] = (joint_pd, task_space)
