@@ -81,16 +81,14 @@ class Brace:
             raise ModelError(
                 f"brace on {self.body}: normal_force {self.normal_force} must be positive [N]; a brace cannot pull"
             )
-        if self.sliding is not None and not _is_along(self.sliding, self.normal):
+        if self.sliding is None:
+            return
+        # A component along the surface that is larger than rounding.
+        along = np.linalg.norm(np.cross(self.normal, self.sliding))
+        if not along > 1e-12 * np.linalg.norm(self.normal) * np.linalg.norm(self.sliding):
             raise ModelError(
                 f"brace on {self.body}: sliding must have a component along the surface, got {self.sliding.tolist()}"
             )
-
-
-def _is_along(sliding: Array, normal: Array) -> bool:
-    """Return whether a velocity has a component along the surface that is larger than rounding."""
-    across = np.linalg.norm(np.cross(normal, sliding))
-    return bool(across > 1e-12 * np.linalg.norm(normal) * np.linalg.norm(sliding))
 
 
 def _vector(name: str, value: ArrayLike) -> Array:

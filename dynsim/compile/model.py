@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from dynsim.compile.bracing import Brace, BraceStatics, PreparedBraces
 from dynsim.compile.derivatives import InverseDynamicsDerivatives, inverse_dynamics_derivatives
 from dynsim.compile.hand_posture import hand_posture
-from dynsim.compile.tables import compile_model
+from dynsim.compile.tables import compile_model, dry_frictions
 from dynsim.config.problems import listed
 from dynsim.dynamics import ledger
 from dynsim.dynamics import tables as ka
@@ -206,7 +206,8 @@ class Model:
         from dynsim.model.mjcf import write_mjcf
 
         drawn = [drawn_surface(name, surface) for name, surface in (surfaces or {}).items()]
-        return write_mjcf(with_shapes(self.robot), contacts, drawn, self.damping, self.armature)
+        rubs = {rubbing.joint: rubbing.gear + rubbing.bearing for rubbing in dry_frictions(self.robot)}
+        return write_mjcf(with_shapes(self.robot), contacts, drawn, self.damping, self.armature, rubs)
 
     @property
     def joint_names(self) -> tuple[str, ...]:

@@ -88,13 +88,6 @@ def wheel_joint(pair: int, side: int) -> str:
     return f"wheel{pair + 1}{'L' if side > 0 else 'R'}"
 
 
-def snake_base_part(d: SnakeDescription) -> BasePart:
-    """Return the lengths of the base part of a snake."""
-    links = np.full(d.base_joints, d.link_length)
-    pairs = tuple(f"pair{k + 1}" for k in range(d.pairs))
-    return BasePart(pairs, links, links, d.half_track, d.wheel_radius, "phi", d.joint_names[d.head_joints :])
-
-
 def lifting_joints(d: SnakeDescription) -> tuple[str, ...]:
     """Return the names of the pitch joints on the axles of pairs 1, 2, …, except the last; pair 1's joint carries the
     head.
@@ -221,6 +214,7 @@ def snake_tree(
         if not isinstance(motor, Servo) or motor.velocity_mode != velocity_mode:
             key, follows = ("wheel_servo", "rates") if velocity_mode else ("joint_servo", "positions")
             raise ModelError(f"plant.dynamics.{key}: must be a servo that follows {follows}, such as the default")
+    pairs, lengths = tuple(f"pair{k + 1}" for k in range(d.pairs)), np.full(d.base_joints, l)
     robot = SnakeTree(
         "snake",
         tuple(links),
@@ -228,7 +222,7 @@ def snake_tree(
         (HEAD, np.array([l + d.point_offset, 0.0, 0.0])),
         feet=tuple(feet),
         description=d,
-        base_part=snake_base_part(d),
+        base_part=BasePart(pairs, lengths, lengths, d.half_track, d.wheel_radius, "phi", d.joint_names[n_h:]),
         lifts=lifts,
         sag_compensation=sag_compensation,
         raised=raised,

@@ -353,13 +353,9 @@ def compile_drives(
     table = np.zeros((len(robot.motors), ka.DRIVE_SIZE), dtype=np.int64)
     motor = np.zeros((len(robot.motors), ka.MOTOR_SIZE))
     inputs = np.zeros((len(robot.motors), ka.INPUT_SIZE))
-    circuits = 0
+    circuits, commanded = 0, ka.AT_TICKS if sampled else ka.CONTINUOUS
     for a, m in enumerate(robot.motors):
-        table[a, ka.DRIVEN], table[a, ka.CIRCUIT], table[a, ka.SAMPLED] = (
-            joints[m.joint],
-            -1,
-            ka.AT_TICKS if sampled else ka.CONTINUOUS,
-        )
+        table[a, [ka.DRIVEN, ka.CIRCUIT, ka.SAMPLED]] = joints[m.joint], -1, commanded
         if isinstance(m, Motor):
             table[a, ka.DRIVE_KIND], table[a, ka.CIRCUIT] = ka.DC_MOTOR, circuits
             table[a, ka.CURRENT_LIMITED] = np.isfinite(m.current_limit)
@@ -387,6 +383,14 @@ def _dc_motor(m: Motor, k_p: float, k_d: float) -> np.ndarray:
     return row
 
 
+def _attached(robot: Robot, body: str, point: np.ndarray, user: str) -> tuple[int, np.ndarray]:
+    """Return the index of a body and a point in its frame, see :meth:`Robot.attach`; errors begin with ``user``."""
+    try:
+        return robot.attach(body, point)
+    except ModelError as error:
+        raise ModelError(f"{user}: {error}") from None
+
+
 def compile_contacts(robot: Robot, contacts: Sequence[Contact], floors: np.ndarray | None = None) -> ka.ContactArrays:
     """Return the tables of the contact points.
 
@@ -407,10 +411,7 @@ def compile_contacts(robot: Robot, contacts: Sequence[Contact], floors: np.ndarr
     link = np.zeros((len(contacts), ka.CONTACT_LINK_SIZE), dtype=np.int64)
     point = np.zeros((len(contacts), ka.POINT_SIZE))
     for k, contact in enumerate(contacts):
-        try:
-            body, on_body = robot.attach(contact.body, contact.point)
-        except ModelError as error:
-            raise ModelError(f"contact {contact.name}: {error}") from None
+        body, on_body = _attached(robot, contact.body, contact.point, f"contact {contact.name}")
         surface = contact.surface
         link[k, ka.LINK], link[k, ka.FRICTION_LAW] = body, _FRICTION[contact.pulling_friction]
         link[k, ka.LEFT_OUT] = contact.left_out
@@ -442,10 +443,7 @@ def compile_loads(robot: Robot, loads: Sequence[Load]) -> LoadArrays:
     parts: list[np.ndarray] = []
     offset = 0
     for k, load in enumerate(loads):
-        try:
-            body, on_body = robot.attach(load.body, load.point)
-        except ModelError as error:
-            raise ModelError(f"load {load.name}: {error}") from None
+        body, on_body = _attached(robot, load.body, load.point, f"load {load.name}")
         segments = np.column_stack([load.knots[:-1], load.coefficients.reshape(len(load.coefficients), 24)])
         table[k] = body, load.in_body, load.hold, offset, len(segments)
         parts += [on_body, np.zeros(6), segments.ravel(), load.knots[-1:]]

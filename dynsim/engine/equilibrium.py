@@ -81,7 +81,7 @@ def balanced(
     loads: Sequence[Load],
     control: JointControl,
     real: bool,
-    requested: Array | None = None,
+    requested: Array,
 ) -> Balance:
     """Compute the start at rest of a robot under its controller.
 
@@ -97,8 +97,8 @@ def balanced(
         Controller with its references.
     real : bool
         True for the unilateral law.
-    requested : (nq,) ndarray, optional
-        Posture before :func:`pressed`, in which references start; default: the initial posture.
+    requested : (nq,) ndarray
+        Posture before :func:`pressed`, in which references start.
 
     Returns
     -------
@@ -111,7 +111,6 @@ def balanced(
         If no torques hold the posture.
     """
     robot, motors = model.robot, model.robot.motors
-    requested = robot.initial if requested is None else requested
     index = [model.joint_names.index(motor.joint) for motor in motors]
     begin, rate = _begin(control.reference, len(motors))
     current, shift, on_edge = np.zeros(len(motors)), np.zeros(len(motors)), False
@@ -219,17 +218,13 @@ def _torque_joints(model: Model, control: JointControl) -> list[str]:
 
 def shifted(reference: ReferenceArrays, shift: Array) -> ReferenceArrays:
     """Return the references, each shifted by a constant."""
-    coefficients = reference.coefficients.copy()
-    for a, column in enumerate(reference.spline):
-        if column >= 0:
-            coefficients[:, column, 0] += shift[a]
+    coefficients, moving = reference.coefficients.copy(), reference.spline >= 0
+    coefficients[:, reference.spline[moving], 0] += shift[moving]
     return reference._replace(held=reference.held + shift, coefficients=coefficients, spline=reference.spline.copy())
 
 
 def _begin(reference: ReferenceArrays, motors: int) -> tuple[Array, Array]:
     """Return values and rates of the references at their start, both (na,)."""
-    begin, rate = reference.held.copy(), np.zeros(motors)
-    for a, column in enumerate(reference.spline):
-        if column >= 0:
-            begin[a], rate[a] = reference.coefficients[0, column, :2]
+    begin, rate, moving = reference.held.copy(), np.zeros(motors), reference.spline >= 0
+    begin[moving], rate[moving] = reference.coefficients[0, reference.spline[moving], :2].T
     return begin, rate

@@ -73,17 +73,6 @@ class MotionSpread:
 
 
 @dataclass(frozen=True)
-class Sharing:
-    """Contacts, and joints that dry friction keeps at rest, whose forces the motion does not determine.
-
-    Contacts of a snake, and the joints of its wheels, have the names of the wheels.
-    """
-
-    contacts: list[str]
-    joints: list[str]
-
-
-@dataclass(frozen=True)
 class ContactMatrices:
     """A(σ) = A0 − B diag(σ) of one state, A(σ) f = rhs, for the p active rows.
 
@@ -384,8 +373,8 @@ def acceleration_range(system: System, t: float, y: Array) -> tuple[Array, Array
 
 
 def sharing(
-    model: Model, contacts: Sequence[Contact], q: Array, modes: Array, rests: NDArray[np.bool_] | None = None
-) -> Sharing:
+    model: Model, contacts: Sequence[Contact], q: Array, modes: Array, rests: NDArray[np.bool_]
+) -> tuple[list[str], list[str]]:
     """Find contacts and joints whose rows depend on each other, in one sample of each set of modes.
 
     The sample is the first with the most joints at rest: dependent rows stay dependent when rows are added. Contacts
@@ -405,16 +394,16 @@ def sharing(
         Positions of the samples [rad or m].
     modes : (T, c) ndarray
         Contact modes: OPEN, SLIDING or STICKING of dynsim.dynamics.tables.
-    rests : (T, n) ndarray of bool, optional
+    rests : (T, n) ndarray of bool
         Joints that dry friction keeps at rest.
 
     Returns
     -------
-    Sharing
-        Names of the contacts and joints.
+    contacts, joints : list of str
+        Names of the contacts, and of the joints that dry friction keeps at rest. Contacts of a snake, and the joints of
+        its wheels, have the names of the wheels.
     """
     free = free_rates(model)
-    rests = np.zeros((len(modes), model.n), dtype=bool) if rests is None else rests
     shared: set[int] = set()
     order = np.argsort(-rests.sum(axis=1), kind="stable")
     first = order[np.unique(modes[order], axis=0, return_index=True)[1]]
@@ -433,10 +422,8 @@ def sharing(
         rank = int(np.count_nonzero(sizes > DEPENDENT))
         shared.update(np.array(owner, dtype=int)[np.abs(left[:, rank:]).max(axis=1, initial=0.0) > DEPENDENT].tolist())
     c = len(contacts)
-    return Sharing(
-        [contacts[k].name for k in sorted(shared) if k < c],
-        [model.joint_names[k - c] for k in sorted(shared) if k >= c],
-    )
+    names = [contact.name for contact in contacts] + list(model.joint_names)
+    return [names[k] for k in sorted(shared) if k < c], [names[k] for k in sorted(shared) if k >= c]
 
 
 def free_rates(model: Model) -> Array:

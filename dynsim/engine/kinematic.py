@@ -6,6 +6,7 @@ import logging
 import math
 import time as clock
 from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -32,7 +33,7 @@ from dynsim.engine.gripper import (
 )
 from dynsim.engine.outcome import check_size, interrupted, run_to_end
 from dynsim.engine.recording import pictured_parts, provenance
-from dynsim.engine.snake_control import OBSTACLES, SnakeControl, control_periods, copy_of
+from dynsim.engine.snake_control import OBSTACLES, SnakeControl, control_periods
 from dynsim.errors import ModelError, SimulationStopped
 from dynsim.jit.kernel import reals
 from dynsim.library.families import member
@@ -60,10 +61,6 @@ OUT_OF_REACH = 1.0
 
 ESTIMATE_ERROR = 1e-3
 """Errors of the controller's head position estimate above this [m] are reported."""
-
-
-def _wrapped(angle: NDArray[np.float64]) -> NDArray[np.float64]:
-    return angle - 2.0 * np.pi * np.floor((angle + np.pi) / (2.0 * np.pi))
 
 
 def attitude(w: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -112,7 +109,8 @@ def add_task(
     """
     # Angles of w on the branch of the target, to avoid jumps by 2 pi.
     w = w.copy()
-    w[:, 3:] = trace.w_target[:, 3:] + _wrapped(w[:, 3:] - trace.w_target[:, 3:])
+    off = w[:, 3:] - trace.w_target[:, 3:]
+    w[:, 3:] = trace.w_target[:, 3:] + (off - 2.0 * np.pi * np.floor((off + np.pi) / (2.0 * np.pi)))
     position_error = np.linalg.norm(w[:, :3] - trace.w_target[:, :3], axis=1)
     attitude_error = attitude_distance(w, trace.w_target)
     grounded = run.controller.law.grounded[trace.mode]
@@ -146,28 +144,17 @@ def add_task(
     add("posture", points, "m", labels=labels, description="polyline: controlled point, joints, axles to the tail")
 
 
-def _waiting_for(counts: NDArray[np.int64], period: float) -> dict[str, float]:
-    """Return the reasons for which the target waited, with durations [s]; reasons that did not occur are omitted."""
-    known = counts[ss.WAITED_FOR + 1 : ss.PATH_SLOWED]
-    ticks = [*known, counts[ss.WAITED] - known.sum()]
-    return {name: float(count * period) for name, count in zip(OBSTACLES, ticks, strict=True) if count}
-
-
-def _out_of_reach(counts: NDArray[np.int64], period: float, duration: float) -> dict[str, Any] | None:
-    """Return start time and reason of a wait that lasts to the end of the run, or None."""
-    still = float(counts[ss.STILL] * period)
-    if still < OUT_OF_REACH:
-        return None
-    return {"since_s": duration - still, "reason": OBSTACLES[counts[ss.STILL_FOR] - 1]}
-
-
 def task_summary(run: SnakeControl, record: Record) -> dict[str, Any]:
     """Return the controller's part of ``summary.json``."""
     description, law, period = run.description, run.controller.law, run.controller.schedule.period
     counts = run.state.counts
     phi, w, at_limit = record["phi"], record["w"], record["at_limit"]
     beyond = np.maximum(phi - description.upper, description.lower - phi)
-    duration = float(record.time[-1])
+    # Reasons for which the target waited, in periods, and the end of a wait that lasts to the end of the run [s].
+    known, still = counts[ss.WAITED_FOR + 1 : ss.PATH_SLOWED], float(counts[ss.STILL] * period)
+    waited = zip(OBSTACLES, [*known, counts[ss.WAITED] - known.sum()], strict=True)
+    since = float(record.time[-1]) - still
+    gone = {"since_s": since, "reason": OBSTACLES[counts[ss.STILL_FOR] - 1]} if still >= OUT_OF_REACH else None
     return {
         "final_position_error_m": float(record["position_error"][-1]),
         "final_attitude_error_rad": float(record["attitude_error"][-1]),
@@ -180,10 +167,10 @@ def task_summary(run: SnakeControl, record: Record) -> dict[str, Any]:
         "joint_limit_violation_max_rad": float(max(beyond.max(), 0.0)),
         "joints_taken_out": [description.joint_names[j] for j in np.flatnonzero((at_limit == 1).any(axis=0))],
         "waiting_s": float(counts[ss.WAITED] * period),
-        "waiting_for_s": _waiting_for(counts, period),
+        "waiting_for_s": {reason: float(count * period) for reason, count in waited if count},
         "path_slowed_s": float(counts[ss.PATH_SLOWED] * period),
         "path_late_s": float(run.state.progress[ss.LATE] * period),
-        "out_of_reach": _out_of_reach(counts, period, duration),
+        "out_of_reach": gone,
         "slowed_s": float(counts[ss.SLOWED] * period),
         "null_space_reduced_s": float(counts[ss.NULL_REDUCED] * period),
         "clamped_joint_ticks": int(counts[ss.CLAMPED]),
@@ -496,7 +483,7 @@ class SnakeRun(SnakeControl):
 
     def load_kernels(self) -> None:
         """Compile or load the kernels, so that this is not counted as simulation time."""
-        law, schedule, trial = self.controller.law, self.controller.schedule, copy_of(self.state)
+        law, schedule, trial = self.controller.law, self.controller.schedule, deepcopy(self.state)
         trace = new_trace(self.model, 1)
         run_ticks(self.model, law, schedule, trial, self.block.velocity, 0, 1, 1, 1, self.ws, trace)
         record_row(self.model, law, trial, self.ws, 0, trace)

@@ -276,7 +276,10 @@ def prepare(
         recall("inertia", lambda: check_inertia(model), model)
     loads = build.loads(scenario, robot)
     if pushable:
-        loads = [*loads, *(_push(body) for body in robot.bodies)]
+        # Wrenches that only the caller sets.
+        nothing = np.zeros((0, 6, 4))
+        pushes = [Load(body, body, np.zeros(3), False, np.zeros(1), nothing, False) for body in robot.bodies]
+        loads = [*loads, *pushes]
     n, na, c = model.n, len(robot.motors), len(contacts)
     real = scenario.config.contacts.law == "unilateral"
     stops = joint_stops(robot) if real else []
@@ -512,20 +515,15 @@ def _breaks(loads: Sequence[Load], control: JointControl, method: int, options: 
 
     For an implicit method, include the times at which references bend: their knots are closer than its steps are long.
     """
-    times = [load.knots for load in loads if len(load.coefficients) and (not load.hold or _varies(load))]
+    times = []
+    for load in loads:
+        varies = len(load.coefficients) > 1 or load.coefficients[:, :, 1:].any()
+        if len(load.coefficients) and (varies or not load.hold):
+            times.append(load.knots)
     if by_number(method).adaptive and not by_number(method).explicit:
         tolerances = options.rtol, options.absolute_tolerance
         times.append(recall("bends", lambda: control.bends(*tolerances), control, *tolerances))
     return np.unique(np.concatenate(times)) if times else np.zeros(0)
-
-
-def _varies(load: Load) -> bool:
-    return len(load.coefficients) > 1 or bool(load.coefficients[:, :, 1:].any())
-
-
-def _push(body: str) -> Load:
-    """Return a wrench on a body that only the caller sets."""
-    return Load(body, body, np.zeros(3), False, np.zeros(1), np.zeros((0, 6, 4)), False)
 
 
 def sample_times(scenario: Scenario, layout: StateLayout, columns: OutputLayout, links: int) -> np.ndarray:

@@ -25,7 +25,7 @@ from dynsim.dynamics.contact.unilateral import UnilateralArrays
 from dynsim.dynamics.tree import support as ks
 from dynsim.engine.link_sensors import AppliedWrench, add_link_sensors
 from dynsim.engine.prepare import Prepared
-from dynsim.engine.ring import counted_within
+from dynsim.engine.ring import counted_within, time_shares
 from dynsim.engine.warnings import warnings_of
 from dynsim.errors import RecordError
 from dynsim.integrators import run as ki
@@ -387,11 +387,7 @@ def _rms(time: Array, values: Array) -> Array:
     """Return the root mean square over time of each row, (k, T) → (k,)."""
     if len(time) < 2:
         return np.abs(values).max(axis=1, initial=0.0)
-    # Half of each interval belongs to the sample at each end.
-    weight = np.zeros(len(time))
-    weight[:-1] = np.diff(time)
-    weight[1:] += weight[:-1].copy()
-    mean: Array = (values * values) @ weight / (2.0 * (time[-1] - time[0]))
+    mean: Array = (values * values) @ time_shares(time) / (time[-1] - time[0])
     return np.sqrt(mean)
 
 
@@ -618,30 +614,26 @@ def _by_column(table: NDArray[np.float64]) -> NDArray[np.float64]:
 def _add_unilateral(record: Record, prepared: Prepared) -> None:
     """Add modes of the contacts, and forces of joint stops, dry friction and ties."""
     run, robot = prepared.run, prepared.model.robot
-    names = tuple(contact.name for contact in prepared.contacts)
-    modes = run.outputs("contact")[:, :, kst.OUT_MODE]
+    units = {link.joint: link.units[3] for link in robot.links}
+
+    def unit(joints: Sequence[str]) -> str:
+        return " or ".join(dict.fromkeys(units[joint] for joint in joints))
+
+    names, modes = tuple(contact.name for contact in prepared.contacts), run.outputs("contact")[:, :, kst.OUT_MODE]
     record.add("contact_mode", modes, "1", labels=names, description="0 off its surface, 1 sliding, 2 sticking")
     if prepared.stops:
-        units = {link.joint: link.units[3] for link in robot.links}
-        joints = tuple(dict.fromkeys(stop.joint for stop in prepared.stops))
+        joints, text = tuple(dict.fromkeys(stop.joint for stop in prepared.stops)), "positive at a lower limit"
         force = np.zeros((len(record), len(joints)))
         for stop, column in zip(prepared.stops, run.outputs("stop").T, strict=True):
             force[:, joints.index(stop.joint)] += stop.side * column
-        unit = " or ".join(dict.fromkeys(units[joint] for joint in joints))
-        record.add(
-            "stop_force", force, unit, labels=joints, description="force of joint stops; positive at a lower limit"
-        )
+        record.add("stop_force", force, unit(joints), labels=joints, description=f"force of joint stops; {text}")
     if prepared.dry:
-        units = {link.joint: link.units[3] for link in robot.links}
-        joints = tuple(friction.joint for friction in prepared.dry)
-        unit = " or ".join(dict.fromkeys(units[joint] for joint in joints))
-        record.add("joint_friction", run.outputs("dry"), unit, labels=joints, description="dry friction on the joints")
+        joints, force = tuple(friction.joint for friction in prepared.dry), run.outputs("dry")
+        record.add("joint_friction", force, unit(joints), labels=joints, description="dry friction on the joints")
     if robot.ties:
-        unit = " or ".join(dict.fromkeys("N m" if tie.turns else "N" for tie in robot.ties))
-        names = tuple(tie.name for tie in robot.ties)
-        record.add(
-            "tie_force", run.outputs("tie"), unit, labels=names, description="force on the first body of each tie"
-        )
+        names, kinds = tuple(tie.name for tie in robot.ties), ["N m" if tie.turns else "N" for tie in robot.ties]
+        text, both = "force on the first body of each tie", " or ".join(dict.fromkeys(kinds))
+        record.add("tie_force", run.outputs("tie"), both, labels=names, description=text)
 
 
 def _add_touching_points(record: Record, robot: Robot, contacts: Sequence[Contact]) -> None:

@@ -47,7 +47,7 @@ def counted_within(prepared: Prepared, happened: Sequence[Event]) -> Prepared:
     on = (touch[:, :, kst.OUT_MODE] != ka.OPEN) | (unilateral is None)
     gaps = np.where(on, touch[:, :, kst.OUT_GAP], 0.0)
     depths = np.maximum(-gaps, 0.0).max(axis=0)
-    extremes, weights = _extremes(run, touch[:, :, kst.OUT_FORCE], gaps), _shares(run.sample_time)
+    extremes, weights = _extremes(run, touch[:, :, kst.OUT_FORCE], gaps), time_shares(run.sample_time)
     system = prepared.system
     if unilateral is not None:
         tally, stop = unilateral.tally.copy(), unilateral.stop.copy()
@@ -100,7 +100,7 @@ def _extremes(run: ki.Run, force: Array, gaps: Array) -> Array:
     return extremes
 
 
-def _shares(times: Array) -> NDArray[np.float64]:
+def time_shares(times: Array) -> NDArray[np.float64]:
     """Return the time that each sample represents [s]: half of each adjacent interval."""
     halves = 0.5 * np.diff(times)
     return np.append(halves, 0.0) + np.append(0.0, halves)

@@ -46,9 +46,9 @@ from dynsim.engine.outcome import interrupted, mark_stopped, raise_stopped, run_
 from dynsim.engine.prepare import Prepared, at_start, prepare, sample_times
 from dynsim.engine.recording import make_record
 from dynsim.engine.soundness import unstable_loop
-from dynsim.engine.stepped import GUARDS, Snapshot, State, Touch, event_name, own_guards, take_log
+from dynsim.engine.stepped import GUARDS, Snapshot, State, Touch, event_name, take_log
 from dynsim.engine.stopping import last_state, stopped
-from dynsim.engine.trace import Trace
+from dynsim.engine.trace import BLOCK, Trace
 from dynsim.errors import ModelError, ScenarioError, SimulationInterrupted, SimulationStopped, brief, first_few
 from dynsim.integrators import driver
 from dynsim.integrators import run as ki
@@ -85,7 +85,8 @@ SERVO_MODES = {"position": ka.POSITION_MODE, "velocity": ka.VELOCITY_MODE, "off"
 _BUFFERS = {f"run.{field}": field for field in ("sample_time", "sample", "output")}
 # Attributes in a snapshot, copied.
 _SAVED = (
-    "_time", "_happened", "_pushed", "_past_pushes", "_base_as_planned", "_frozen", "_due", "_samples_end", "_window",
+    "_time", "_trace", "_happened", "_pushed", "_past_pushes", "_base_as_planned", "_frozen", "_due", "_samples_end",
+    "_window",
 )  # fmt: skip
 _TABLES = {f"run.{field}": field for field in ("tick", "tick_table", "event", "event_table")}
 
@@ -140,8 +141,8 @@ class Simulation:
     ((201, 10), False)
     """
 
-    # Whether the records of exceptions have scenes.
-    _pictured = True
+    # Rows of the buffer for samples; whether the records of exceptions have scenes.
+    _block, _pictured = BLOCK, True
 
     def __init__(
         self,
@@ -184,10 +185,16 @@ class Simulation:
         self._calling: Callable[[Simulation], None] | None = None
         self._loaded, self._watch = False, stopping.WallWatch(scenario.integrator.wall_limit_s)
         self._kernel = driver.direct(self._prepared.run)
-        self._guards: list[tuple[str, str, Callable[[Simulation], None] | None]] = []
         self._calls: list[Callable[[Simulation], None]] = []
         robot = self.robot
-        self._guards.extend((kind, subject, None) for kind, subject in own_guards(self._prepared))
+        # Kind, subject and callback of each guard: first those that a run has by default. Events of contacts and stops
+        # are logged under separate numbers, see event_name.
+        tipping = [] if robot.base is None else [(TIP_OVER, robot.base.body, None)]
+        unnamed = len(self._prepared.run.event) - len(tipping)
+        self._guards: list[tuple[str, str, Callable[[Simulation], None] | None]] = [
+            *tipping,
+            *[("", "", None)] * unnamed,
+        ]
         self._brakes = Brakes(scenario, self._prepared)
         self._joints = {link.joint: i for i, link in enumerate(robot.links)}
         self._motors = {motor.joint: a for a, motor in enumerate(robot.motors)}
@@ -205,7 +212,7 @@ class Simulation:
         if state is None and self._end == scenario.duration_s and trace is None:
             # Exactly the samples of simulate, including its size limit.
             times = sample_times(scenario, self._prepared.run.layout, self._prepared.run.columns, len(robot.links))
-        self._trace = Trace(start, self._end, scenario.record.rate_hz, trace, times)
+        self._trace = Trace(start, self._end, scenario.record.rate_hz, trace, times, self._block)
         self._sampled = self._prepared.system.drives.table[:, ka.SAMPLED].copy()
         reference = self._prepared.control.reference
         # Planned control, from which the target of the base is computed until a wheel is commanded otherwise.
@@ -1100,7 +1107,7 @@ class Simulation:
         tick_handlers = [handler.saved_state() for handler in self._tick_handlers]
         attributes = {name: copy(getattr(self, name)) for name in _SAVED}
         behind_brakes = self._prepared.behind_brakes
-        return Snapshot(self._token, arrays, self._trace.snapshot(), behind_brakes, tick_handlers, attributes)
+        return Snapshot(self._token, arrays, behind_brakes, tick_handlers, attributes)
 
     def restore(self, snapshot: Snapshot) -> None:
         """Restore a snapshot of this simulation; it then continues bit-identically.
@@ -1142,7 +1149,6 @@ class Simulation:
         self._swap(**{field: snapshot.arrays[name].copy() for name, field in (_BUFFERS | _TABLES).items()})
         for name, array in self._arrays().items():
             array[...] = snapshot.arrays[name]
-        self._trace.restore(snapshot.trace)
         for name, value in snapshot.attributes.items():
             setattr(self, name, copy(value))
         self._prepared = replace(self._prepared, behind_brakes=snapshot.behind_brakes)
@@ -1409,17 +1415,11 @@ class Simulation:
         raise_stopped(stopped(self._scenario, self._prepared), self.record(pictured=self._pictured))
 
     def _failed(self) -> bool:
-        """Return whether the run has ended before its regular end."""
-        return (
-            bool(self._prepared.run.count[ki.STATUS] not in (ki.RUNNING, ki.FINISHED, ki.STOPPED)) or self._overturned()
-        )
-
-    def _overturned(self) -> bool:
-        """Return whether the base has tipped and the scenario ends the run there."""
-        base = self.robot.base
-        if base is None or not base.stop_on_overturn or self._prepared.run.count[ki.STATUS] != ki.STOPPED:
-            return False
-        return any(event.kind == TIP_OVER for event in self._happened)
+        """Return whether the run has ended before its regular end, also if the base has tipped and that ends it."""
+        status, base = self._prepared.run.count[ki.STATUS], self.robot.base
+        if status == ki.STOPPED and base is not None and base.stop_on_overturn:
+            return any(event.kind == TIP_OVER for event in self._happened)
+        return bool(status not in (ki.RUNNING, ki.FINISHED, ki.STOPPED))
 
     def _settle_now(self, *, calling: bool = True) -> None:
         """End a step at the present time if it lies within one.
@@ -1675,6 +1675,8 @@ class _WholeRun(Simulation):
 
     def __init__(self, scenario: Scenario, progress: Progress | None, pictured: bool) -> None:
         self._progress, self._pictured, self._ticked = progress, pictured, commanded_by_python(scenario)
+        # Without ticks, compiled code runs to the end in one piece, and its buffer is the record.
+        self._block = BLOCK if self._ticked else 1 << 62
         # With ticks it has no end, as in a session: a step that ends at a tick and one at the end of a run may differ.
         super().__init__(scenario, duration=math.inf if self._ticked else None)
         if self._ticked:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -537,8 +538,12 @@ class SnakeControl:
             self.read_commands(waiting=self.blocked or self.recovering)
         request = int(self.block.request[now - self.block_start])
         # Only at the end of switching periods, so that every recovery has at least one.
-        if self.recovering and now >= (switcher.next_event() or 0) and self._is_released():
-            self.recovering, request = False, FIXING
+        if self.recovering and now >= (switcher.next_event() or 0):
+            # Until every base joint is well within its limit again ([T] IV.C.5: until the robot becomes operable).
+            base = slice(self.model.head_joints, None)
+            limit = self.controller.release_fraction * self.model.upper[base]
+            if np.all(np.abs(state.phi[base]) < limit):
+                self.recovering, request = False, FIXING
         state.counts[ss.MODE] = switcher.at_tick(now, request)
 
     def periods(self) -> int:
@@ -566,21 +571,13 @@ class SnakeControl:
             state=self.postures(),
         )
 
-    def _is_released(self) -> bool:
-        """Return whether every base joint is well within its limit again ([T] IV.C.5: until the robot becomes
-        operable).
-        """
-        base = slice(self.model.head_joints, None)
-        limit = self.controller.release_fraction * self.model.upper[base]
-        return bool(np.all(np.abs(self.state.phi[base]) < limit))
-
     def _predict(self, row: int) -> tuple[float, float]:
         """Return the cost after one switching period in a mode at constant command, and the smallest support margin."""
         ticks, law, real = self.controller.prediction_ticks, self.controller.law, self.controller.schedule
         schedule = self.controller.prediction
         waits = (real.null_start_tick - self.tick) * real.period  # time until the null-space motion starts [s]
         schedule = schedule._replace(null_start_tick=round(waits / schedule.period))
-        trial, trace = copy_of(self.state), new_trace(self.model, ticks + 1)
+        trial, trace = deepcopy(self.state), new_trace(self.model, ticks + 1)
         row_of_block = min(int(trial.counts[ss.CARRIED_OUT]), len(self.block.velocity) - 1)
         lasting = np.tile(self.block.velocity[row_of_block], (ticks, 1))
         trial.counts[[ss.MODE, ss.TICKS, ss.CARRIED_OUT]], trial.progress[ss.DONE] = (row, 0, 0), 0.0
@@ -591,11 +588,6 @@ class SnakeControl:
             run_ticks(self.model, law, schedule, trial, lasting, ticks - done, 0, 0, 1, self.ws, trace)
         record_row(self.model, law, trial, self.ws, ticks, trace)
         return float(trace.cost[-1]), float(trace.margin.min())
-
-
-def copy_of(state: SnakeState) -> SnakeState:
-    """Return a copy of the state with separate arrays."""
-    return SnakeState(*(array.copy() for array in state))
 
 
 def control_periods(scenario: Scenario, period: float) -> tuple[int, int]:

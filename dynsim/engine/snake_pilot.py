@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from copy import deepcopy
 from dataclasses import replace
 from typing import Any
 
@@ -24,7 +25,7 @@ from dynsim.engine.gripper import GripperControl
 from dynsim.engine.kinematic import add_task, effort, hold_last, task_summary, task_warnings
 from dynsim.engine.operator import Referenced, SampledSensor
 from dynsim.engine.saved_state import Stateful
-from dynsim.engine.snake_control import STEADY_TICKS, SnakeControl, WheelLifter, copy_of
+from dynsim.engine.snake_control import STEADY_TICKS, SnakeControl, WheelLifter
 from dynsim.engine.stepped import State
 from dynsim.errors import SimulationStopped
 from dynsim.jit.kernel import FixedSignature
@@ -201,15 +202,8 @@ class SnakePilot(Stateful, SnakeControl):
 
         def sensor(read: Callable[[State], Array], of: Any, noise: Array, resolution: Array) -> SampledSensor:
             period = self.period if of is None or of.rate_hz is None else 1.0 / of.rate_hz
-            delay = 0.0 if of is None else of.delay_s
-            return SampledSensor(
-                read,
-                period=period,
-                delay=delay,
-                noise=noise,
-                resolution=resolution,
-                seed=[config.seed, self.state_source],
-            )
+            delay, seed = 0.0 if of is None else of.delay_s, [config.seed, self.state_source]
+            return SampledSensor(read, period=period, delay=delay, noise=noise, resolution=resolution, seed=seed)
 
         if self.state_source == ss.MEASURED:
             capture = config.motion_capture
@@ -301,7 +295,7 @@ class SnakePilot(Stateful, SnakeControl):
             if end < now:
                 trace.w_target[-1] = before + (end - begun) / (now - begun) * (self.state.w_target - before)
         hold_last(trace)
-        w, points, shown, write_row = np.zeros((rows, 6)), [], copy_of(self.state), FixedSignature(record_row)
+        w, points, shown, write_row = np.zeros((rows, 6)), [], deepcopy(self.state), FixedSignature(record_row)
         for r in range(rows):
             shown.base[:], shown.phi[:], shown.w_target[:] = trace.base[r], trace.phi[r], trace.w_target[r]
             shown.rho[:], shown.counts[ss.MODE] = trace.rho[r], trace.mode[r]

@@ -10,12 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.engine.prepare import Prepared
-from dynsim.engine.trace import TraceState
 from dynsim.integrators import events
 from dynsim.integrators import run as ki
 from dynsim.integrators.contacts import events as contact_events
 from dynsim.record import Record
-from dynsim.record.measures import TIP_OVER
 
 Array = NDArray[np.float64]
 
@@ -50,16 +48,6 @@ def take_log(run: ki.Run) -> list[tuple[float, int]]:
     logged = int(run.count[ki.LOGGED])
     run.count[ki.LOGGED] = 0
     return list(zip(run.log_time[:logged].tolist(), run.log_event[:logged].tolist(), strict=True))
-
-
-def own_guards(prepared: Prepared) -> list[tuple[str, str]]:
-    """Return kind and subject of the events that a run watches for by default, in the order of its guards.
-
-    Events of contacts and stops are logged under separate numbers: :func:`event_name`.
-    """
-    base = prepared.model.robot.base
-    tipping = [] if base is None else [(TIP_OVER, base.body)]
-    return tipping + [("", "")] * (len(prepared.run.event) - len(tipping))
 
 
 def event_name(prepared: Prepared, number: int) -> tuple[str, str] | None:
@@ -171,7 +159,6 @@ class Snapshot:
 
     owner: object
     arrays: dict[str, NDArray[Any]]
-    trace: TraceState
     behind_brakes: Mapping[str, float]
     tick_handlers: list[dict[str, Any]]
     attributes: dict[str, Any]

@@ -26,7 +26,6 @@ from dynsim.engine.soundness import unstable_stop
 from dynsim.errors import SimulationStopped
 from dynsim.integrators import driver
 from dynsim.integrators import run as ki
-from dynsim.integrators import run as kp
 from dynsim.integrators.methods import by_number
 from dynsim.integrators.stepping import tables as kt
 from dynsim.scenario import Scenario
@@ -507,7 +506,7 @@ def _reason(scenario: Scenario, prepared: Prepared) -> str:
         )
     ws = prepared.workspace
     gaps, rates = ws.rows[: ws.counts[ka.ROWS], [ka.ROW_GAP, ka.ROW_RATE]].T
-    worst = int(np.argmax(np.maximum(np.abs(gaps) / kp.GAP_TOLERANCE, np.abs(rates) / kp.RATE_TOLERANCE)))
+    worst = int(np.argmax(np.maximum(np.abs(gaps) / ki.GAP_TOLERANCE, np.abs(rates) / ki.RATE_TOLERANCE)))
     owner = int(ws.active[worst, ka.OWNER])
     if ws.active[worst, ka.ROW_KIND] == ka.JOINT_ROW:
         couplings = prepared.model.robot.couplings

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import deque
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +11,6 @@ from dynsim.integrators import run as ki
 
 Array = NDArray[np.float64]
 Rows = tuple[Array, Array, Array]
-TraceState = tuple[tuple[Rows, ...], int, float, Array | None]
 
 # Rows of the buffer that kernels write samples to before it is emptied.
 BLOCK = 256
@@ -59,7 +57,7 @@ def _times(start: float, rate: float, numbers: NDArray[np.int64]) -> Array:
 
 
 class Trace:
-    """Times, states and outputs of samples.
+    """Times, states and outputs of samples; a shallow copy is a snapshot, because values are replaced.
 
     Parameters
     ----------
@@ -73,11 +71,16 @@ class Trace:
         Number of last samples to keep; None for all, 0 for none.
     times : (T,) ndarray, optional
         Times of all samples if known in advance [s].
+    block : int, optional
+        Rows of the buffer.
     """
 
-    def __init__(self, start: float, end: float, rate: float, keep: int | None, times: Array | None = None) -> None:
+    def __init__(
+        self, start: float, end: float, rate: float, keep: int | None, times: Array | None = None, block: int = BLOCK
+    ) -> None:
+        self._size = block
         self._start, self._end, self._rate, self._keep, self._times = start, end, rate, keep, times
-        self._rows: deque[Rows] = deque()
+        self._rows: tuple[Rows, ...] = ()
         self._next = 0
 
     def end_at(self, end: float, run: ki.Run) -> None:
@@ -93,23 +96,27 @@ class Trace:
     def taken(self, run: ki.Run) -> Rows:
         """Return the contents of the run's buffer."""
         rows = int(run.count[ki.SAMPLE])
-        return run.sample_time[:rows].copy(), run.sample[:rows].copy(), run.output[:rows].copy()
+        return run.sample_time[:rows], run.sample[:rows], run.output[:rows]
 
     def move(self, run: ki.Run, until: float = -np.inf) -> Array:
         """Keep the buffer's contents and return the next sample times [s], at least up to ``until`` and one more."""
-        taken = self.taken(run)
-        if len(taken[0]):
-            self._rows.append(taken)
+        times, states, outputs = self.taken(run)
+        if len(times):
+            self._rows = (*self._rows, (times.copy(), states.copy(), outputs.copy()))
             kept = sum(len(times) for times, _, _ in self._rows)
             while self._keep is not None and kept - len(self._rows[0][0]) >= self._keep:
-                kept -= len(self._rows.popleft()[0])
-        self._next += len(taken[0])
+                kept -= len(self._rows[0][0])
+                self._rows = self._rows[1:]
+        self._next += len(times)
         return self._block(until)
 
     def rows(self, run: ki.Run) -> Rows:
         """Return all kept samples, including the run's buffer."""
-        parts = zip(*self._rows, self.taken(run), strict=True)
-        times, states, outputs = (np.concatenate(part) for part in parts)
+        times, states, outputs = self.taken(run)
+        # The buffer of an ended run does not change any more; it need not be copied.
+        if self._rows or run.count[ki.STATUS] == ki.RUNNING:
+            parts = zip(*self._rows, (times, states, outputs), strict=True)
+            times, states, outputs = (np.concatenate(part) for part in parts)
         first = 0 if self._keep is None else max(len(times) - self._keep, 0)
         return times[first:], states[first:], outputs[first:]
 
@@ -117,20 +124,11 @@ class Trace:
         """Return the outputs of the last kept sample."""
         return self._rows[-1][2][-1] if self._rows else None
 
-    def snapshot(self) -> TraceState:
-        """Return a snapshot for :meth:`restore`; rows are never modified, so they are shared."""
-        return tuple(self._rows), self._next, self._end, self._times
-
-    def restore(self, snapshot: TraceState) -> None:
-        """Restore a snapshot."""
-        rows, self._next, self._end, self._times = snapshot
-        self._rows = deque(rows)
-
     def _block(self, until: float) -> Array:
         """Return the next sample times [s]; infinite times are never reached."""
         if self._keep == 0:
             return np.full(1, np.inf)
-        first, count = self._next, BLOCK
+        first, count = self._next, self._size
         if self._times is not None:
             more = int(np.searchsorted(self._times, until, side="right")) - first
             times = self._times[first : first + max(count, more + 1)].copy()

@@ -235,13 +235,6 @@ def _limits_of(motor: Drive, unit: str) -> list[tuple[str, str, float, str]]:
     return limits
 
 
-def _sliding(record: Record, contacts: Sequence[Contact], names: Sequence[str], samples: Any) -> list[str]:
-    """Return the named contacts that slide with friction in at least one of the samples; ``samples`` is an index."""
-    slides = (record["contact_mode"][samples] == ka.SLIDING).any(axis=0)
-    slides &= np.array([contact.friction > 0.0 for contact in contacts], dtype=bool)
-    return _named(contacts, slides, names)
-
-
 def _named(contacts: Sequence[Contact], chosen: NDArray[np.bool_], names: Sequence[str]) -> list[str]:
     """Return the names whose contacts are chosen, in the order of the contacts; ``chosen`` has shape (c,)."""
     return [contact.name for contact, own in zip(contacts, chosen, strict=True) if own and contact.name in names]
@@ -279,8 +272,7 @@ def _shared_forces(record: Record, prepared: Prepared, dependent: bool, stepped:
     contacts, rests = prepared.contacts, _joints_at_rest(record, prepared)
     if not len(record) or not (dependent or stepped or rests.any()):
         return []
-    shared = sharing(prepared.model, contacts, record["q"], record["contact_mode"], rests)
-    touching, joints = shared.contacts, shared.joints
+    touching, joints = sharing(prepared.model, contacts, record["q"], record["contact_mode"], rests)
     if joints and not touching:
         return [
             f"{first_few(joints)}: shared dry friction forces keep these coupled joints at rest; the motion does not "
@@ -288,11 +280,15 @@ def _shared_forces(record: Record, prepared: Prepared, dependent: bool, stepped:
         ]
     if not touching:
         return []
-    sliding = _sliding(record, contacts, touching, rests.any(axis=1) if joints else slice(None))
+    modes, friction = record["contact_mode"], np.array([contact.friction > 0.0 for contact in contacts], dtype=bool)
+    slides = (modes[rests.any(axis=1) if joints else slice(None)] == ka.SLIDING).any(axis=0) & friction
+    sliding = _named(contacts, slides, touching)
     verb = "slides" if len(sliding) == 1 else "slide"
     motion = f"; while {first_few(sliding)} {verb}, other solutions may move differently" if sliding else ""
     if joints:
-        if not sliding and (leaving := _leaving(record, contacts, touching, rests)):
+        # From sticking to open while dry friction keeps joints at rest.
+        leaves = (modes[:-1] == ka.STICKING) & (modes[1:] == ka.OPEN) & rests[:-1].any(axis=1, keepdims=True)
+        if not sliding and (leaving := _named(contacts, leaves.any(axis=0), touching)):
             leave = "leaves its surface" if len(leaving) == 1 else "leave their surfaces"
             motion = f"; when {first_few(leaving)} {leave}, other solutions may move differently"
         return [
@@ -319,13 +315,6 @@ def _others_closed(record: Record, k: int, since: float) -> bool:
     first = min(int(np.searchsorted(record.time, since)), len(record) - 1)
     others = np.delete(record["contact_mode"][first:], k, axis=1)
     return bool((others != ka.OPEN).any())
-
-
-def _leaving(record: Record, contacts: Sequence[Contact], names: Sequence[str], rests: NDArray[np.bool_]) -> list[str]:
-    """Return the named contacts that change from sticking to open while dry friction keeps joints at rest."""
-    modes = record["contact_mode"]
-    leaves = (modes[:-1] == ka.STICKING) & (modes[1:] == ka.OPEN) & rests[:-1].any(axis=1, keepdims=True)
-    return _named(contacts, leaves.any(axis=0), names)
 
 
 def _not_unique(record: Record, prepared: Prepared, begun: float) -> list[str]:
@@ -454,18 +443,12 @@ def _passed_limits(record: Record, robot: Robot, real: bool) -> list[str]:
         position, velocity, _, force = link.units
         if not len(q):
             continue
-        below, above = link.lower - q, q - link.upper
+        below, above, effort = link.lower - q, q - link.upper, np.abs(torque.get(link.joint, np.zeros_like(q)))
         for quantity, limit, unit, beyond, note in (
             ("lower position", link.lower, position, below, _after_passing(below[-1], position, real)),
             ("upper position", link.upper, position, above, _after_passing(above[-1], position, real)),
             ("velocity", link.velocity_limit, velocity, np.abs(v) - link.velocity_limit, NOT_ENFORCED),
-            (
-                "effort",
-                link.effort_limit,
-                force,
-                np.abs(torque.get(link.joint, np.zeros_like(q))) - link.effort_limit,
-                NOT_ENFORCED,
-            ),
+            ("effort", link.effort_limit, force, effort - link.effort_limit, NOT_ENFORCED),
         ):
             over = np.flatnonzero(beyond > LIMIT_SLACK)
             if over.size:

@@ -188,28 +188,22 @@ class Link:
         return tuple(f"{self.joint_of_rows}.{name}" for name in row.names) or (self.joint,) * len(row.neutral)
 
 
+def without_body(link: Link) -> Link:
+    """Return the link without mass, extent and shapes."""
+    return replace(link, inertia=Inertia(0.0), radius=0.0, tip=None, shapes=())
+
+
 def in_rows(link: Link, rows: Sequence[tuple[str, str, Array]]) -> tuple[Link, ...]:
     """Return a joint of several rows, (suffix, kind, axis); the last carries the body of ``link``, others no mass."""
     made: list[Link] = []
     for suffix, kind, axis in rows:
-        last, first = len(made) == len(rows) - 1, not made
-        made.append(
-            replace(
-                link,
-                name=link.name if last else f"{link.name}.{suffix}",
-                joint=f"{link.joint}.{suffix}",
-                parent=link.parent if first else made[-1].name,
-                kind=kind,
-                axis=np.asarray(axis, dtype=np.float64),
-                inertia=link.inertia if last else Inertia(0.0),
-                R_PJ=link.R_PJ if first else np.eye(3),
-                p_PJ=link.p_PJ if first else np.zeros(3),
-                radius=link.radius if last else 0.0,
-                tip=link.tip if last else None,
-                shapes=link.shapes if last else (),
-                joint_of_rows=link.joint,
-            )
-        )
+        turned = np.asarray(axis, dtype=np.float64)
+        row = replace(link, joint=f"{link.joint}.{suffix}", kind=kind, axis=turned, joint_of_rows=link.joint)
+        if len(made) < len(rows) - 1:
+            row = replace(without_body(row), name=f"{link.name}.{suffix}")
+        if made:
+            row = replace(row, parent=made[-1].name, R_PJ=np.eye(3), p_PJ=np.zeros(3))
+        made.append(row)
     return tuple(made)
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -30,7 +30,12 @@ _BALL = ["ball_x", "ball_y", "ball_z"]
 
 
 def write_mjcf(
-    robot: Robot, contacts: Sequence[Contact], surfaces: Sequence[SceneSurface], damping: Array, armature: Array
+    robot: Robot,
+    contacts: Sequence[Contact],
+    surfaces: Sequence[SceneSurface],
+    damping: Array,
+    armature: Array,
+    rubs: Mapping[str, float],
 ) -> str:
     """Write the bodies, joints, torques and visual shapes of a robot as MJCF text.
 
@@ -44,6 +49,8 @@ def write_mjcf(
         Planes, spheres, cylinders and boxes are drawn.
     damping, armature : (n,) ndarray
         Values of each row of the joints [N m s/rad, kg m²; N s/m, kg].
+    rubs : mapping of str to float
+        Dry friction of bearing and gear, for each joint that has any [N m or N].
 
     Raises
     ------
@@ -52,7 +59,6 @@ def write_mjcf(
     """
     if robot.ties:
         raise ModelError(f"{robot.ties[0].name}: ties between bodies cannot be exported to MJCF")
-    rubs = _dry_friction(robot)
     root = Element("mujoco", model=robot.name)
     ElementTree.SubElement(root, "compiler", angle="radian", autolimits="true", inertiafromgeom="false")
     ElementTree.SubElement(root, "option", timestep="0.001", integrator="implicitfast", gravity=numbers(robot.gravity))
@@ -114,7 +120,9 @@ def _joints(robot: Robot) -> list[list[Link]]:
     return list(groups.values())
 
 
-def _add_joints(body: Element, group: Sequence[Link], rubs: dict[str, float], damping: Array, armature: float) -> None:
+def _add_joints(
+    body: Element, group: Sequence[Link], rubs: Mapping[str, float], damping: Array, armature: float
+) -> None:
     """Add the joints of a body; three slides and a ball of a body that is free in the world become one free joint."""
     kinds = [link.kind for link in group]
     first = group[0]
@@ -128,20 +136,11 @@ def _add_joints(body: Element, group: Sequence[Link], rubs: dict[str, float], da
             ElementTree.SubElement(body, "joint", {**common, "type": "ball"})
         elif link.kind in _SIMPLE:
             joint = {**common, "type": _SIMPLE[link.kind], "axis": numbers(link.axis)}
-            if rubs[link.joint] > 0.0:
+            if link.joint in rubs:
                 joint["frictionloss"] = numbers(rubs[link.joint])
             if math.isfinite(link.lower) and math.isfinite(link.upper):
                 joint["range"] = numbers([link.lower, link.upper])
             ElementTree.SubElement(body, "joint", joint)
-
-
-def _dry_friction(robot: Robot) -> dict[str, float]:
-    """Return the dry friction of bearings and gears for each joint [N m or N]."""
-    rubs = {link.joint: link.friction for link in robot.links}
-    for motor in robot.motors:
-        if not isinstance(motor, TorqueSource):
-            rubs[motor.joint] += motor.dry_friction
-    return rubs
 
 
 def _add_inertial(body: Element, link: Link) -> None:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,25 +19,6 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 # Quadrics that spheres and capsules can touch.
 SIMPLE = ("plane", "sphere", "cylinder")
-
-
-class Surface(Protocol):
-    """Surface; its free side is where the distance is positive."""
-
-    def gap(self, position: Array) -> float:
-        """Return the signed distance of a point, (3,), along the normal [m]."""
-
-    def gaps(self, positions: Array) -> Array:
-        """Return :meth:`gap` of many points, (T, 3) → (T,) [m]."""
-
-    def normal(self, position: Array) -> Array:
-        """Return the unit normal at a point, (3,), to the free side."""
-
-    def normals(self, positions: Array) -> Array:
-        """Return :meth:`normal` at many points, (T, 3) → (T, 3)."""
-
-    def shifted(self, by: Array) -> Surface:
-        """Return the surface moved by a vector [m]."""
 
 
 @dataclass(frozen=True)
@@ -115,17 +95,8 @@ class Quadric:
         return SceneSurface.of_quadric("", self.Q, self.b, self.c)
 
 
-class _Shaped(ABC):
+class _Shaped:
     """Distances by the kernels of dynsim.dynamics.contact.distance."""
-
-    @abstractmethod
-    def shifted(self, by: Array) -> Surface:
-        """Return the surface moved by a vector [m]."""
-
-    @property
-    def shapes(self) -> ShapeArrays:
-        """Return the table of a point candidate on this surface."""
-        return shape_arrays([(self, 0.0, np.zeros(3), False)])
 
     def gap(self, position: Array) -> float:
         """Return the signed distance of a point, (3,), along the normal [m]."""
@@ -148,7 +119,8 @@ class _Shaped(ABC):
 
         points = np.array(positions, dtype=np.float64, order="C")
         gaps, normals = np.zeros(len(points)), np.zeros((len(points), 3))
-        surface_distances(self.shapes, points, gaps, normals)
+        assert isinstance(self, Box | HeightField)
+        surface_distances(shape_arrays([(self, 0.0, np.zeros(3), False)]), points, gaps, normals)
         return gaps, normals
 
 
@@ -209,8 +181,8 @@ class HeightField(_Shaped):
         return _spline(_spline(self.heights).T).T
 
 
-SURFACES = Quadric | Box | HeightField
-"""Types that a member of the family ``surface`` may build."""
+Surface = Quadric | Box | HeightField
+"""Surface, as a member of the family ``surface`` builds it; its free side is where the distance is positive."""
 
 
 def _spline(values: Array) -> Array:

@@ -20,7 +20,7 @@ from dynsim.config.problems import dotted, errors_at, suggest
 from dynsim.errors import ModelError, ScenarioError, brief
 from dynsim.library import families
 from dynsim.model.description import WORLD, Array, Contact, Foot, Inertia, Load, Robot
-from dynsim.model.surfaces import SURFACES, Surface
+from dynsim.model.surfaces import Surface
 from dynsim.scenario.candidates import candidates
 from dynsim.scenario.schema import ContactPoint, Contacts, LinkSensorConfig, Payload, Scenario
 from dynsim.system.memo import recall
@@ -350,7 +350,7 @@ def surfaces(scenario: Scenario) -> dict[str, Surface]:
 
     def built() -> dict[str, Surface]:
         nominal: dict[str, Surface] = {
-            name: families.build("surface", config, context, SURFACES) for name, config in configs.items()
+            name: families.build("surface", config, context, Surface) for name, config in configs.items()
         }
         if error is None or not any(error.shift_m):
             return nominal

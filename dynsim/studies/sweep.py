@@ -7,10 +7,9 @@ import io
 import json
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, fields
+from contextlib import closing, contextmanager, suppress
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -75,13 +74,11 @@ OK, FAILED, LOST = "ok", "failed", "lost"
 
 
 @dataclass(frozen=True)
-class SweepRow:
+class SweepRow(SweepPoint):
     """One run of the table: its numbers, or the reason for its failure.
 
     Attributes
     ----------
-    run, variant, values
-        See :class:`dynsim.studies.sweep_plan.SweepPoint`.
     status : str
         ``ok``, ``failed`` (reproducibly) or ``lost`` (with its process).
     reason : str
@@ -92,9 +89,6 @@ class SweepRow:
         Warnings of its summary, in one line.
     """
 
-    run: int
-    variant: str | None
-    values: Mapping[str, Any]
     status: str
     reason: str
     numbers: Mapping[str, Any]
@@ -105,7 +99,9 @@ class SweepRow:
         """Create the row of a result."""
         status = OK if result.ok else LOST if result.lost else FAILED
         warnings = "; ".join(result.summary.get("warnings", ()))
-        return cls(point.run, point.variant, point.values, status, result.reason, numbers(result.summary), warnings)
+        return cls(
+            **vars(point), status=status, reason=result.reason, numbers=numbers(result.summary), warnings=warnings
+        )
 
     @classmethod
     def read(cls, line: str) -> SweepRow:
@@ -137,12 +133,7 @@ class SweepRow:
 
     def placed(self, point: SweepPoint) -> SweepRow:
         """Return this row with number, variant and values of a point of another plan."""
-        return SweepRow(point.run, point.variant, point.values, self.status, self.reason, self.numbers, self.warnings)
-
-    @property
-    def identity(self) -> str:
-        """See :class:`dynsim.studies.sweep_plan.SweepPoint`."""
-        return SweepPoint(self.run, self.variant, self.values).identity
+        return replace(self, **vars(point))
 
     def cells(self) -> dict[str, Any]:
         """Return the cells of the row by column."""
@@ -166,10 +157,8 @@ class SweepJournal:
         # Unbuffered: closing the file on a full disk would try to write a buffer again.
         self._stream = self._path.open("ab", buffering=0)
 
-    def __enter__(self) -> SweepJournal:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+    def close(self) -> None:
+        """Close the file."""
         self._stream.close()
 
     def add(self, row: SweepRow) -> None:
@@ -282,8 +271,8 @@ def run_sweep(
     keep_records: Keep = "none",
     resume: bool = False,
     scheduler: str | None = None,
-    progress: Callable[[int, int], None] | None = None,
-    ended: Callable[[SweepRow], None] | None = None,
+    progress: Callable[[int, int], None] = lambda completed, failed: None,
+    ended: Callable[[SweepRow], None] = lambda row: None,
 ) -> list[SweepRow]:
     """Run a plan; write plan, journal, records, tables and statistics of the samples to a folder.
 
@@ -339,7 +328,7 @@ def run_sweep(
         failed = sum(row.status != OK for row in rows.values())
         with _resumable(folder):
             write_text(folder / PLAN, json_text(header))
-            with SweepJournal(folder, rows.values()) as journal:
+            with closing(SweepJournal(folder, rows.values())) as journal:
 
                 def take(point: SweepPoint, result: RunResult) -> None:
                     nonlocal failed
@@ -349,16 +338,12 @@ def run_sweep(
                     row = rows[point.run] = SweepRow.of(point, result)
                     journal.add(row)
                     failed += row.status != OK
-                    if ended is not None:
-                        ended(row)
-                    if progress is not None:
-                        progress(len(rows), failed)
-
-                if progress is not None:
+                    ended(row)
                     progress(len(rows), failed)
-                if ended is not None:
-                    for row in rows.values():
-                        ended(row)
+
+                progress(len(rows), failed)
+                for row in rows.values():
+                    ended(row)
                 work = BatchWork(plan.scenario, keep_records)
                 try:
                     interrupted = run_all(work, left, take, jobs=jobs, scheduler=scheduler)

@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -286,7 +287,7 @@ def test_the_journal_names_itself(tmp_path: Path):
     if not Path("/dev/full").exists():
         pytest.skip("needs /dev/full")
     row = SweepRow(0, None, {}, "ok", "", {}, "")
-    with SweepJournal(tmp_path, []) as journal:
+    with closing(SweepJournal(tmp_path, [])) as journal:
         journal._stream.close()
         (tmp_path / JOURNAL).unlink()
         (tmp_path / JOURNAL).symlink_to("/dev/full")

@@ -45,8 +45,8 @@ def shared(
     model = dynsim.build_model(scenario)
     q = np.random.default_rng(3).uniform(-0.5, 0.5, (1, model.n))
     resting = np.isin(np.arange(model.n), rests or [])[None]
-    names = sharing(model, build.contacts(scenario, model.robot), q, np.array([modes], dtype=float), resting)
-    return [*names.contacts, *names.joints]
+    touching, joints = sharing(model, build.contacts(scenario, model.robot), q, np.array([modes], dtype=float), resting)
+    return [*touching, *joints]
 
 
 @pytest.mark.parametrize("modes", [[STICKING, OPEN, OPEN], [SLIDING, OPEN, OPEN], [OPEN, OPEN, OPEN]])
@@ -87,8 +87,10 @@ def test_joints_that_have_the_names_of_contacts_are_no_contacts(tmp_path: Path) 
     scenario = dynsim.load_scenario(path)
     model = dynsim.build_model(scenario)
     q, rests = np.full((1, model.n), 0.3), np.array([[True, False, False, False]])
-    names = sharing(model, build.contacts(scenario, model.robot), q, np.array([[SLIDING, OPEN, OPEN]]), rests)
-    assert (names.contacts, names.joints) == (["joint_2"], ["joint_1"])
+    touching, joints = sharing(
+        model, build.contacts(scenario, model.robot), q, np.array([[SLIDING, OPEN, OPEN]]), rests
+    )
+    assert (touching, joints) == (["joint_2"], ["joint_1"])
 
 
 def test_a_compliant_contact_shares_only_friction(tmp_path: Path) -> None:

@@ -52,8 +52,8 @@ def floating(link: Link) -> tuple[Link, ...]:
     Coordinates: position of its origin in the joint's frame, then the quaternion. Rates: velocity of the origin in the
     axes of the joint's frame, angular velocity in the axes of the body.
     """
-    from dynsim.model.description import Inertia, in_rows
+    from dynsim.model.description import in_rows, without_body
 
-    carrier = replace(link, name=f"{link.name}.position", inertia=Inertia(0.0), radius=0.0, tip=None, shapes=())
+    carrier = replace(without_body(link), name=f"{link.name}.position")
     sliding = in_rows(carrier, [(axis, "prismatic", np.eye(3)[k]) for k, axis in enumerate("xyz")])
     return (*sliding, *ball(replace(link, parent=carrier.name, R_PJ=np.eye(3), p_PJ=np.zeros(3))))
