@@ -195,14 +195,13 @@ class BracePlanner:
         return torques, normal, int(solved)
 
 
-class PreparedBraces:
+class PreparedBraces(BracePlanner):
     """Braces of a robot with everything that does not change between states."""
 
     def __init__(self, robot: Robot, model: ka.ModelArrays, braces: Mapping[str, Brace]) -> None:
         self.names, self.braces = tuple(braces), tuple(braces.values())
         attached = [robot.attach(brace.body, brace.point) for brace in self.braces]
-        self._arrays = BracePlanner(robot, model, [link for link, _ in attached]).arrays
-        self._model, self._ws = model, ka.workspace(len(robot.links), 0, 0)
+        super().__init__(robot, model, [link for link, _ in attached])
         self._tables = np.zeros((1, len(braces), kb.BRACE_SIZE))
         for k, (brace, (_, point)) in enumerate(zip(self.braces, attached, strict=True)):
             sliding = np.zeros(3) if brace.sliding is None else brace.sliding
@@ -220,7 +219,7 @@ class PreparedBraces:
 
     def solve(self, q: Array, v: Array, vdot: Array) -> BraceStatics:
         """Solve the brace forces for one state."""
-        arrays = self._arrays
+        arrays = self.arrays
         self._q[0], self._v[0], self._vdot[0] = q, v, vdot
         solved = brace_statics(
             self._model, self._ws, arrays, self._q, self._v, self._vdot, self._tables, self._torques, self._normal, True

@@ -212,11 +212,8 @@ def joint_stops(
     ModelError
         If a joint starts beyond its stop.
     """
-    stops, remedy = [], "change its initial position or its limit"
-    if q is None:
-        q = robot.initial
-    else:
-        remedy = "start from a state within its stops"
+    remedy = "change its initial position or its limit" if q is None else "start from a state within its stops"
+    stops, q = list[JointStop](), robot.initial if q is None else q
     for link, k in zip(robot.links, robot.position_index, strict=True):
         for side, limit in ((1.0, link.lower), (-1.0, link.upper)):
             if np.isfinite(limit):

@@ -144,18 +144,15 @@ def balanced(
         current[a] = torques[i] / motor.joint_constant
         if len(planned):
             current[a] += planned[0, a, 0] / motor.resistance
-        if drop != 0.0 and k_p > 0.0:
-            shift[a] = drop / k_p
-        unit = robot.links[i].units
-        at = requested[robot.position_index[i]]
-        if k_p > 0.0:
-            shift[a] += robot.initial[robot.position_index[i]] - at
-        if k_p > 0.0 and abs(begin[a] - at) > AT_REST:
-            jumps.append(
-                f"the reference of {motor.joint} starts {format_quantity(begin[a] - at, unit[0], 3)} from "
-                "the joint position"
-            )
-        elif k_p > 0.0 and abs(rate[a]) > AT_REST:
+        if not k_p > 0.0:
+            continue
+        unit, place = robot.links[i].units, robot.position_index[i]
+        at = requested[place]
+        shift[a] = drop / k_p + (robot.initial[place] - at)
+        if abs(begin[a] - at) > AT_REST:
+            away = format_quantity(begin[a] - at, unit[0], 3)
+            jumps.append(f"the reference of {motor.joint} starts {away} from the joint position")
+        elif abs(rate[a]) > AT_REST:
             jumps.append(f"the reference of {motor.joint} starts with {rate[a]:.3g} {unit[1]}")
     resistance = np.array([getattr(motor, "resistance", 0.0) for motor in motors])
     said = _moved(model, requested)

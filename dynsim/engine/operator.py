@@ -56,10 +56,6 @@ class StoppingPath:
     targets: Array
     joints: Array
 
-    def remainder(self) -> StoppingPath:
-        """Return the path after its first tick."""
-        return StoppingPath(self.velocity[1:], self.targets[1:], self.joints[1:])
-
 
 class HandGovernor(Stateful):
     """Moves the hand with commanded velocities from which it can stop in time.
@@ -150,7 +146,7 @@ class HandGovernor(Stateful):
             return
         self.rates = (path.joints[0] - self.joints) * self._options.rate
         self.velocity, self.target, self.joints = path.velocity[0].copy(), path.targets[0].copy(), path.joints[0].copy()
-        self._path = path.remainder()
+        self._path = StoppingPath(path.velocity[1:], path.targets[1:], path.joints[1:])
 
     def _path_to_rest(self, velocity: Array) -> tuple[StoppingPath | None, str]:
         """Return the path to rest that starts with a velocity, or None and the reason."""

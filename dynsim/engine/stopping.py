@@ -376,25 +376,21 @@ _MODES = {ka.SLIDING: "slides", ka.STICKING: "sticks"}
 
 def stopped(scenario: Scenario, prepared: Prepared) -> SimulationStopped:
     """Return the exception for a run whose STATUS shows that it stopped before its end."""
-    run = prepared.run
-    status, time = int(run.count[ki.STATUS]), float(run.clock[ki.TIME])
-    kind = KINDS[status]
+    run, unstable = prepared.run, ""
+    status, time, y = int(run.count[ki.STATUS]), float(run.clock[ki.TIME]), run.y
     if status != ki.STOPPED:  # a base may tip over for any reason
-        q, v = (run.y[block(run.layout, name)] for name in ("q", "v"))
+        q, v = (y[block(run.layout, name)] for name in ("q", "v"))
         elapsed = float((run.tick_table[:, ki.TICK_COUNT] * run.tick[:, ki.TICK_PERIOD]).max(initial=0.0))
-        if unstable := unstable_stop(scenario, prepared, q, v, elapsed):
-            words = f"stopped at t = {time:.6g} s"
-            if status == ki.OUT_OF_TIME:
-                words = _reason(scenario, prepared)
-            return SimulationStopped(f"{words}: {unstable}", time=time, state=last_state(prepared, run.y), kind=kind)
-    if finding := paradox(prepared.system, prepared.workspace, run, prepared.contacts):
-        reached, y, words = finding
-        return SimulationStopped(
-            f"stopped at t = {reached:.6g} s: {words}", time=reached, state=last_state(prepared, y), kind=kind
-        )
-    return SimulationStopped(
-        _reason(scenario, prepared), time=float(run.clock[ki.TIME]), state=last_state(prepared, run.y), kind=kind
-    )
+        unstable = unstable_stop(scenario, prepared, q, v, elapsed)
+    if unstable:
+        words = _reason(scenario, prepared) if status == ki.OUT_OF_TIME else f"stopped at t = {time:.6g} s"
+        words = f"{words}: {unstable}"
+    elif finding := paradox(prepared.system, prepared.workspace, run, prepared.contacts):
+        time, y, words = finding
+        words = f"stopped at t = {time:.6g} s: {words}"
+    else:
+        words = _reason(scenario, prepared)
+    return SimulationStopped(words, time=time, state=last_state(prepared, y), kind=KINDS[status])
 
 
 def last_state(prepared: Prepared, y: np.ndarray) -> dict[str, Sequence[float]]:
@@ -508,17 +504,16 @@ def _reason(scenario: Scenario, prepared: Prepared) -> str:
     gaps, rates = ws.rows[: ws.counts[ka.ROWS], [ka.ROW_GAP, ka.ROW_RATE]].T
     worst = int(np.argmax(np.maximum(np.abs(gaps) / ki.GAP_TOLERANCE, np.abs(rates) / ki.RATE_TOLERANCE)))
     owner = int(ws.active[worst, ka.OWNER])
-    if ws.active[worst, ka.ROW_KIND] == ka.JOINT_ROW:
-        couplings = prepared.model.robot.couplings
-        if owner >= len(couplings) + len(prepared.stops):
-            joint = prepared.dry[owner - len(couplings) - len(prepared.stops)].joint
-            return f"{where}: dry friction cannot keep joint {joint} in place (off by {gaps[worst]:+.2e})"
-        if owner >= len(couplings):
-            joint = prepared.stops[owner - len(couplings)].joint
-            return f"{where}: joint {joint} cannot be kept at its stop (off by {gaps[worst]:+.2e})"
-        coupling = couplings[owner]
-        failure = f"joint {coupling.joint} cannot follow its leader {coupling.leader} (off by {gaps[worst]:+.2e})"
-    else:
+    off, couplings = f"(off by {gaps[worst]:+.2e})", prepared.model.robot.couplings
+    # Rows of joints: first couplings, then stops, then dry friction.
+    stop, dry = owner - len(couplings), owner - len(couplings) - len(prepared.stops)
+    if ws.active[worst, ka.ROW_KIND] != ka.JOINT_ROW:
         failure = f"contact {prepared.contacts[owner].name} cannot be kept on its surface (gap {gaps[worst]:+.2e} m, "
         failure += f"rate {rates[worst]:+.2e} m/s)"
+    elif dry >= 0:
+        return f"{where}: dry friction cannot keep joint {prepared.dry[dry].joint} in place {off}"
+    elif stop >= 0:
+        return f"{where}: joint {prepared.stops[stop].joint} cannot be kept at its stop {off}"
+    else:
+        failure = f"joint {couplings[owner].joint} cannot follow its leader {couplings[owner].leader} {off}"
     return f"{where}: {failure}; the contacts contradict each other, or the arm is singular here"
