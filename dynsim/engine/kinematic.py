@@ -42,7 +42,7 @@ from dynsim.model.gripper import Gripper, grasp_frame, graspable
 from dynsim.record import Event, Record
 from dynsim.record.measures import SHORT, percent
 from dynsim.record.poses import add_body_poses, pose_columns
-from dynsim.record.scene import Scene, quaternion
+from dynsim.record.scene import quaternion
 from dynsim.scenario import Scenario, build
 from dynsim.scenario.effect import without_effect
 from dynsim.scenario.schema import SceneObject
@@ -461,14 +461,6 @@ class CarriedObjects:
         if self.graspable:
             add_gripper(record, state, distance, self.events)
 
-    def scene_with_objects(self, scene: Scene) -> Scene:
-        """Return the scene including the objects."""
-        own = robot_scene(self.robot, (), {})
-        assert own is not None
-        shifted = len(scene.bodies)
-        bodies = (replace(body, parent=body.parent + shifted) if body.parent >= 0 else body for body in own.bodies)
-        return replace(scene, bodies=(*scene.bodies, *bodies))
-
 
 # Run of the kinematic snake: compiled control periods, with mode switches between them in Python.
 
@@ -554,7 +546,11 @@ def make_record(run: SnakeRun, scenario: Scenario, wall: float, pictured: bool =
         run.objects.add_to(record, trace.w, np.rint(time / period).astype(np.int64))
     if pictured:
         scene = snake_scene(description)
-        scene = scene if run.objects is None else run.objects.scene_with_objects(scene)
+        if run.objects is not None:
+            own, shifted = robot_scene(run.objects.robot, (), {}), len(scene.bodies)
+            assert own is not None
+            bodies = (replace(body, parent=body.parent + shifted) if body.parent >= 0 else body for body in own.bodies)
+            scene = replace(scene, bodies=(*scene.bodies, *bodies))
         record.scene = pictured_parts(scene, scenario)
         add_body_poses(record)
     summary = {

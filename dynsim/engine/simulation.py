@@ -53,6 +53,7 @@ from dynsim.errors import ModelError, ScenarioError, SimulationInterrupted, Simu
 from dynsim.integrators import driver
 from dynsim.integrators import run as ki
 from dynsim.integrators.run import state_within
+from dynsim.library.families import member
 from dynsim.model.description import Contact, Robot
 from dynsim.model.drives import Drive
 from dynsim.record import Event, Record
@@ -1368,13 +1369,17 @@ class Simulation:
         """Check for signals while compiled code runs."""
         interruption.check()
 
-    def _run_piece(self, look: Callable[[], None]) -> BaseException | None:
-        """Run one piece of compiled code and return the exception raised meanwhile by ``look`` or by a signal."""
+    def _load(self) -> None:
+        """Load or compile the kernels before the first piece, so that it does not count as integration time."""
         if not self._loaded:
             prepared = self._prepared
             size = prepared.model.n, len(prepared.contacts), len(prepared.stops)
             recall("kernels", partial(stopping.load, prepared), prepared.choice.method, *size)
             self._loaded = True
+
+    def _run_piece(self, look: Callable[[], None]) -> BaseException | None:
+        """Run one piece of compiled code and return the exception raised meanwhile by ``look`` or by a signal."""
+        self._load()
         begun = clock.perf_counter()
         self._prepared, raised = stopping.advance(self._prepared, self._watch, look, self._kernel)
         self._wall += clock.perf_counter() - begun
@@ -1570,9 +1575,11 @@ def check(scenario: Scenario, started: Callable[[Start], None]) -> Start:
 def commanded_by_python(scenario: Scenario) -> bool:
     """Return whether Python code sets commands at ticks: an operator, a snake's controller, or encoders."""
     controller, sensors = scenario.controller, scenario.config.sensors
-    operated = controller is not None and getattr(controller, "operator", None) is not None
     encoded = sensors is not None and sensors.encoders is not None
-    return operated or encoded or (controller is not None and controller.type == "task_space")
+    if encoded or controller is None:
+        return encoded
+    of_snake = member("controller", controller.type).ENGINE == "kinematic"
+    return of_snake or getattr(controller, "operator", None) is not None
 
 
 def _begin(scenario: Scenario, prepared: Prepared) -> None:
@@ -1697,6 +1704,7 @@ class _WholeRun(Simulation):
         end, method, ticks, period = self._scenario.duration_s, self._prepared.choice.method, 0, math.inf
         if self._ticked:
             period = self._prepared.control.sample_time or 1.0 if self._operator is None else self._operator.period
+        self._load()
         self._look()
         log.info("%s: integrating %g s by %s", self._scenario.title, end, method)
         while self._time < end and not self.finished:

@@ -86,20 +86,17 @@ def compare(
         except WorkerInterrupted:
             location = scenarios[name].location(variant=f" ({name})")
             stops[name] = SimulationInterrupted(f"{location}: interrupted before there were results to save")
-            return
         except WorkerLost as lost:
             stops[name] = SimulationStopped(f"{name}: {lost}")
-            return
         except SimulationStopped as stop:
             if stopped is not None:
                 stopped(name, stop)
             stops[name] = stop
-            return
-        if record is None:
-            return
-        if finished is not None:
-            finished(name, record)
-        records[name] = record
+        else:
+            if record is not None:
+                if finished is not None:
+                    finished(name, record)
+                records[name] = record
 
     if jobs > 1:
 
