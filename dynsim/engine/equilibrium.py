@@ -146,9 +146,9 @@ def balanced(
             current[a] += planned[0, a, 0] / motor.resistance
         if not k_p > 0.0:
             continue
-        unit, place = robot.links[i].units, robot.position_index[i]
-        at = requested[place]
-        shift[a] = drop / k_p + (robot.initial[place] - at)
+        unit, index_q = robot.links[i].units, robot.position_index[i]
+        at = requested[index_q]
+        shift[a] = drop / k_p + (robot.initial[index_q] - at)
         if abs(begin[a] - at) > AT_REST:
             away = format_quantity(begin[a] - at, unit[0], 3)
             jumps.append(f"the reference of {motor.joint} starts {away} from the joint position")

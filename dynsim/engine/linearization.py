@@ -162,10 +162,10 @@ class _Frozen:
         bodies = self._prepared.model.robot.bodies
         first = len(self._prepared.loads) - len(bodies)
 
-        def moved(change: Callable[..., None], *place: int) -> Callable[[NDArray[Any], Array], Array]:
+        def moved(change: Callable[..., None], *indices: int) -> Callable[[NDArray[Any], Array], Array]:
             def at(read: NDArray[Any], amount: Array) -> Array:
                 system = copied(self._system)
-                change(system, float(amount[0]), *place)
+                change(system, float(amount[0]), *indices)
                 return self.rate_and_output(self.x, read, system)
 
             return at
