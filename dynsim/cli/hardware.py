@@ -39,7 +39,7 @@ from dynsim.system.terminal import Terminal, escaped, plain
 if TYPE_CHECKING:
     from dynsim.hardware.bus.protocol import Bus, Clock
     from dynsim.hardware.nudge import Nudge
-    from dynsim.hardware.replay.trajectory import MotionTask
+    from dynsim.hardware.replay.drive import MotionTask
     from dynsim.hardware.servo_map import MappedServo, ServoMap
 
 hw = typer.Typer(
@@ -295,14 +295,15 @@ def _plant(scenario: str | None, variant: str | None, servo_map: Any, start: Seq
 
 def print_timing(result: Any) -> None:
     """Print the timing of the control loop in one line."""
-    timing = result.timing
-    if timing is None:
-        return
-    console.print(
-        f"{timing.cycles} cycles, period {timing.period_mean * 1e3:.3f} ms (max {timing.period_max * 1e3:.3f}), "
-        f"lateness 99 % {timing.lateness_p99 * 1e3:.3f} ms, bus {timing.exchange_mean * 1e3:.2f} ms per cycle, "
-        f"{timing.skipped_cycles} cycles skipped, {timing.missed_statuses} status packets missed"
-    )
+    if timing := result.timing:
+        period, longest, lateness, exchange = (
+            1e3 * timing[f"{name}_s"] for name in ("period_mean", "period_max", "lateness_p99", "exchange_mean")
+        )
+        console.print(
+            f"{timing['cycles']} cycles, period {period:.3f} ms (max {longest:.3f}), lateness 99 % {lateness:.3f} ms, "
+            f"bus {exchange:.2f} ms per cycle, {timing['skipped_cycles']} cycles skipped, "
+            f"{timing['missed_statuses']} status packets missed"
+        )
 
 
 @hw.command(epilog="Example: dynsim hw recover results/arm_replay")

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from dynsim.hardware.bus.dynamixel_bus import DynamixelBus, latency_timer, open_serial_port
-from dynsim.hardware.bus.protocol import Clock, VirtualClock, WallClock
+from dynsim.hardware.bus.protocol import Clock, VirtualClock
 from dynsim.hardware.errors import VerificationFailed
 from dynsim.hardware.servo_map import ServoMap
 from dynsim.hardware.virtual.faults import FaultScript
@@ -59,13 +59,12 @@ def bus_on(
     VerificationFailed
         If the latency timer of the adapter is too long for the control loop.
     """
-    clock: Clock
     if port == VIRTUAL:
         line = line_for_map(servo_map, script=script, plant=plant, posture=posture or {})
-        clock = WallClock(time.monotonic()) if in_wall_time else VirtualClock()
+        clock = Clock(time.monotonic()) if in_wall_time else VirtualClock()
         handler: Any = VirtualPort(line, clock, baud=servo_map.bus.baud)
     else:
-        clock = WallClock()
+        clock = Clock()
         timer = latency_timer(port)
         if timer is not None and timer > 1:
             raise VerificationFailed(

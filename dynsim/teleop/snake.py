@@ -9,7 +9,7 @@ import logging
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -128,61 +128,21 @@ class SpeedLimits:
     base: float = 0.3
 
 
-class Session(Protocol):
-    """Interface of a simulation that a pilot commands.
-
-    Attributes
-    ----------
-    axes : tuple of PilotAxis
-        Components of the commanded velocity.
-    modes : tuple of int
-        Modes that may be requested.
-    has_gripper : bool
-        True if the robot has a gripper.
-    period : float
-        Duration of a tick [s].
-    still : Record
-        Short record of the robot at its start, from which the page is built.
-    """
-
-    axes: tuple[PilotAxis, ...]
-    modes: tuple[int, ...]
-    has_gripper: bool
-    period: float
-    still: Record
-
-    @property
-    def ticks(self) -> int:
-        """Number of ticks so far."""
-
-    @property
-    def time(self) -> float:
-        """Simulation time [s]: the time of the last tick, or half a tick earlier."""
-
-    @property
-    def finished(self) -> bool:
-        """True if the maximum duration has passed or the simulation has ended."""
-
-    def tick(self, command: Command) -> None:
-        """Advance by one period. Raises SimulationStopped if the simulation cannot continue."""
-
-    def frame(self) -> LiveFrame:
-        """Return the present state for the display."""
-
-    def joints(self) -> Mapping[str, Array]:
-        """Return joint angles [rad], rates [rad/s] and grounded wheel pairs (since the previous tick).
-
-        Rates are omitted if they are constant from tick to tick. The keys are names of record signals, and the values
-        are in the order of their labels.
-        """
-
-    def record(self) -> Record:
-        """Return the record of all ticks so far, with a scenario that reproduces it."""
-
-
 def with_controller(scenario: Scenario, duration: float, controller: dict[str, Any]) -> Scenario:
     """Return the scenario with another duration [s] and controller."""
     return scenario_from_resolved({**scenario.resolved, "duration_s": duration, "controller": controller})
+
+
+def _record_until(simulation: Simulation, end: float, script: Scenario) -> Record:
+    """Return the record of a run that ends at a tick [s], whose command is not known yet; the simulation goes on."""
+    before = simulation.snapshot()
+    if not simulation.finished:
+        simulation.end_samples(end)
+        simulation.advance(end)
+    record = simulation.record(script)
+    simulation.restore(before)
+    record.complete = "stopped" not in record.provenance
+    return record
 
 
 log = logging.getLogger(__name__)
@@ -191,7 +151,7 @@ REQUESTS = {SWITCHING: "switching", FIXING: "fixing"}
 
 
 class SnakeSession:
-    """Session of a kinematic snake robot; see :class:`dynsim.teleop.snake.Session`.
+    """Session of a kinematic snake robot; see :data:`dynsim.teleop.snake.Session`.
 
     The session is the :class:`~dynsim.snake.description.CommandSource` of its run. ``longest`` is the maximum
     duration [s].
@@ -319,8 +279,7 @@ class SnakeSession:
     def record(self) -> Record:
         """Return the record of all ticks so far; its scenario contains the script of commands."""
         duration = max(self.ticks, 1) * self.period
-        script = with_controller(self._scenario, duration, {**self._controller, "commands": self._commands})
-        return self._record(script)
+        return self._record(with_controller(self._scenario, duration, {**self._controller, "commands": self._commands}))
 
     def _record(self, script: Scenario) -> Record:
         return make_record(self._kinematic, script, 0.0)
@@ -365,16 +324,9 @@ class DynamicSnakeSession(SnakeSession):
         return self._simulation.touching
 
     def _record(self, script: Scenario) -> Record:
-        simulation = self._simulation
-        before, longest = simulation.snapshot(), self._run.ticks
-        # Record as a run that ends at this tick, whose command is not known yet.
-        self._run.ticks = self.ticks
-        simulation.end_samples(self.ticks * self.period)
-        simulation.advance(self.ticks * self.period)
-        record = simulation.record(script)
+        longest, self._run.ticks = self._run.ticks, self.ticks
+        record = _record_until(self._simulation, self.ticks * self.period, script)
         self._run.ticks = longest
-        simulation.restore(before)
-        record.complete = "stopped" not in record.provenance
         return record
 
 
@@ -387,7 +339,7 @@ _SMALL = 1e-6
 
 
 class ArmSession:
-    """Session of an arm; see :class:`dynsim.teleop.snake.Session`.
+    """Session of an arm; see :data:`dynsim.teleop.snake.Session`.
 
     The session is the :class:`~dynsim.compile.references.teleop.VelocitySource` of its simulation. ``longest`` is the
     maximum duration [s].
@@ -490,20 +442,11 @@ class ArmSession:
 
     def record(self) -> Record:
         """Return the record of all ticks so far; its scenario contains the script of commands."""
-        before = self.simulation.snapshot()
-        if not self.simulation.finished:
-            self.simulation.end_samples(self.ticks * self.period)
-            self.simulation.advance(self.ticks * self.period)
         # Compute the end from the number of ticks: a rounding error would change the last step of the repeated run.
         duration = max(self.ticks, 1) * self.period
         operator = {**self._operator, "commands": self._commands}
-        record = self.simulation.record(
-            with_controller(self._scenario, duration, {**self._controller, "operator": operator})
-        )
-        # The command at this tick is not known yet.
-        self.simulation.restore(before)
-        record.complete = "stopped" not in record.provenance
-        return record
+        script = with_controller(self._scenario, duration, {**self._controller, "operator": operator})
+        return _record_until(self.simulation, self.ticks * self.period, script)
 
 
 def _default_operator(scenario: Scenario, controller: dict[str, Any]) -> dict[str, Any]:
@@ -521,6 +464,30 @@ def _default_operator(scenario: Scenario, controller: dict[str, Any]) -> dict[st
 
 
 # Choice of the session for a scenario.
+
+
+Session = SnakeSession | ArmSession
+"""Simulation that a pilot commands.
+
+Attributes
+----------
+axes : tuple of PilotAxis
+    Components of the commanded velocity.
+modes : tuple of int
+    Modes that may be requested.
+has_gripper : bool
+    True if the robot has a gripper.
+period : float
+    Duration of a tick [s].
+ticks : int
+    Number of ticks so far.
+time : float
+    Simulation time [s]: the time of the last tick, or half a tick earlier.
+finished : bool
+    True if the maximum duration has passed or the simulation has ended.
+still : Record
+    Short record of the robot at its start, from which the page is built.
+"""
 
 
 def begin(scenario: Scenario, *, limits: SpeedLimits | None = None, longest: float = 600.0) -> Session:

@@ -123,16 +123,16 @@ def test_after_a_pause_the_path_waits_and_no_goal_is_far(rig, clean_run: Run, st
     # Rounding to ticks: one more than where no cycle was skipped.
     before = largest_steps(clean_run)
     assert all(step <= before[id_] + 1 for id_, step in largest_steps(run).items())
-    skipped = result.timing.skipped_cycles * run.replay.loop.period
+    skipped = result.timing["skipped_cycles"] * run.replay.loop.period
     assert skipped >= pause - 2 * run.replay.loop.period
-    assert result.timing.path_late == pytest.approx(skipped if state == ReplayState.REPLAY else 0.0)
+    assert result.timing["path_late_s"] == pytest.approx(skipped if state == ReplayState.REPLAY else 0.0)
     # No place of the path is left out, and it takes so much longer.
     times, straight = result.record["record_time"], clean_run.result.record["record_time"]
     on_path, planned = np.isfinite(times), np.isfinite(straight)
     np.testing.assert_allclose(np.unique(times[on_path]), np.unique(straight[planned]))
     reached = [record.time[np.flatnonzero(t == np.nanmax(t))[0]] for record, t in
                ((result.record, times), (clean_run.result.record, straight))]  # fmt: skip
-    assert reached[0] - reached[1] == pytest.approx(result.timing.path_late, abs=1e-3)
+    assert reached[0] - reached[1] == pytest.approx(result.timing["path_late_s"], abs=1e-3)
 
 
 @pytest.mark.parametrize("number", [1, 5])

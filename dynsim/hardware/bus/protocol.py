@@ -126,47 +126,36 @@ class Bus(Protocol):
     def close(self) -> None: ...
 
 
-# Clocks of a replay: interface, wall time for serial ports, and virtual time for virtual servos in this process.
+# Clocks of a replay: wall time for serial ports, and virtual time for virtual servos in this process.
 
 
-class Clock(Protocol):
-    """Interface of a monotonic clock."""
-
-    def now(self) -> float:
-        """Return the time since an arbitrary origin [s]."""
-        ...
-
-    def sleep_until(self, deadline: float) -> None:
-        """Return at ``deadline`` [s], or immediately if it has passed."""
-        ...
-
-
-class WallClock:
+class Clock:
     """Monotonic clock of the computer, relative to ``origin`` [s]."""
 
     def __init__(self, origin: float = 0.0) -> None:
         self._origin = origin
 
     def now(self) -> float:
+        """Return the time since the origin [s]."""
         return time.monotonic() - self._origin
 
     def sleep_until(self, deadline: float) -> None:
+        """Return at ``deadline`` [s], or immediately if it has passed."""
         remaining = deadline - self.now()
         if remaining > 0:
             time.sleep(remaining)
 
 
-class VirtualClock:
+class VirtualClock(Clock):
     """Clock that advances only in `sleep_until`, so a replay is deterministic and runs as fast as possible."""
 
-    def __init__(self) -> None:
-        self._now = 0.0
+    _time = 0.0
 
     def now(self) -> float:
-        return self._now
+        return self._time
 
     def sleep_until(self, deadline: float) -> None:
-        self._now = max(self._now, deadline)
+        self._time = max(self._time, deadline)
 
 
 # POSIX modules for serial ports and pseudo-terminals; None on systems without them, such as Windows.

@@ -24,16 +24,15 @@ from dynsim.hardware.replay.trajectory import (
     Array,
     CyclePlan,
     GoalCourse,
-    MotionTask,
     Needs,
     Path,
-    PlannedCourse,
     column_of,
     long_steps,
     path_of_record,
 )
 from dynsim.hardware.servo_map import MappedServo, ServoMap
 from dynsim.record import Record
+from dynsim.record.scene import Scene
 
 BITS_PER_BYTE = 10
 TURNAROUND = 50e-6
@@ -107,18 +106,29 @@ class Margin:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CheckedMotion(MotionTask):
+class CheckedMotion:
     """Motion that passed the offline check; input of the replay.
 
     Attributes
     ----------
+    plan : CyclePlan
     path : Path
+    speed : float
+        Motion time per second.
+    scene : Scene or None
+        Scene of the robot, which is copied into the measured record.
+    unmeasured : Record or None
+        Signals that the servos do not measure, such as the pose of the base; also copied into the measured record.
     margins : tuple of Margin
         Smallest margin for each joint and limit.
     warnings : tuple of str
     """
 
+    plan: CyclePlan
     path: Path
+    speed: float = 1.0
+    scene: Scene | None = None
+    unmeasured: Record | None = None
     margins: tuple[Margin, ...] = ()
     warnings: tuple[str, ...] = ()
 
@@ -152,7 +162,7 @@ class CheckedMotion(MotionTask):
 
     def course(self) -> GoalCourse:
         """Return the course along the path, from its start."""
-        return PlannedCourse(self.path, self.path.start, self.path.end, speed=self.speed)
+        return GoalCourse(self.path, self.path.start, self.path.end, speed=self.speed)
 
 
 def check_motion(
@@ -324,18 +334,6 @@ class MotionLimits:
         quantities: list[Quantity] = ["position", *values]
         for joint, quantity in np.argwhere(wanted):
             yield Margin(self._servos[joint].joint, quantities[quantity], *table[joint, quantity].tolist())
-
-    def within_bounds(self, path: Path) -> bool:
-        """Return True if simple bounds prove that the last interval and the windows that end in it break no limit."""
-        position, velocity, acceleration, jerk, shaking = path.bounds_of_last(JERK_WINDOW, SHAKING_WINDOW)
-        highest = self._highest
-        return bool(
-            np.all((position >= self._low) & (position <= self._high))
-            and np.all(velocity <= highest["velocity"])
-            and np.all(acceleration <= highest["acceleration"])
-            and np.all(jerk <= JERK_WINDOW * highest["jerk"])
-            and np.all(shaking <= highest["shaking"])
-        )
 
     def _tightest_position(self, position: Array, time: Array) -> tuple[Array, Array, Array, Array]:
         lowest, lowest_time = _extreme(np.negative, position, time)

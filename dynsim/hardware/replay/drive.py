@@ -17,15 +17,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import ClassVar, NamedTuple, Protocol
 
 import numpy as np
 
 from dynsim.errors import CheckRefused
-from dynsim.hardware.replay.check import ROUNDING, MotionLimits, plan_cycle
+from dynsim.hardware.replay.check import ROUNDING, CheckedMotion, MotionLimits, plan_cycle
 from dynsim.hardware.replay.output import Stopped
 from dynsim.hardware.replay.rules import Cause, Fault
-from dynsim.hardware.replay.trajectory import GAP_FACTOR, SHAKING_WINDOW, Array, GoalCourse, MotionTask, Needs, Path
+from dynsim.hardware.replay.trajectory import GAP_FACTOR, SHAKING_WINDOW, Array, CyclePlan, GoalCourse, Needs, Path
 from dynsim.hardware.replay.verify import needs_of_map
 from dynsim.hardware.servo_map import ServoMap
 from dynsim.record import Record
@@ -114,10 +114,7 @@ class IncrementalPath:
             )
             # Check the windows that end after the last knot; their accelerations also depend on two earlier knots.
             windows = longer.since(path.end - SHAKING_WINDOW, 2)
-            # Simple bounds save time in the cycle, because the robot is usually far from its limits.
-            sure = self._limits.within_bounds(windows)
-            margins = [] if sure else self._limits.margins(windows, since=path.end, broken=True)
-            broken = [str(margin) for margin in margins]
+            broken = [str(margin) for margin in self._limits.margins(windows, since=path.end, broken=True)]
         if not broken:
             self._path, self._last = longer, sample
         return broken
@@ -168,36 +165,40 @@ def lead(servo_map: ServoMap) -> float:
 
 
 @dataclass(frozen=True, kw_only=True)
-class DrivenMotion(MotionTask):
+class DrivenMotion:
     """Motion commanded live by a pilot; only its start is known in advance.
 
     Attributes
     ----------
+    plan : CyclePlan
     servo_map : ServoMap
     feed : Feed
     first : Sample
         Start of the motion.
     step : float
         Time between two samples [s].
-    longest : float
+    duration : float
         Maximum duration of the drive [s].
+    scene : Scene or None
+        Scene of the robot, which is copied into the measured record.
+    speed : float
+        Motion time per second.
     """
 
+    plan: CyclePlan
     servo_map: ServoMap
     feed: Feed
     first: Sample
     step: float
-    longest: float
+    duration: float
+    scene: Scene | None
+    speed: ClassVar[float] = 1.0
+    unmeasured: ClassVar[None] = None
 
     @property
     def start(self) -> Array:
         """Posture at the start [rad], shape (N,)."""
         return self.first.posture
-
-    @property
-    def duration(self) -> float:
-        """Maximum duration of the drive [s]."""
-        return self.longest
 
     def needs(self) -> list[Needs]:
         """Return the full range allowed by the map, because the motion is not known."""
@@ -206,6 +207,10 @@ class DrivenMotion(MotionTask):
     def course(self) -> GoalCourse:
         """Return the course along the samples of the feed."""
         return DrivenCourse(self)
+
+
+MotionTask = CheckedMotion | DrivenMotion
+"""Motion that a replay executes: a checked record, or the commands of a pilot."""
 
 
 def check_drive(
@@ -254,10 +259,12 @@ def check_drive(
         raise CheckRefused(
             f"the simulation starts in motion ({names}), but servos start at rest; use zero initial rates"
         )
-    return DrivenMotion(servo_map=servo_map, feed=feed, first=first, step=step, longest=longest, plan=plan, scene=scene)
+    return DrivenMotion(
+        plan=plan, servo_map=servo_map, feed=feed, first=first, step=step, duration=longest, scene=scene
+    )
 
 
-class DrivenCourse:
+class DrivenCourse(GoalCourse):
     """Course along the samples of a feed; each sample is checked before any goal of its interval is sent.
 
     The limits are the same as in the offline check. A sample that exceeds a limit is neither followed nor clamped:
@@ -265,16 +272,11 @@ class DrivenCourse:
     """
 
     def __init__(self, motion: DrivenMotion) -> None:
-        self.time, self.speed = 0.0, 0.0
-        self._motion, self._feed = motion, motion.feed
-        self._stop_time = motion.servo_map.safety.stop_time
         self._path = IncrementalPath(motion.first, motion.servo_map)
+        super().__init__(self._path, 0.0, self._path.end, speed=0.0)
+        self._step, self._duration, self._feed = motion.step, motion.duration, motion.feed
+        self._stop_time = motion.servo_map.safety.stop_time
         self._silent = 0.0
-
-    @property
-    def end(self) -> float:
-        """Time of the last sample [s]."""
-        return self._path.end
 
     @property
     def over(self) -> bool:
@@ -282,10 +284,7 @@ class DrivenCourse:
 
     @property
     def fraction(self) -> float:
-        return min(1.0, self.time / self._motion.duration)
-
-    def at(self, time: float) -> tuple[Array, Array]:
-        return self._path.at(time)
+        return min(1.0, self.time / self._duration)
 
     def braking_time(self, stop_time: float) -> float:
         # At reduced speed a stop in this time may need more path than is known.
@@ -299,22 +298,22 @@ class DrivenCourse:
         self.speed = min(1.0, most, self.speed + period / stop_time)
         self.time = min(self.end, self.time + self.speed * period)
         self._feed.report_time(self.time)
-        position, rate = self._path.at(self.time)
+        position, rate = self.at(self.time)
         return position, self.speed * rate
 
     def _take(self, period: float) -> None:
         """Append the samples that have arrived, limited in number so that the cycle is not late."""
-        samples = self._feed.take(math.ceil(period / self._motion.step) + 1)
+        samples = self._feed.take(math.ceil(period / self._step) + 1)
         self._silent = 0.0 if samples else self._silent + period
         for sample in samples:
-            step = sample.time - self._path.end
-            if not 0.0 < step <= GAP_FACTOR * self._motion.step:
-                text = f"time jumps from {self._path.end:g} to {sample.time:g} s (step {self._motion.step:g} s)"
+            if not 0.0 < sample.time - self.end <= GAP_FACTOR * self._step:
+                text = f"time jumps from {self.end:g} to {sample.time:g} s (step {self._step:g} s)"
                 raise Stopped(Fault(Cause.SIMULATION, text))
             if broken := self._path.append(sample, keep=self.time):
                 text = "; ".join(broken[:MAX_VIOLATIONS])
                 more = f"; and {len(broken) - MAX_VIOLATIONS} more" if len(broken) > MAX_VIOLATIONS else ""
                 raise Stopped(Fault(Cause.LIMIT, f"the driven motion exceeds limits of the servo map: {text}{more}"))
+            self.end = sample.time
         if self._feed.fault:
             raise Stopped(Fault(Cause.SIMULATION, self._feed.fault))
         if self._silent > SILENCE and not self._feed.over:

@@ -32,7 +32,8 @@ from dynsim.hardware.bus.control_table import (
 from dynsim.hardware.bus.protocol import Bus, Clock, NoAnswer, RequestRefused, too_busy
 from dynsim.hardware.errors import PortError
 from dynsim.hardware.replay.check import velocity_limit
-from dynsim.hardware.replay.measured import describe, measured_record, timing_of
+from dynsim.hardware.replay.drive import MotionTask
+from dynsim.hardware.replay.measured import describe, measured_record
 from dynsim.hardware.replay.output import (
     HOLDING,
     LIMP,
@@ -55,7 +56,7 @@ from dynsim.hardware.replay.output import (
     robot_state,
 )
 from dynsim.hardware.replay.rules import AbortRules, Cause, Cycle, Fault, watchdog_units
-from dynsim.hardware.replay.trajectory import QUINTIC_PEAK, Approach, GoalCourse, MotionTask, PlannedCourse
+from dynsim.hardware.replay.trajectory import QUINTIC_PEAK, Approach, GoalCourse
 from dynsim.hardware.replay.verify import Registers, all_registers, configure, difference_lines, read_registers, verify
 from dynsim.hardware.servo_map import FaultPolicy, MappedServo, ServoMap
 from dynsim.system.files import write_json
@@ -708,7 +709,7 @@ class Replay:
         self.journal.enter(ReplayState.VERIFY)
         if self.write_eeprom:
             configure(self.bus, self.map, self.journal.add_line)
-        problems, limits = verify(self.bus, self.map, self.motion, poll=self.stop.check)
+        problems, limits = verify(self.bus, self.map, self.motion.needs(), poll=self.stop.check)
         self.result.limits = tuple(limits)
         for line in difference_lines(limits):
             self.journal.add_line(line)
@@ -774,7 +775,7 @@ class Replay:
         self.journal.enter(ReplayState.MOVE_TO_START)
         self.journal.add_line(f"{distance:.3f} rad in {duration:.1f} s")
         self.loop.begin()
-        self.loop.follow(PlannedCourse(Approach(here, goal, duration), 0.0, duration, speed=1.0))
+        self.loop.follow(GoalCourse(Approach(here, goal, duration), 0.0, duration, speed=1.0))
         self._settle()
 
     def _settle(self) -> None:
@@ -869,18 +870,17 @@ class Replay:
 
     def _finish(self) -> None:
         self.journal.guard(RECORD, self._sum_up)
-        timing = self.result.timing
-        if timing:
-            self.journal.add_line(
-                f"timing: {', '.join(f'{name} {value:.6g}' for name, value in timing.as_dict().items())}"
-            )
+        if self.result.timing:
+            timing = ", ".join(f"{name} {value:.6g}" for name, value in self.result.timing.items())
+            self.journal.add_line(f"timing: {timing}")
 
     def _sum_up(self) -> None:
         """Build record and timing of the run."""
         result, rows = self.result, self.recorder.all()
-        result.timing = timing_of(rows, self.layout)
         started = self.loop.path_started if self.loop.path_started is not None else self.loop.origin
-        record = describe(measured_record(rows, self.layout, started), self.motion.scene, self.motion.unmeasured)
+        record = measured_record(rows, self.layout, started)
+        result.timing = record.summary["timing"]
+        describe(record, self.motion.scene, self.motion.unmeasured)
         record.complete = result.fault is None
         for fault in result.faults:
             record.add_event(fault.time - started, "fault", fault.cause.value, description=fault.text)

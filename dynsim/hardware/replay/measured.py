@@ -23,7 +23,7 @@ from dynsim.hardware.replay.output import (
     Layout,
     ReplayState,
     Rows,
-    TimingStatistics,
+    Timing,
     is_locked,
     row_type,
 )
@@ -40,28 +40,28 @@ FOLLOWED = "copied from the replayed record at record_time; not measured by a se
 END_STATE = "unknown: the program died"
 
 
-def timing_of(rows: Rows, layout: Layout) -> TimingStatistics | None:
-    """Return timing statistics of the recorded cycles; None before the second cycle."""
+def timing_of(rows: Rows, layout: Layout) -> Timing:
+    """Return timing statistics of the recorded cycles; empty before the second cycle."""
     if len(rows) < 2:
-        return None
+        return {}
     path_time = rows["path_time"]
     # Cycles in which the path advanced; the first cycle has no earlier time to compare with.
     followed = np.isfinite(path_time) & (np.diff(path_time, prepend=np.nan) != 0)
     periods, lateness, exchange = np.diff(rows["time"]), rows["lateness"], rows["exchange"]
-    return TimingStatistics(
-        cycles=len(rows),
-        skipped_cycles=int(rows["skipped"].sum()),
-        missed_statuses=int(np.isnan(rows["position"]).sum()),
-        stray_bytes=int(rows["stray"].sum()),
-        period_mean=float(periods.mean()),
-        period_max=float(periods.max()),
-        lateness_p50=float(np.percentile(lateness, 50)),
-        lateness_p99=float(np.percentile(lateness, 99)),
-        lateness_max=float(lateness.max()),
-        path_late=float(rows["skipped"][followed].sum() / layout.provenance["rate_Hz"]),
-        exchange_mean=float(exchange.mean()),
-        exchange_max=float(exchange.max()),
-    )
+    return {
+        "cycles": len(rows),
+        "skipped_cycles": int(rows["skipped"].sum()),
+        "missed_statuses": int(np.isnan(rows["position"]).sum()),
+        "stray_bytes": int(rows["stray"].sum()),
+        "period_mean_s": float(periods.mean()),
+        "period_max_s": float(periods.max()),
+        "lateness_p50_s": float(np.percentile(lateness, 50)),
+        "lateness_p99_s": float(np.percentile(lateness, 99)),
+        "lateness_max_s": float(lateness.max()),
+        "path_late_s": float(rows["skipped"][followed].sum() / layout.provenance["rate_Hz"]),
+        "exchange_mean_s": float(exchange.mean()),
+        "exchange_max_s": float(exchange.max()),
+    }
 
 
 def measured_record(rows: Rows, layout: Layout, origin: float) -> Record:
@@ -93,8 +93,7 @@ def measured_record(rows: Rows, layout: Layout, origin: float) -> Record:
     record.add("alert", rows["alert"], "1", labels=joints, description="alert bit of the status")
     record.add("lateness", rows["lateness"], "s", description="delay of the cycle start after its deadline")
     record.add("exchange", rows["exchange"], "s", description="duration of the bus traffic of the cycle")
-    timing = timing_of(rows, layout)
-    record.summary["timing"] = timing.as_dict() if timing else {}
+    record.summary["timing"] = timing_of(rows, layout)
     return record
 
 

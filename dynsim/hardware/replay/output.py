@@ -212,37 +212,16 @@ def robot_state(servos: Sequence[ServoEnd]) -> str:
     return f"mixed: {'; '.join(descriptions)}"
 
 
-@dataclass(frozen=True)
-class TimingStatistics:
-    """Timing statistics of the control loop.
+Timing = dict[str, float | int]
+"""Timing statistics of the control loop.
 
-    Attributes
-    ----------
-    cycles, skipped_cycles, missed_statuses, stray_bytes : int
-    period_mean, period_max, lateness_p50, lateness_p99, lateness_max, exchange_mean, exchange_max : float
-        Time between cycle starts, delay of the start after the deadline, and time to write all goals and read all
-        states [s].
-    path_late : float
-        Delay of the end of the path because of skipped cycles [s].
-    """
+Numbers of ``cycles``, ``skipped_cycles``, ``missed_statuses`` and ``stray_bytes``; times in [s], whose keys end in ``_s``:
 
-    cycles: int
-    skipped_cycles: int
-    missed_statuses: int
-    stray_bytes: int
-    period_mean: float
-    period_max: float
-    lateness_p50: float
-    lateness_p99: float
-    lateness_max: float
-    path_late: float
-    exchange_mean: float
-    exchange_max: float
-
-    def as_dict(self) -> dict[str, float | int]:
-        """Return the values as a dictionary for summaries, with units in the keys."""
-        seconds = {f"{name}_s": value for name, value in vars(self).items() if isinstance(value, float)}
-        return {name: value for name, value in vars(self).items() if isinstance(value, int)} | seconds
+- ``period_mean_s``, ``period_max_s``: time between the starts of cycles
+- ``lateness_p50_s``, ``lateness_p99_s``, ``lateness_max_s``: delay of a start after its deadline
+- ``path_late_s``: delay of the end of the path because of skipped cycles
+- ``exchange_mean_s``, ``exchange_max_s``: time to write all goals and read all states
+"""
 
 
 @dataclass
@@ -266,7 +245,8 @@ class ReplayResult:
         (clock time, ID, register value) of each goal that was sent after the fault.
     record : Record
         Measured record.
-    timing : TimingStatistics | None
+    timing : Timing
+        Empty before the second cycle.
     torque_still_on : tuple of int
         IDs that did not confirm torque off.
     limits : tuple of LimitRow
@@ -280,7 +260,7 @@ class ReplayResult:
     fault_time: float = math.nan
     policy_goals: list[tuple[float, int, int]] = field(default_factory=list)
     record: Record = field(default_factory=lambda: Record([]))
-    timing: TimingStatistics | None = None
+    timing: Timing = field(default_factory=dict)
     torque_still_on: tuple[int, ...] = ()
     limits: tuple[LimitRow, ...] = ()
 

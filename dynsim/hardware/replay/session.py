@@ -13,6 +13,7 @@ from typing import Any
 from dynsim.errors import DynsimError
 from dynsim.hardware.bus.protocol import Bus, Clock
 from dynsim.hardware.errors import OutputsFailed, PortError, ReplayAborted, ReplayInterrupted, VerificationFailed
+from dynsim.hardware.replay.drive import MotionTask
 from dynsim.hardware.replay.machine import RECORD, Replay
 from dynsim.hardware.replay.measured import write_measured
 from dynsim.hardware.replay.output import (
@@ -28,7 +29,6 @@ from dynsim.hardware.replay.output import (
     move_away,
 )
 from dynsim.hardware.replay.rules import Cause
-from dynsim.hardware.replay.trajectory import MotionTask
 from dynsim.hardware.servo_map import ServoMap
 from dynsim.system.files import write_json
 

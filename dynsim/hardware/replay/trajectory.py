@@ -9,10 +9,9 @@ the interpolant represents exactly), so that the robot starts and ends at rest w
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,9 +21,6 @@ from dynsim.errors import CheckRefused
 from dynsim.hardware.servo_map import MappedServo, ServoMap
 from dynsim.record import TIME, Record
 from dynsim.snake.lifting import grounded_pairs, lifted
-
-if TYPE_CHECKING:
-    from dynsim.record.scene import Scene
 
 # Motions of servos: postures as functions of time, the advance of the loop along them, and demands on the servos.
 
@@ -43,8 +39,18 @@ class Motion(Protocol):
         ...
 
 
-class GoalCourse(Motion, Protocol):
+class GoalCourse:
     """Advance of the loop along a motion, by one period from goal to goal, independent of the clock.
+
+    Parameters
+    ----------
+    motion : Motion
+    start : float
+        Motion time of the first goal [s].
+    end : float
+        Motion time up to which the motion is known [s].
+    speed : float
+        Motion time per second.
 
     Attributes
     ----------
@@ -52,63 +58,39 @@ class GoalCourse(Motion, Protocol):
         Motion time of the last goal [s].
     """
 
-    time: float
-
-    @property
-    def speed(self) -> float:
-        """Motion time per second."""
-
-    @property
-    def end(self) -> float:
-        """Motion time up to which the motion is known [s]."""
+    def __init__(self, motion: Motion, start: float, end: float, *, speed: float) -> None:
+        self.end, self.speed = end, speed
+        self.time = self._start = start
+        self._motion = motion
+        self._goals = 0
 
     @property
     def over(self) -> bool:
         """True if there are no more goals."""
+        return self.time >= self.end
 
     @property
     def fraction(self) -> float:
         """Completed fraction of the motion, 0 to 1."""
+        return min(1.0, max(0.0, self.time / (self.end or 1.0)))
+
+    def at(self, time: float) -> tuple[Array, Array]:
+        """Return joint angles [rad] and their derivatives with respect to ``time``, shape (N,)."""
+        return self._motion.at(time)
 
     def advance(self, period: float) -> tuple[Array, Array]:
         """Return the goal after one more period [s]: joint angles [rad] and their rates [rad/s], shape (N,).
 
         May raise :class:`~dynsim.hardware.replay.output.Stopped`.
         """
-        ...
-
-    def braking_time(self, stop_time: float) -> float:
-        """Return the time [s] of a stop along the motion at constant deceleration; ``stop_time`` [s] is desired."""
-        ...
-
-
-class PlannedCourse:
-    """Course along a motion that is known from time ``start`` to ``end`` [s], at ``speed`` seconds of it per second."""
-
-    def __init__(self, motion: Motion, start: float, end: float, *, speed: float) -> None:
-        self.motion, self.start, self.end, self.speed = motion, start, end, speed
-        self.time = start
-        self._goals = 0
-
-    @property
-    def over(self) -> bool:
-        return self.time >= self.end
-
-    @property
-    def fraction(self) -> float:
-        return min(1.0, max(0.0, self.time / (self.end or 1.0)))
-
-    def at(self, time: float) -> tuple[Array, Array]:
-        return self.motion.at(time)
-
-    def advance(self, period: float) -> tuple[Array, Array]:
         self._goals += 1
         # Use the scheduled time: jitter of the loop must not affect the goals.
-        self.time = min(self.end, self.start + self.speed * period * self._goals)
-        position, rate = self.motion.at(self.time)
+        self.time = min(self.end, self._start + self.speed * period * self._goals)
+        position, rate = self.at(self.time)
         return position, self.speed * rate
 
     def braking_time(self, stop_time: float) -> float:
+        """Return the time [s] of a stop along the motion at constant deceleration; ``stop_time`` [s] is desired."""
         # If the motion ends earlier, it ends at rest.
         return stop_time
 
@@ -142,45 +124,6 @@ class CyclePlan:
     cycle_time: float
     health_time: float
     health_every: int
-
-
-@dataclass(frozen=True, kw_only=True)
-class MotionTask(ABC):
-    """Motion that a replay executes: a checked record, or the commands of a pilot.
-
-    Attributes
-    ----------
-    plan : CyclePlan
-    speed : float
-        Motion time per second.
-    scene : Scene or None
-        Scene of the robot, which is copied into the measured record.
-    unmeasured : Record or None
-        Signals that the servos do not measure, such as the pose of the base; also copied into the measured record.
-    """
-
-    plan: CyclePlan
-    speed: float = 1.0
-    scene: Scene | None = None
-    unmeasured: Record | None = None
-
-    @property
-    @abstractmethod
-    def start(self) -> Array:
-        """Posture at the start of the motion [rad], shape (N,)."""
-
-    @property
-    @abstractmethod
-    def duration(self) -> float:
-        """Maximum duration [s]."""
-
-    @abstractmethod
-    def needs(self) -> list[Needs]:
-        """Return the possible demands on all joints, in the order of the map."""
-
-    @abstractmethod
-    def course(self) -> GoalCourse:
-        """Return the course along the motion, from its start."""
 
 
 @dataclass(frozen=True)
@@ -339,7 +282,10 @@ class Path:
             End of the window with this value [s].
         """
         variation = np.zeros_like(self.position)
-        self._changes.cumsum(axis=0, out=variation[1:])
+        first, last = self._accelerations
+        with np.errstate(over="ignore", invalid="ignore"):
+            at_knots = np.concatenate([first[:1], 0.5 * (last[:-1] + first[1:]) + self._steps[1:], last[-1:]])
+            np.abs(at_knots[1:] - at_knots[:-1]).cumsum(axis=0, out=variation[1:])
         ends, within = self._within(variation, window, since)
         jerk, where = self._worst(ends, within)
         return jerk / window, where
@@ -381,46 +327,6 @@ class Path:
         """Acceleration of the interpolant at the start and the end of each interval [rad/s²], shape (T-1, N)."""
         h, _, _, b, a = self._cubics(slice(None))
         return 2 * b / h / h, (2 * b + 6 * a) / h / h
-
-    @cached_property
-    def _changes(self) -> Array:
-        """Magnitude of the change of acceleration from knot to knot [rad/s²], shape (T-1, N)."""
-        first, last = self._accelerations
-        with np.errstate(over="ignore", invalid="ignore"):
-            at_knots = np.concatenate([first[:1], 0.5 * (last[:-1] + first[1:]) + self._steps[1:], last[-1:]])
-            return np.abs(at_knots[1:] - at_knots[:-1])
-
-    def bounds_of_last(self, jerk_window: float, shaking_window: float) -> tuple[Array, Array, Array, Array, Array]:
-        """Return upper bounds of the extremes of the last interval, at a third of the cost of the extremes.
-
-        A cubic lies between its control points, and so does its rate. A window includes all intervals that it touches.
-        The reversed change of velocity in a window is at most half of the total change of the rate.
-
-        Returns
-        -------
-        position : array, shape (3, N)
-            Control points without the first [rad].
-        velocity, acceleration, jerk, shaking : array, shape (N,)
-            Bounds of the magnitudes; the jerk is multiplied by its window [rad/s²].
-        """
-        h, q0, q1 = float(self.time[-1] - self.time[-2]), self.position[-2], self.position[-1]
-        v0, v1 = self.rate_after[-1], self.rate_before[-1]
-        velocity = np.abs([v0, 3.0 * (q1 - q0) / h - v0 - v1, v1]).max(axis=0)
-        first, last = self._accelerations
-        acceleration = np.abs([first[-1], last[-1], self._steps[-1]]).max(axis=0)
-        jerk_from, shaking_from = np.maximum(
-            np.searchsorted(self.time, self.time[-2] - np.array([jerk_window, shaking_window]), side="right") - 1, 0
-        )
-        since = slice(shaking_from, None)
-        within = 0.5 * np.diff(self.time)[since, None] * (np.abs(first[since]) + np.abs(last[since]))
-        steps = np.abs(self.rate_after[1:] - self.rate_before[:-1])[since]
-        return (
-            np.array([q0 + h / 3.0 * v0, q1 - h / 3.0 * v1, q1]),
-            velocity,
-            acceleration,
-            self._changes[jerk_from:].sum(axis=0),
-            0.5 * (within.sum(axis=0) + steps.sum(axis=0)),
-        )
 
     def _within(self, total: Array, window: float, since: float) -> tuple[Array, Array]:
         """Return the ends of windows (M,) [s] and the growth of ``total``, a running sum at the knots, in them (M, N).

@@ -6,7 +6,7 @@ its limits and switches its torque off at its own thresholds. A limit that contr
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -26,7 +26,7 @@ from dynsim.hardware.bus.control_table import (
 )
 from dynsim.hardware.bus.protocol import Bus, NoAnswer, RequestRefused, too_busy
 from dynsim.hardware.errors import VerificationFailed
-from dynsim.hardware.replay.trajectory import QUINTIC_PEAK, MotionTask, Needs
+from dynsim.hardware.replay.trajectory import QUINTIC_PEAK, Needs
 from dynsim.hardware.servo_map import MappedServo, Safety, ServoMap
 
 EEPROM_BLOCK = (0, 64)
@@ -83,7 +83,7 @@ def configure(bus: Bus, servo_map: ServoMap, report: Callable[[str], None]) -> N
 
 
 def verify(
-    bus: Bus, servo_map: ServoMap, motion: MotionTask, *, poll: Callable[[], None]
+    bus: Bus, servo_map: ServoMap, demands: Iterable[Needs], *, poll: Callable[[], None]
 ) -> tuple[list[str], list[LimitRow]]:
     """Verify the servos on the bus before a motion.
 
@@ -91,8 +91,8 @@ def verify(
     ----------
     bus : Bus
     servo_map : ServoMap
-    motion : MotionTask
-        Motion whose demands the servos must satisfy.
+    demands : iterable of Needs
+        Demands of the motion on the joints, in the order of the map.
     poll : callable
         Called between servos; may raise an exception to cancel.
 
@@ -112,7 +112,7 @@ def verify(
         if id_ not in servo_map.ids:
             name = MODEL_BY_NUMBER[model].name if model in MODEL_BY_NUMBER else f"model {model}"
             problems.append(f"ID {id_}: {name} (firmware {firmware}) is on the bus but not in the map")
-    for servo, needs in zip(servo_map.servos, motion.needs(), strict=True):
+    for servo, needs in zip(servo_map.servos, demands, strict=True):
         poll()
         try:
             registers = snapshot(bus, servo)

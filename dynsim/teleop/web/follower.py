@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import math
 import os
-import struct
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -80,16 +79,6 @@ class Done:
     failure: DynsimError | None
 
 
-def frame_of(servos: int, lifting: int) -> struct.Struct:
-    """Return the format of a sample in the pipe: time, angles, rates, and the lifting angles and rates."""
-    return struct.Struct(f"={1 + 2 * (servos + lifting)}d")
-
-
-def lifting_columns(servo_map: ServoMap) -> list[int]:
-    """Return the indices in the map of the joints that lift wheel pairs."""
-    return [servo_map.joints.index(joint) for joint in servo_map.lifts.joints] if servo_map.lifts else []
-
-
 class Columns:
     """Joints of a simulation that the servos of a map follow.
 
@@ -113,8 +102,7 @@ class Columns:
                 f"lifts.signal: {self._lifts.signal!r} is not available in a live drive; use {', '.join(known)}"
             )
         self._session = session
-        self._position = np.array([servo.hold_at or 0.0 for servo in servo_map.servos])
-        self._velocity = np.zeros(len(self._position))
+        self._fixed = np.array([servo.hold_at or 0.0 for servo in servo_map.servos])
         # Index of the servo, signal and column of its angle and of its rate; None for held rates.
         self._sources: list[tuple[int, tuple[str, int], tuple[str, int] | None]] = []
         for index, servo in enumerate(servo_map.servos):
@@ -134,19 +122,15 @@ class Columns:
             position, *rates = ((name, still.labels[name].index(servo.label)) for name in signals)
             self._sources.append((index, position, rates[0] if rates else None))
 
-    def now(self) -> tuple[Array, Array]:
-        """Return the present angles [rad] and rates [rad/s] in the order of the map, shape (N,)."""
-        joints = self._session.joints()
-        for index, (signal, column), rates in self._sources:
-            self._position[index] = joints[signal][column]
-            if rates is not None:
-                self._velocity[index] = joints[rates[0]][rates[1]]
-        return self._position, self._velocity
-
     def sample(self) -> Sample:
-        """Return the present angles and rates as a sample."""
-        position, velocity = self.now()
-        return Sample(self._session.time, position.copy(), velocity.copy())
+        """Return the present angles [rad] and rates [rad/s] as a sample."""
+        joints = self._session.joints()
+        position, velocity = self._fixed.copy(), np.zeros(len(self._fixed))
+        for index, (signal, column), rates in self._sources:
+            position[index] = joints[signal][column]
+            if rates is not None:
+                velocity[index] = joints[rates[0]][rates[1]]
+        return Sample(self._session.time, position, velocity)
 
     def base(self, yaw: tuple[str, list[int]]) -> tuple[Array, Array]:
         """Return the yaw angles of the base part [rad], from columns of a signal, and the grounded wheel pairs."""
@@ -181,9 +165,8 @@ class ServoFollower:
         self.lookahead = LiftLookahead(session.still, servo_map, session.period) if servo_map.lifts else None
         # Time by which the simulation may be ahead of the servos [s].
         self._ahead = lead(servo_map) + (self.lookahead.delay if self.lookahead is not None else 0.0)
-        self._samples, self._servo_time, self._lifting = samples, servo_time, lifting_columns(servo_map)
+        self._samples, self._servo_time = samples, servo_time
         self.first = self._columns.sample()
-        self._frame = frame_of(len(self.first.position), len(self._lifting))
         if self.lookahead is not None:
             self.first = self.lookahead.begin(self.first, *self._columns.base(self.lookahead.yaw))
 
@@ -211,19 +194,14 @@ class ServoFollower:
 
     def end(self, how: float) -> None:
         """Send the code of the end of the drive, and close the pipe."""
-        self._write(math.nan, how, *[0.0] * (self._frame.size // 8 - 2))
+        self._send(Sample(math.nan, np.full_like(self.first.position, how), np.zeros_like(self.first.position)))
         self._samples.close()
 
     def _send(self, sample: Sample) -> None:
-        added: list[float] = []
-        for values in (sample.lift, sample.lift_rate) if self._lifting else ():
-            added += np.asarray(values)[self._lifting].tolist()
-        self._write(sample.time, *sample.position, *sample.velocity, *added)
-
-    def _write(self, *numbers: float) -> None:
+        rows = np.broadcast_arrays(sample.position, sample.velocity, sample.lift, sample.lift_rate)
         # A process of servos that is gone is reported elsewhere.
         with suppress(OSError):
-            os.write(self._samples.fileno(), self._frame.pack(*numbers))
+            os.write(self._samples.fileno(), np.concatenate([[sample.time], *rows]).tobytes())
 
 
 def simulate(request: DriveRequest, control: Connection, samples: Connection, servo_time: Any) -> None:
@@ -343,23 +321,22 @@ class PipeFeed:
         self._descriptor = samples.fileno()
         os.set_blocking(self._descriptor, False)
         self._samples, self._servo_time = samples, servo_time
-        self._servos, self._lifting = len(servo_map.servos), lifting_columns(servo_map)
-        self._frame = frame_of(self._servos, len(self._lifting))
+        # A frame has the time, then angles, rates, and the angles and rates of the lifting.
+        self._size = 8 * (1 + 4 * len(servo_map.servos))
         self._bytes = b""
         self._gone = False
 
     def take(self, most: int) -> Sequence[Sample]:
         self._read()
-        size = self._frame.size
+        size = self._size
         samples: list[Sample] = []
         while len(self._bytes) >= size and len(samples) < most and not self.over and not self.fault:
-            numbers = np.array(self._frame.unpack(self._bytes[:size]))
+            numbers = np.frombuffer(self._bytes[:size])
             self._bytes = self._bytes[size:]
-            time, values = float(numbers[0]), numbers[1:]
-            if time == time:
-                samples.append(self._sample(time, values))
-            elif values[0] in FAULTS:
-                self.fault = FAULTS[values[0]]
+            if not math.isnan(numbers[0]):
+                samples.append(Sample(float(numbers[0]), *numbers[1:].reshape(4, -1)))
+            elif numbers[1] in FAULTS:
+                self.fault = FAULTS[numbers[1]]
             else:
                 self.over = True
         if self._gone and len(self._bytes) < size and not self.over and not self.fault:
@@ -372,15 +349,6 @@ class PipeFeed:
     def close(self) -> None:
         """Close the pipe."""
         self._samples.close()
-
-    def _sample(self, time: float, values: Array) -> Sample:
-        count, joints = self._servos, self._lifting
-        position, velocity, added = values[:count], values[count : 2 * count], values[2 * count :]
-        if not joints:
-            return Sample(time, position, velocity)
-        lift = np.zeros((2, count))
-        lift[:, joints] = added.reshape(2, -1)
-        return Sample(time, position, velocity, lift[0], lift[1])
 
     def _read(self) -> None:
         with suppress(BlockingIOError):
