@@ -28,7 +28,7 @@ from dynsim.cli.teleop import (
     new_folder,
     print_address,
     print_drive,
-    require_websockets,
+    require,
 )
 from dynsim.errors import DynsimError
 from dynsim.hardware.errors import ReplayInterrupted, ServoMapError, VerificationFailed
@@ -76,17 +76,9 @@ Plant = Annotated[str | None, typer.Option("--plant", help="Scenario that provid
 PlantVariant = Annotated[str | None, typer.Option("--variant", help="Variant of that scenario.")]
 
 
-class MissingClientLibrary(DynsimError):
-    """The optional packages for servos are not installed."""
-
-
 def require_client_library() -> None:
-    """Raise MissingClientLibrary if the packages for servos are not installed."""
-    try:
-        import dynamixel_sdk  # noqa: F401
-        import serial  # noqa: F401
-    except ImportError as error:
-        raise MissingClientLibrary(f"{error.name} is not installed: pip install 'dynsim[hardware]'") from error
+    """Raise DynsimError if the packages for servos are not installed."""
+    require("hardware", "dynamixel_sdk", "serial")
 
 
 @hw.command(epilog="Example: dynsim hw scan --port /dev/ttyUSB0 --map arm")
@@ -246,7 +238,6 @@ def replayed(
     lost: dict[str, BaseException],
     *,
     quiet: bool,
-    policy: Policy | None,
     **options: Any,
 ) -> Any:
     """Run a replay that signals can stop, with a progress bar unless ``quiet``; add display errors to ``lost``."""
@@ -254,9 +245,8 @@ def replayed(
     from dynsim.hardware.replay.session import run_replay
 
     stop = StopRequest()
-    options |= {"policy": policy.value if policy else None, "stop": stop}
     with stop_on_signals(stop), nullcontext() if quiet else displayed(console, lost) as observer:
-        return run_replay(motion, servo_map, connection, folder, observer=observer, **options)
+        return run_replay(motion, servo_map, connection, folder, observer=observer, stop=stop, **options)
 
 
 def print_dry_run(result: Any) -> None:
@@ -528,7 +518,7 @@ def hw_drive(
     Servos are verified and armed, and move to the start, as in a replay; every posture is checked against the map
     before it is sent. Ctrl-C once: controlled stop. Twice: torque off. The button on the page ends the drive normally.
     """
-    require_websockets()
+    require("live", "websockets")
     require_client_library()
     from dynsim.engine.recording import RUN_FILES
     from dynsim.hardware.ports import VIRTUAL, bus_on

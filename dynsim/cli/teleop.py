@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -59,7 +60,7 @@ def teleop(
     The robot moves only while the dead-man switch is held: space bar, shoulder button, or a finger on a stick. The
     drive is saved; `dynsim run FOLDER/scenario.yaml` repeats it bit for bit.
     """
-    require_websockets()
+    require("live", "websockets")
     from dynsim.engine.recording import RUN_FILES, save_drive
     from dynsim.scenario import load_scenario
     from dynsim.system.files import check_writable
@@ -97,12 +98,11 @@ def teleop(
         raise report.stop
 
 
-def require_websockets() -> None:
-    """Raise DynsimError if the package websockets is not installed."""
-    try:
-        import websockets  # noqa: F401
-    except ModuleNotFoundError:
-        raise DynsimError("live driving requires websockets: pip install 'dynsim[live]'") from None
+def require(extra: str, *packages: str) -> None:
+    """Raise DynsimError if a package of an optional extra of dynsim is not installed."""
+    for package in packages:
+        if find_spec(package) is None:
+            raise DynsimError(f"{package} is not installed: pip install 'dynsim[{extra}]'")
 
 
 def print_address(address: str, ending: str, *, open_: bool) -> None:

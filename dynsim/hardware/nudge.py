@@ -118,7 +118,7 @@ def nudge(
     distance = _signed_distance(servo, start)
     single = _single_servo_map(servo_map, servo)
     motion = CheckedMotion(path=_out_and_back(start, distance), plan=plan_cycle(single, single.bus.rate))
-    replay = Replay(motion, single, cast(Bus, _OneServo(bus, servo.id)), clock, live=live, stop=stop)
+    replay = Replay(motion, single, cast(Bus, _OneServo(bus, servo.id)), clock, live=live, stop=stop or StopRequest())
     result = replay.run()
     if result.fault is not None and result.fault_state is not None:
         if result.fault.cause == Cause.VERIFICATION:

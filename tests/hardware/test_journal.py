@@ -36,7 +36,7 @@ def test_who_wants_out_of_an_output_asks_for_a_stop(journal: Journal, error: typ
         raise error
 
     journal.guard("progress", leaves)
-    assert journal._stop.count == 1
+    assert journal.stop.count == 1
     assert isinstance(journal.failures["progress"], error)
 
 
@@ -66,7 +66,7 @@ def test_an_observer_that_fails_does_not_stop_the_motion(rig) -> None:
 def test_what_is_held_back_is_written_afterwards_with_its_own_time(journal: Journal) -> None:
     with journal.buffered():
         journal.add_line("first")
-        journal._clock.sleep_until(2.0)
+        journal.clock.sleep_until(2.0)
         journal.add_line("second")
         assert not journal.log.lines
     assert [line.split() for line in journal.log.lines] == [

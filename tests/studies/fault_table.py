@@ -211,7 +211,7 @@ class Rig:
         )
         port = VirtualPort(line, clock, baud=self.map.bus.baud)
         bus = DynamixelBus(port, latency=self.map.bus.latency, return_delay=self.map.bus.return_delay)
-        replay = Replay(motion or self.motion(), self.map, bus, clock, stop=stop, **options)
+        replay = Replay(motion or self.motion(), self.map, bus, clock, stop=stop or StopRequest(), **options)
         return Run(replay, replay.result, line, clock, sent)
 
     def run(self, *faults: dict[str, Any], **options: Any) -> Run:

@@ -11,7 +11,7 @@ import math
 import struct
 from collections.abc import Callable, Collection, Iterable, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -56,7 +56,7 @@ from dynsim.hardware.replay.output import (
     robot_state,
 )
 from dynsim.hardware.replay.rules import AbortRules, Cause, Cycle, Fault, watchdog_units
-from dynsim.hardware.replay.trajectory import QUINTIC_PEAK, Approach, GoalCourse
+from dynsim.hardware.replay.trajectory import QUINTIC_PEAK, Approach, CyclePlan, GoalCourse
 from dynsim.hardware.replay.verify import Registers, all_registers, configure, difference_lines, read_registers, verify
 from dynsim.hardware.servo_map import FaultPolicy, MappedServo, ServoMap
 from dynsim.system.files import write_json
@@ -89,14 +89,19 @@ def goal_registers(
     return goals
 
 
+@dataclass(eq=False)
 class Loop:
     """Control loop: write goals and read measurements in each cycle.
 
     Attributes
     ----------
+    plan : CyclePlan
     map : ServoMap
     bus : Bus
+    clock : Clock
     stop : StopRequest
+    recorder : Recorder
+    journal : Journal
     rules : AbortRules
     period : float
         Cycle time [s].
@@ -117,43 +122,33 @@ class Loop:
         (clock time, ID, register value) of each goal that was sent after a fault.
     """
 
-    def __init__(
-        self,
-        motion: MotionTask,
-        servo_map: ServoMap,
-        bus: Bus,
-        clock: Clock,
-        stop: StopRequest,
-        recorder: Recorder,
-        journal: Journal,
-    ) -> None:
-        self.map = servo_map
-        self.bus = bus
-        self.stop = stop
-        self.rules = AbortRules(servo_map, motion.plan)
-        self.period = 1.0 / motion.plan.rate
-        count = len(servo_map.servos)
-        self.goal, self.goal_rate = np.zeros(count), np.zeros(count)
-        self.measured = np.zeros(count)
-        self.origin = clock.now()
-        self.tick = 0
-        self.course: GoalCourse | None = None
-        self.path_started: float | None = None
-        self.policy_goals: list[tuple[float, int, int]] = []
-        self._clock = clock
-        self._recorder = recorder
-        self._journal = journal
-        self.in_position_mode = np.array([servo.in_position_mode for servo in servo_map.servos])
+    plan: CyclePlan
+    map: ServoMap
+    bus: Bus
+    clock: Clock
+    stop: StopRequest
+    recorder: Recorder
+    journal: Journal
+    course: GoalCourse | None = None
+    path_started: float | None = None
+    policy_goals: list[tuple[float, int, int]] = field(default_factory=list)
+    _cycles: int = 0
+    _last_contact: float = math.inf
+
+    def __post_init__(self) -> None:
+        servos = self.map.servos
+        self.rules = AbortRules(self.map, self.plan)
+        self.period = 1.0 / self.plan.rate
+        self.goal, self.goal_rate, self.measured = np.zeros((3, len(servos)))
+        self.begin()
+        self.in_position_mode = np.array([servo.in_position_mode for servo in servos])
         # Limits of goals: lowest and highest tick and maximum step from goal to goal, or maximum speed.
         self._tick_bounds = [
             (*servo.tick_limits, velocity_limit(servo) * servo.gear * 2 * self.period / RAD_PER_TICK + 2)
-            for servo in servo_map.servos
+            for servo in servos
         ]
-        self._unit_bounds = [abs(servo.to_velocity_units(velocity_limit(servo))) for servo in servo_map.servos]
-        self._health_every = motion.plan.health_every
-        self._cycles = 0
+        self._unit_bounds = [abs(servo.to_velocity_units(velocity_limit(servo))) for servo in servos]
         self._sent: dict[int, int] = {}
-        self._last_contact = math.inf
 
     def servo_armed(self, index: int, register: int, angle: float) -> None:
         """Set goal and measurement of a servo that was armed at the goal ``register`` and joint angle [rad]."""
@@ -162,24 +157,15 @@ class Loop:
 
     def all_armed(self) -> None:
         """Start to measure the time without packets, because the watchdogs are switched on from now on."""
-        self._last_contact = self._clock.now()
+        self._last_contact = self.clock.now()
 
     def stall(self) -> Fault | None:
         """Return a fault if no packet was sent for longer than the watchdog time of the servos, otherwise None."""
-        silence = self._clock.now() - self._last_contact
-        return self.rules.stall(silence) if self.rules.stalled(silence) else None
-
-    def now(self) -> float:
-        """Return the clock time [s]."""
-        return self._clock.now()
-
-    def pause(self, duration: float) -> None:
-        """Wait for a duration [s]."""
-        self._clock.sleep_until(self._clock.now() + duration)
+        return self.rules.stall(self.clock.now() - self._last_contact)
 
     def begin(self) -> None:
         """Start counting deadlines from now."""
-        self.origin, self.tick = self._clock.now(), 0
+        self.origin, self.tick = self.clock.now(), 0
 
     def deadline_of(self, tick: int) -> float:
         return self.origin + tick * self.period
@@ -193,11 +179,11 @@ class Loop:
     def wait_for_deadline(self) -> tuple[float, int]:
         """Sleep until the next cycle is due; return its lateness [s] and the number of skipped cycles."""
         self.tick += 1
-        behind = math.floor((self._clock.now() - self.deadline_of(self.tick)) / self.period)
+        behind = math.floor((self.clock.now() - self.deadline_of(self.tick)) / self.period)
         skipped = max(0, behind)
         self.tick += skipped
-        self._clock.sleep_until(self.deadline_of(self.tick))
-        return self._clock.now() - self.deadline_of(self.tick) + skipped * self.period, skipped
+        self.clock.sleep_until(self.deadline_of(self.tick))
+        return self.clock.now() - self.deadline_of(self.tick) + skipped * self.period, skipped
 
     def follow(self, course: GoalCourse) -> None:
         """Follow a course to its end.
@@ -214,10 +200,6 @@ class Loop:
         """Execute one cycle at rest."""
         return self._cycle(position, np.zeros_like(position), *self.next_cycle())
 
-    def read_only_cycle(self) -> None:
-        """Execute one cycle that does not write goals."""
-        self.exchange(*self.next_cycle(), write=False)
-
     def _cycle(self, position: Array, velocity: Array, lateness: float, skipped: int) -> Cycle:
         if stall := self.stall():
             # Servos that were stopped by their watchdogs must not jump to the current goal.
@@ -230,11 +212,11 @@ class Loop:
 
     def exchange(self, lateness: float, skipped: int, *, write: bool) -> Cycle:
         """Write all goals, read all states and the health of one servo in turn, and record them."""
-        began = self._clock.now()
+        began = self.clock.now()
         if write:
             self._send(self.goal, self.goal_rate)
         block = self.bus.sync_read(self.map.ids, *STATE_BLOCK)
-        exchange = self._clock.now() - began
+        exchange = self.clock.now() - began
         servos = self.map.servos
         count = len(servos)
         position, velocity, torque = np.full((3, count), np.nan)
@@ -260,25 +242,22 @@ class Loop:
         )
         self.measured = np.where(cycle.missed, self.measured, cycle.position)
         self._cycles += 1
-        if self._cycles % self._health_every == 0:
-            servo = servos[self._cycles // self._health_every % count]
+        if self._cycles % self.plan.health_every == 0:
+            servo = servos[self._cycles // self.plan.health_every % count]
             # A sync read of one servo: a silent servo costs one time-out and no retry.
             answer = self.bus.sync_read((servo.id,), *HEALTH_BLOCK).replies.get(servo.id)
             if answer is not None:
                 cycle.health[servo.id] = servo.model.registers_in(HEALTH_BLOCK[0], answer.data)
-        now = self._clock.now()
+        now = self.clock.now()
         if self._last_contact < math.inf:
             cycle.silence, self._last_contact = max(began - self._last_contact, now - began), now
         origin = math.nan if self.path_started is None else self.path_started
         path_time = self.course.time if self.course and self.path_started is not None else math.nan
-        self._journal.guard("record", self._recorder.add, cycle, self._journal.state, path_time, origin)
-        self._report(cycle)
-        return cycle
-
-    def _report(self, cycle: Cycle) -> None:
+        self.journal.guard("record", self.recorder.add, cycle, self.journal.state, path_time, origin)
         error = self.rules.following_error(cycle)[self.in_position_mode]
         worst = float(np.nanmax(np.abs(error))) if np.isfinite(error).any() else 0.0
-        self._journal.report(worst, self.course.fraction if self.course else 0.0)
+        self.journal.report(worst, self.course.fraction if self.course else 0.0)
+        return cycle
 
     def _send(self, position: Array, velocity: Array) -> None:
         """Send the goals of a motion; raise Stopped for a goal that no checked motion can contain."""
@@ -302,8 +281,8 @@ class Loop:
                 continue
             self.bus.sync_write(FIELDS[name], values)
             self._sent.update(values)
-            if self._journal.state == ReplayState.FAULT:
-                now = self._clock.now()
+            if self.journal.state == ReplayState.FAULT:
+                now = self.clock.now()
                 self.policy_goals += [(now, id_, value) for id_, value in values.items()]
 
 
@@ -317,31 +296,33 @@ AT_REST = 0.1
 """Speed below which joints and wheels are at rest [rad/s]; a few units of the velocity register."""
 
 
+@dataclass(eq=False)
 class Ending:
     """Bring the robot to one of the end states.
 
     Parameters
     ----------
     loop : Loop
-    journal : Journal
     result : ReplayResult
         Receives further faults, the end state of each servo, and the IDs that did not confirm torque off.
     policy : "hold", "decelerate" or "off"
     """
 
-    def __init__(self, loop: Loop, journal: Journal, result: ReplayResult, policy: FaultPolicy) -> None:
-        self._loop = loop
-        self._journal = journal
-        self._result = result
-        self._policy = policy
-        self._servos = loop.map.servos
-        self._faulty: set[int] = set()
-        self._frozen = self._released = False
-        self._at_rest = False
+    loop: Loop
+    result: ReplayResult
+    policy: FaultPolicy
+    _faulty: set[int] = field(default_factory=set)
+    _frozen: bool = False
+    _released: bool = False
+    _at_rest: bool = False
+
+    @property
+    def _servos(self) -> tuple[MappedServo, ...]:
+        return self.loop.map.servos
 
     def regular(self) -> None:
         """End a motion as ``safety.at_end`` of the map specifies. Raises PortError."""
-        if self._loop.map.safety.at_end == "hold":
+        if self.loop.map.safety.at_end == "hold":
             self._leave_holding()
         else:
             self._release()
@@ -357,8 +338,8 @@ class Ending:
             True if torque was on before the robot was armed.
         """
         self._at_rest = struck == ReplayState.SETTLE
-        interrupted = self._result.faults[0].cause == Cause.INTERRUPTED
-        if self._loop.stop.for_release:
+        interrupted = self.result.faults[0].cause == Cause.INTERRUPTED
+        if self.loop.stop.for_release:
             self._try(self._release)
         elif struck in UNARMED:
             return
@@ -366,20 +347,20 @@ class Ending:
             self._try(self.regular)
         elif struck == ReplayState.ARM:
             # Nothing has moved yet: restore the initial torque, unless another program has switched it off meanwhile.
-            taken = any(fault.cause == Cause.TORQUE_LOST for fault in self._result.faults)
+            taken = any(fault.cause == Cause.TORQUE_LOST for fault in self.result.faults)
             self._try(self._leave_holding if found_holding and not taken else self._release)
-        elif self._policy == "off" and not interrupted:
+        elif self.policy == "off" and not interrupted:
             self._try(self._release)
         else:
             # With a dead port this has no effect, but the attempt shows whether the port is really dead.
-            if not self._try(self._freeze if self._policy == "hold" and not interrupted else self._decelerate):
+            if not self._try(self._freeze if self.policy == "hold" and not interrupted else self._decelerate):
                 self._try(self._freeze)
             self._try(self._come_to_rest)
-            self._try(self._release if self._policy == "off" else self._leave_holding)
+            self._try(self._release if self.policy == "off" else self._leave_holding)
 
     def release_at_last(self) -> bool:
         """Switch torque off if the user has requested it since the policy was applied; never raises."""
-        if self._released or not self._loop.stop.for_release:
+        if self._released or not self.loop.stop.for_release:
             return False
         self._try(self._release)
         self.read_back(armed=True)
@@ -387,12 +368,13 @@ class Ending:
 
     def read_back(self, *, armed: bool) -> None:
         """Read the state of all servos and derive the end state of the robot; never raises."""
-        self._result.servos = tuple(ServoEnd(servo.joint, servo.id) for servo in self._servos)
-        self._try(self._read_servos)
-        self._result.end_state = robot_state(self._result.servos) if armed else NOT_ARMED
+        self.result.servos = tuple(ServoEnd(servo.joint, servo.id) for servo in self._servos)
 
-    def _read_servos(self) -> None:
-        self._result.servos = read_back(self._loop.bus, self._servos)
+        def read() -> None:
+            self.result.servos = read_back(self.loop.bus, self._servos)
+
+        self._try(read)
+        self.result.end_state = robot_state(self.result.servos) if armed else NOT_ARMED
 
     # -- faults during the policy -------------------------------------------------------------------------------------
 
@@ -401,25 +383,25 @@ class Ending:
         try:
             step()
         except PortError as error:
-            if all(fault.cause != Cause.PORT for fault in self._result.faults):
+            if all(fault.cause != Cause.PORT for fault in self.result.faults):
                 self._declare(Fault(Cause.PORT, f"{error}; armed servos stop by their bus watchdog"))
         except Exception as error:
             self._declare(Fault(Cause.PROGRAM, repr(error)))
         except BaseException as error:
             # A request to exit, which is delayed until the robot has been stopped.
-            self._loop.stop()
+            self.loop.stop()
             self._declare(Fault(Cause.PROGRAM, repr(error)))
         else:
             return True
         return False
 
     def _declare(self, fault: Fault) -> None:
-        self._result.declare(replace(fault, time=self._loop.now()))
-        self._journal.add_line(f"{fault.cause}: {fault.text}")
+        self.result.declare(replace(fault, time=self.loop.clock.now()))
+        self.loop.journal.add_line(f"{fault.cause}: {fault.text}")
 
     def _watch(self, lateness: float, skipped: int) -> Cycle:
         """Read and apply the abort rules; a servo with a new fault stops at its present position."""
-        loop = self._loop
+        loop = self.loop
         cycle = loop.exchange(lateness, skipped, write=False)
         # Late cycles do not matter, because the remaining goals do not depend on the time at which they are sent.
         for fault in loop.rules.examine(cycle):
@@ -447,14 +429,14 @@ class Ending:
     def _freeze(self) -> None:
         """Set the goals of all servos to their present positions."""
         self._frozen = True
-        if any(fault.cause == Cause.STALL for fault in self._result.faults):
+        if any(fault.cause == Cause.STALL for fault in self.result.faults):
             # The last measurement is from before the stall.
-            self._loop.exchange(0.0, 0, write=False)
+            self.loop.exchange(0.0, 0, write=False)
         self._hold_measured(range(len(self._servos)))
 
     def _hold_measured(self, indices: Iterable[int]) -> None:
         """Set the goals of some servos to their measured positions."""
-        loop = self._loop
+        loop = self.loop
         reliable = []
         for index in indices:
             servo = self._servos[index]
@@ -470,7 +452,7 @@ class Ending:
 
     def _decelerate(self) -> None:
         """Slow down along the path to rest, all joints synchronously; faulty servos stop at their present positions."""
-        loop, faults = self._loop, self._result.faults
+        loop, faults = self.loop, self.result.faults
         if any(fault.cause == Cause.STALL for fault in faults):
             # The servos were stopped by their watchdogs and do not accept goals.
             return self._freeze()
@@ -498,23 +480,23 @@ class Ending:
 
     def _send(self, position: Array, velocity: Array) -> None:
         """Send goals [rad], [rad/s] to the servos without a fault."""
-        loop = self._loop
+        loop = self.loop
         sound = [index for index in range(len(self._servos)) if index not in self._faulty]
         loop.goal[sound], loop.goal_rate[sound] = position[sound], velocity[sound]
         self._write(sound)
 
     def _write(self, indices: list[int]) -> None:
         """Write the goals of some servos."""
-        loop, servos = self._loop, [self._servos[index] for index in indices]
+        loop, servos = self.loop, [self._servos[index] for index in indices]
         loop.write_goals(goal_registers(servos, loop.goal[indices], loop.goal_rate[indices]))
 
     def _come_to_rest(self) -> None:
         """Wait until all servos answer and are at rest, for REST_TIME at most."""
         quiet = 0
-        for _ in range(math.ceil(REST_TIME / self._loop.period)):
-            if self._loop.stop.for_release:
+        for _ in range(math.ceil(REST_TIME / self.loop.period)):
+            if self.loop.stop.for_release:
                 return
-            cycle = self._watch(*self._loop.wait_for_deadline())
+            cycle = self._watch(*self.loop.wait_for_deadline())
             # A silent servo does not count as at rest, because it may be restarting.
             quiet = quiet + 1 if np.all(np.abs(cycle.velocity) < AT_REST) else 0
             if quiet == REST_CYCLES:
@@ -522,7 +504,7 @@ class Ending:
 
     def _leave_holding(self) -> None:
         """Switch the watchdogs off, so that the robot keeps its posture after this program ends. Raises PortError."""
-        loop = self._loop
+        loop = self.loop
         health = read_health(loop.bus, self._servos)
         unconfirmed = []
         for index, servo in enumerate(self._servos):
@@ -538,33 +520,33 @@ class Ending:
                 loop.measured[index] = servo.to_angle(registers["present_position"])
                 self._hold_measured([index])
         if unconfirmed:
-            self._journal.add_line(
+            self.loop.journal.add_line(
                 f"watchdogs not confirmed to be off, they may stop these servos: {'; '.join(unconfirmed)}"
             )
-        return self._journal.add_line("servos with torque on stay ON; switch them off with `dynsim hw stop`")
+        return self.loop.journal.add_line("servos with torque on stay ON; switch them off with `dynsim hw stop`")
 
     def _release(self) -> None:
         """Broadcast torque off until all servos confirm or REST_TIME is over; then switch watchdogs off.
 
         Raises PortError.
         """
-        loop, until = self._loop, self._loop.now() + REST_TIME
+        loop, until = self.loop, self.loop.clock.now() + REST_TIME
         self._released = True
         while True:
             loop.bus.torque_off_all()
             health = read_health(loop.bus, self._servos)
             still_on = [id_ for id_ in loop.map.ids if id_ not in health or health[id_]["torque_enable"]]
-            self._result.torque_still_on = tuple(still_on)
-            if not still_on or loop.now() >= until:
+            self.result.torque_still_on = tuple(still_on)
+            if not still_on or loop.clock.now() >= until:
                 break
-            loop.pause(REST_TIME / 10)
+            loop.clock.sleep_until(loop.clock.now() + REST_TIME / 10)
         # Also switch watchdogs off, because a watchdog that trips later makes the goals read-only for the next program.
         for id_ in loop.map.ids:
             if id_ not in still_on and health[id_]["bus_watchdog"]:
                 with suppress(NoAnswer, RequestRefused):
                     loop.bus.write(id_, FIELDS["bus_watchdog"], 0)
         confirmed = f"; NOT confirmed by ID {', '.join(map(str, still_on))}" if still_on else ""
-        self._journal.add_line(f"torque off{confirmed}")
+        self.loop.journal.add_line(f"torque off{confirmed}")
 
 
 def read_health(bus: Bus, servos: Sequence[MappedServo]) -> dict[int, Registers]:
@@ -603,13 +585,14 @@ DRY_RUN_TIME = 1.0
 """Duration of a dry run, which measures the timing of the bus without moving [s]."""
 
 
+@dataclass(eq=False)
 class Replay:
     """One run of a motion on servos.
 
     Parameters
     ----------
     motion : MotionTask
-    servo_map : ServoMap
+    map : ServoMap
     bus : Bus
     clock : Clock
     policy : "hold", "decelerate" or "off", optional
@@ -634,41 +617,31 @@ class Replay:
         Layout of the measured record.
     """
 
-    def __init__(
-        self,
-        motion: MotionTask,
-        servo_map: ServoMap,
-        bus: Bus,
-        clock: Clock,
-        *,
-        policy: FaultPolicy | None = None,
-        live: bool = True,
-        write_eeprom: bool = False,
-        stop: StopRequest | None = None,
-        log: RunLog | None = None,
-        dump_folder: FilePath | None = None,
-        observer: Callable[[ReplayProgress], None] | None = None,
-        provenance: dict[str, Any] | None = None,
-    ) -> None:
-        self.motion = motion
-        self.map = servo_map
-        self.bus = bus
-        self.clock = clock
-        self.policy: FaultPolicy = policy or servo_map.safety.policy
-        self.live = live
-        self.write_eeprom = write_eeprom
-        self.stop = stop or StopRequest()
-        self._dump_folder = dump_folder
-        self._provenance = {"robot": servo_map.robot, "speed": motion.speed, "rate_Hz": motion.plan.rate}
-        self._provenance |= servo_map.lifting | (provenance or {})
+    motion: MotionTask
+    map: ServoMap
+    bus: Bus
+    clock: Clock
+    _: KW_ONLY
+    policy: FaultPolicy | None = None
+    live: bool = True
+    write_eeprom: bool = False
+    stop: StopRequest = field(default_factory=StopRequest)
+    log: RunLog = field(default_factory=lambda: RunLog(None))
+    dump_folder: FilePath | None = None
+    observer: Callable[[ReplayProgress], None] | None = None
+    provenance: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        motion, servo_map = self.motion, self.map
+        provenance = {"robot": servo_map.robot, "speed": motion.speed, "rate_Hz": motion.plan.rate}
         self._servos = servo_map.servos
         self._found_holding = False
         self.recorder = Recorder(servo_map)
-        self.layout = Layout.of(servo_map, self._provenance)
-        self.journal = Journal(clock, self.recorder, log or RunLog(None), observer, self.stop)
-        self.loop = Loop(motion, servo_map, bus, clock, self.stop, self.recorder, self.journal)
+        self.layout = Layout.of(servo_map, provenance | servo_map.lifting | self.provenance)
+        self.journal = Journal(self.clock, self.recorder, self.log, self.observer, self.stop)
+        self.loop = Loop(motion.plan, servo_map, self.bus, self.clock, self.stop, self.recorder, self.journal)
         self.result = ReplayResult(policy_goals=self.loop.policy_goals)
-        self._ending = Ending(self.loop, self.journal, self.result, self.policy)
+        self._ending = Ending(self.loop, self.result, self.policy or servo_map.safety.policy)
 
     def run(self) -> ReplayResult:
         """Execute the replay to its end or to a fault; problems of bus and outputs are part of the result.
@@ -723,7 +696,7 @@ class Replay:
         self.loop.goal = self.loop.goal_rate = np.full(len(self._servos), np.nan)
         self.loop.begin()
         for _ in range(math.ceil(DRY_RUN_TIME / self.loop.period)):
-            self.loop.read_only_cycle()
+            self.loop.exchange(*self.loop.next_cycle(), write=False)
         self.journal.add_line("dry run: nothing was moved; use --live to move the robot")
 
     def _arm(self) -> None:
@@ -865,8 +838,8 @@ class Replay:
             return None
 
     def _dump(self, registers: dict[str, Registers | str] | None, name: str) -> None:
-        if self._dump_folder and registers is not None:
-            self.journal.guard(name, write_json, self._dump_folder / name, registers)
+        if self.dump_folder and registers is not None:
+            self.journal.guard(name, write_json, self.dump_folder / name, registers)
 
     def _finish(self) -> None:
         self.journal.guard(RECORD, self._sum_up)

@@ -11,7 +11,6 @@ import json
 import math
 import os
 import signal
-import struct
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -215,7 +214,7 @@ def robot_state(servos: Sequence[ServoEnd]) -> str:
 Timing = dict[str, float | int]
 """Timing statistics of the control loop.
 
-Numbers of ``cycles``, ``skipped_cycles``, ``missed_statuses`` and ``stray_bytes``; times in [s], whose keys end in ``_s``:
+Numbers of ``cycles``, ``skipped_cycles``, ``missed_statuses`` and ``stray_bytes``; times in [s]:
 
 - ``period_mean_s``, ``period_max_s``: time between the starts of cycles
 - ``lateness_p50_s``, ``lateness_p99_s``, ``lateness_max_s``: delay of a start after its deadline
@@ -333,37 +332,35 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 
+@dataclass(eq=False)
 class Journal:
     """State of a replay, passed to log and observer. The methods do not raise.
 
     Attributes
     ----------
-    state : ReplayState
+    clock : Clock
+    recorder : Recorder
     log : RunLog
     observer : callable, optional
         Called with a ReplayProgress after each cycle and at each change of state.
+    stop : StopRequest
+    state : ReplayState
     failures : dict
         First error of each output that failed, by the name of the output; a failed output is disabled.
     """
 
-    def __init__(
-        self,
-        clock: Clock,
-        recorder: Recorder,
-        log: RunLog,
-        observer: Callable[[ReplayProgress], None] | None,
-        stop: StopRequest,
-    ) -> None:
-        self.state = ReplayState.CONNECT
-        self.observer = observer
-        self.log = log
-        self.failures: dict[str, BaseException] = {}
-        self._clock = clock
-        self._recorder = recorder
-        self._stop = stop
-        self._origin = clock.now()
-        self._last_logged = -math.inf
-        self._buffer: list[tuple[float, str, str]] | None = None
+    clock: Clock
+    recorder: Recorder
+    log: RunLog
+    observer: Callable[[ReplayProgress], None] | None
+    stop: StopRequest
+    state: ReplayState = ReplayState.CONNECT
+    failures: dict[str, BaseException] = field(default_factory=dict)
+    _last_logged: float = -math.inf
+    _buffer: list[tuple[float, str, str]] | None = None
+
+    def __post_init__(self) -> None:
+        self._origin = self.clock.now()
 
     def guard(self, name: str, call: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T | None:
         """Call an output; an error disables it.
@@ -389,7 +386,7 @@ class Journal:
             self.failures[name] = error
         except BaseException as error:
             self.failures[name] = error
-            self._stop()
+            self.stop()
         if name != "log":
             self.add_line(f"{name} failed and is disabled: {self.failures[name]!r}")
         return None
@@ -400,7 +397,7 @@ class Journal:
         self._observe(0.0, 0.0)
 
     def add_line(self, text: str) -> None:
-        line = (self._clock.now() - self._origin, self.state.name, text)
+        line = (self.clock.now() - self._origin, self.state.name, text)
         if self._buffer is None:
             self._write(*line)
         else:
@@ -410,10 +407,10 @@ class Journal:
         """Report the largest following error [rad] and the completed fraction of the motion after a cycle."""
         if self._buffer is not None:
             return
-        now = self._clock.now()
+        now = self.clock.now()
         if now - self._last_logged >= LOG_INTERVAL:
             self._last_logged = now
-            hottest = self._recorder.hottest
+            hottest = self.recorder.hottest
             self.add_line(
                 f"following error {following_error:.4f} rad"
                 + (f", hottest {hottest:.0f} °C" if hottest == hottest else "")
@@ -441,13 +438,11 @@ class Journal:
 
     def _observe(self, fraction: float, following_error: float) -> None:
         if self.observer and self._buffer is None:
-            progress = ReplayProgress(self.state, fraction, following_error, self._recorder.hottest)
+            progress = ReplayProgress(self.state, fraction, following_error, self.recorder.hottest)
             self.guard("progress", self.observer, progress)
 
 
 Rows = NDArray[np.void]
-SCALARS = struct.Struct("=5d3i")
-"""Scalars of a row."""
 
 
 def row_type(servos: int) -> np.dtype[np.void]:
@@ -482,6 +477,7 @@ class Recorder:
     def __init__(self, servo_map: ServoMap) -> None:
         count = len(servo_map.servos)
         self.type = row_type(count)
+        self._names = self.type.names or ()
         self.hottest = math.nan
         self._rows: list[bytes] = []
         self._columns = {servo.id: column for column, servo in enumerate(servo_map.servos)}
@@ -505,21 +501,9 @@ class Recorder:
                 self._volts[self._columns[id_]] = registers["present_voltage"] * VOLT_PER_UNIT
                 self._celsius[self._columns[id_]] = registers["present_temperature"]
             self.hottest = float(np.nanmax(self._celsius))
-        scalars = SCALARS.pack(
-            cycle.time, origin, path_time, cycle.lateness, cycle.exchange, state, cycle.stray, cycle.skipped
-        )
-        # Some microseconds faster than an assignment field by field, in every cycle.
-        arrays: tuple[Any, ...] = (
-            cycle.goal_position,
-            cycle.goal_velocity,
-            cycle.position,
-            cycle.velocity,
-            cycle.torque,
-            self._volts,
-            self._celsius,
-            cycle.alert,
-        )
-        self._rows.append(b"".join((scalars, *arrays)))
+        values = vars(cycle) | {"origin": origin, "path_time": path_time, "state": state}
+        values |= {"volts": self._volts, "celsius": self._celsius}
+        self._rows.append(np.array(tuple(values[name] for name in self._names), dtype=self.type).tobytes())
 
     def since(self, first: int) -> bytes:
         """Return the rows from number ``first`` on."""

@@ -8,17 +8,14 @@ reads of all servos for faults that only health reads can detect.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dynsim.hardware.bus.control_table import (
-    VOLT_PER_UNIT,
-    WATCHDOG_SECONDS_PER_UNIT,
-    describe_hardware_error,
-)
+from dynsim.hardware.bus.control_table import VOLT_PER_UNIT, WATCHDOG_SECONDS_PER_UNIT, describe_hardware_error
 from dynsim.hardware.replay.trajectory import CyclePlan
 from dynsim.hardware.servo_map import MappedServo, Safety, ServoMap
 
@@ -163,7 +160,7 @@ class AbortRules:
         self._late = self._late + 1 if cycle.lateness > self._late_after else 0
         safety = self._safety
         return [
-            *([self.stall(cycle.silence)] if self.stalled(cycle.silence) else ()),
+            *filter(None, [self.stall(cycle.silence)]),
             *self._alert(cycle),
             *(fault for id_, registers in cycle.health.items() for fault in self._health(self._by_id[id_], registers)),
             *self._silent(np.flatnonzero(self._missed >= safety.missed_cycles), cycle),
@@ -178,12 +175,10 @@ class AbortRules:
             *self._deadline(cycle),
         ]  # fmt: skip
 
-    def stalled(self, silence: float) -> bool:
-        """Return True if a time without packets [s] is long enough for the watchdogs of the servos to trip."""
-        return silence > self._watchdog
-
-    def stall(self, silence: float) -> Fault:
-        """Declare a stall: no packet was sent to the servos for ``silence`` [s]."""
+    def stall(self, silence: float) -> Fault | None:
+        """Declare a stall if no packet was sent for ``silence`` [s], long enough for the watchdogs to trip."""
+        if silence <= self._watchdog:
+            return None
         self._new(Cause.STALL)
         text = (
             f"stalled for {silence:.2f} s, so the bus watchdogs of the servos ({self._watchdog:.2f} s) have tripped; "
@@ -197,72 +192,62 @@ class AbortRules:
         self._declared.add((cause, id_))
         return not known
 
-    def _newly(self, cause: Cause, indices: NDArray[np.intp]) -> list[MappedServo]:
+    def _newly(self, cause: Cause, indices: Iterable[int]) -> list[MappedServo]:
         """Mark a fault of some servos as declared and return the servos for which it was not declared before."""
         return [self._servos[k] for k in indices if self._new(cause, self._servos[k].id)]
 
-    def _alert(self, cycle: Cycle) -> list[Fault]:
-        hit = self._newly(Cause.ALERT, np.flatnonzero(cycle.alert))
-        text = f"hardware error reported by {', '.join(map(str, hit))}"
-        return [Fault(Cause.ALERT, text, tuple(servo.id for servo in hit))] if hit else []
+    def _alert(self, cycle: Cycle) -> Iterator[Fault]:
+        if hit := self._newly(Cause.ALERT, np.flatnonzero(cycle.alert)):
+            text = f"hardware error reported by {', '.join(map(str, hit))}"
+            yield Fault(Cause.ALERT, text, tuple(servo.id for servo in hit))
 
-    def _health(self, servo: MappedServo, registers: dict[str, int]) -> list[Fault]:
-        faults: list[Fault] = []
-
-        def add(cause: Cause, text: str) -> None:
-            if self._new(cause, servo.id):
-                faults.append(Fault(cause, f"{servo}: {text}", (servo.id,)))
-
-        if registers["hardware_error"]:
-            add(Cause.ALERT, describe_hardware_error(registers["hardware_error"]))
-        elif registers["bus_watchdog"] == -1 and (Cause.STALL, None) not in self._declared:
-            add(Cause.WATCHDOG, "its bus watchdog has tripped, it ignores goals")
-        elif not registers["torque_enable"]:
-            add(Cause.TORQUE_LOST, "torque is off (restarted, or switched off by another program)")
+    def _health(self, servo: MappedServo, registers: dict[str, int]) -> Iterator[Fault]:
         celsius, volts = registers["present_temperature"], registers["present_voltage"] * VOLT_PER_UNIT
+        texts: dict[Cause, str] = {}
+        if registers["hardware_error"]:
+            texts[Cause.ALERT] = describe_hardware_error(registers["hardware_error"])
+        elif registers["bus_watchdog"] == -1 and (Cause.STALL, None) not in self._declared:
+            texts[Cause.WATCHDOG] = "its bus watchdog has tripped, it ignores goals"
+        elif not registers["torque_enable"]:
+            texts[Cause.TORQUE_LOST] = "torque is off (restarted, or switched off by another program)"
         if celsius > self._safety.temperature_max:
-            add(Cause.TEMPERATURE, f"{celsius} °C, limit {self._safety.temperature_max:g} °C")
+            texts[Cause.TEMPERATURE] = f"{celsius} °C, limit {self._safety.temperature_max:g} °C"
+        for cause, text in texts.items():
+            if self._new(cause, servo.id):
+                yield Fault(cause, f"{servo}: {text}", (servo.id,))
         supply = self._safety.supply
         if not supply.lowest <= volts <= supply.highest and self._new(Cause.VOLTAGE):
             # One supply feeds all servos, so the fault has no IDs and all servos stop synchronously.
-            text = f"{servo}: {volts:.1f} V, allowed {supply.lowest:g} to {supply.highest:g} V"
-            faults.append(Fault(Cause.VOLTAGE, text))
-        return faults
+            yield Fault(Cause.VOLTAGE, f"{servo}: {volts:.1f} V, allowed {supply.lowest:g} to {supply.highest:g} V")
 
-    def _silent(self, indices: NDArray[np.intp], cycle: Cycle) -> list[Fault]:
-        hit = self._newly(Cause.MISSED_STATUS, indices)
-        if not hit:
-            return []
-        text = f"no status for {self._safety.missed_cycles} cycles: {', '.join(map(str, hit))}"
-        outdated = [servo for servo in hit if servo.id in cycle.outdated]
-        if outdated:
-            text += f"; answers to earlier requests come from {', '.join(map(str, outdated))}"
-        if len(indices) == len(self._servos) > 1:
-            text += "; no servo answers: is the supply or the line lost?"
-        return [Fault(Cause.MISSED_STATUS, text, tuple(servo.id for servo in hit))]
+    def _silent(self, indices: NDArray[np.intp], cycle: Cycle) -> Iterator[Fault]:
+        if hit := self._newly(Cause.MISSED_STATUS, indices):
+            text = f"no status for {self._safety.missed_cycles} cycles: {', '.join(map(str, hit))}"
+            if outdated := [servo for servo in hit if servo.id in cycle.outdated]:
+                text += f"; answers to earlier requests come from {', '.join(map(str, outdated))}"
+            if len(indices) == len(self._servos) > 1:
+                text += "; no servo answers: is the supply or the line lost?"
+            yield Fault(Cause.MISSED_STATUS, text, tuple(servo.id for servo in hit))
 
-    def _beyond(self, cause: Cause, over: NDArray[np.bool_], values: NDArray[np.float64], quantity: str) -> list[Fault]:
-        if not over.any():
-            return []
+    def _beyond(
+        self, cause: Cause, over: NDArray[np.bool_], values: NDArray[np.float64], quantity: str
+    ) -> Iterator[Fault]:
         # Ignore servos with an earlier fault: a servo without torque or answer is off its goal, too.
         in_trouble = {id_ for _, id_ in self._declared}
-        hit = [k for k in np.flatnonzero(over) if self._servos[k].id not in in_trouble]
-        if not hit:
-            return []
-        ids = tuple(self._servos[k].id for k in hit)
-        for id_ in ids:
-            self._new(cause, id_)
-        names = ", ".join(f"{self._servos[k].joint} (ID {self._servos[k].id}, {values[k]:.3f})" for k in hit)
-        return [Fault(cause, f"{quantity}: {names}", ids)]
+        if hit := self._newly(
+            cause, [k for k in map(int, np.flatnonzero(over)) if self._servos[k].id not in in_trouble]
+        ):
+            value = {servo.id: values[k] for k, servo in enumerate(self._servos)}
+            names = ", ".join(f"{servo.joint} (ID {servo.id}, {value[servo.id]:.3f})" for servo in hit)
+            yield Fault(cause, f"{quantity}: {names}", tuple(servo.id for servo in hit))
 
-    def _deadline(self, cycle: Cycle) -> list[Fault]:
-        if self._late < self._safety.late_cycles or not self._new(Cause.DEADLINE):
-            return []
-        text = (
-            f"{self._late} cycles in a row started late, the last by {cycle.lateness * 1e3:.1f} ms: "
-            "the computer is too slow or too busy; close other programs, or lower --rate"
-        )
-        return [Fault(Cause.DEADLINE, text)]
+    def _deadline(self, cycle: Cycle) -> Iterator[Fault]:
+        if self._late >= self._safety.late_cycles and self._new(Cause.DEADLINE):
+            yield Fault(
+                Cause.DEADLINE,
+                f"{self._late} cycles in a row started late, the last by {cycle.lateness * 1e3:.1f} ms: "
+                "the computer is too slow or too busy; close other programs, or lower --rate",
+            )
 
 
 def _count(counters: NDArray[np.int64], hit: NDArray[np.bool_], unknown: NDArray[np.bool_]) -> NDArray[np.int64]:

@@ -6,7 +6,7 @@ its limits and switches its torque off at its own thresholds. A limit that contr
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -124,7 +124,7 @@ def verify(
         except RequestRefused as refused:
             problems.append(f"{servo.joint}: {refused}")
             continue
-        unfit = _unfit(servo, registers, servo_map)
+        unfit = [*_unfit(servo, registers, servo_map)]
         if registers["model_number"] == servo.model.number:
             rows.append(compare_limits(servo, registers, servo_map.safety, needs))
             unfit += [*rows[-1].refused, *_position_problem(servo, registers)]
@@ -135,42 +135,31 @@ def verify(
     return problems + missed, rows
 
 
-def _unfit(servo: MappedServo, registers: Registers, servo_map: ServoMap) -> list[str]:
-    problems = []
+def _unfit(servo: MappedServo, registers: Registers, servo_map: ServoMap) -> Iterator[str]:
     if registers["model_number"] != servo.model.number:
-        return [f"is model {registers['model_number']}, the map has {servo.model.name} ({servo.model.number})"]
+        yield f"is model {registers['model_number']}, the map has {servo.model.name} ({servo.model.number})"
+        return
     if registers["firmware"] < servo.kind.firmware_min:
-        problems.append(f"firmware {registers['firmware']} is older than firmware_min {servo.kind.firmware_min}")
-    if registers["operating_mode"] != servo.operating_mode:
-        mode = registers["operating_mode"]
+        yield f"firmware {registers['firmware']} is older than firmware_min {servo.kind.firmware_min}"
+    if (mode := registers["operating_mode"]) != servo.operating_mode:
         name = OperatingMode(mode).name.lower() if mode in list(OperatingMode) else str(mode)
-        problems.append(f"is in mode {name}, must be {servo.kind.mode} (--configure sets it)")
-    if registers["drive_mode"]:
-        problems.append(
-            f"drive mode is {registers['drive_mode']}, must be 0 (--configure sets it); use sign in the map instead"
-        )
-    delay = registers["return_delay"] * RETURN_DELAY_SECONDS_PER_UNIT
-    if delay > servo_map.bus.return_delay + 1e-9:
-        problems.append(
-            f"return delay is {delay * 1e6:.0f} µs, the map has {servo_map.bus.return_delay * 1e6:.0f} µs "
-            "(--configure sets it)"
-        )
+        yield f"is in mode {name}, must be {servo.kind.mode} (--configure sets it)"
+    if mode := registers["drive_mode"]:
+        yield f"drive mode is {mode}, must be 0 (--configure sets it); use sign in the map instead"
+    delay, longest = registers["return_delay"] * RETURN_DELAY_SECONDS_PER_UNIT, servo_map.bus.return_delay
+    if delay > longest + 1e-9:
+        yield f"return delay is {delay * 1e6:.0f} µs, the map has {longest * 1e6:.0f} µs (--configure sets it)"
     if registers["status_return_level"] != STATUS_TO_ALL:
-        problems.append(f"status return level is {registers['status_return_level']}, must be {STATUS_TO_ALL}")
+        yield f"status return level is {registers['status_return_level']}, must be {STATUS_TO_ALL}"
     if registers["shutdown"] & NEEDED_SHUTDOWN != NEEDED_SHUTDOWN:
-        problems.append(
-            f"shutdown is 0x{registers['shutdown']:02x}, must switch the torque off at overheating and overload"
-        )
-    if registers["hardware_error"]:
-        problems.append(
-            f"hardware error: {describe_hardware_error(registers['hardware_error'])}; restart the servo to clear it"
-        )
+        yield f"shutdown is 0x{registers['shutdown']:02x}, must switch the torque off at overheating and overload"
+    if error := registers["hardware_error"]:
+        yield f"hardware error: {describe_hardware_error(error)}; restart the servo to clear it"
     volts, supply = registers["present_voltage"] * VOLT_PER_UNIT, servo_map.safety.supply
     if not supply.lowest <= volts <= supply.highest:
-        problems.append(f"supply is {volts:.1f} V, allowed {supply.lowest:g} to {supply.highest:g} V")
+        yield f"supply is {volts:.1f} V, allowed {supply.lowest:g} to {supply.highest:g} V"
     if registers["present_temperature"] > servo_map.safety.temperature_max:
-        problems.append(f"{registers['present_temperature']} °C, limit {servo_map.safety.temperature_max:g} °C")
-    return problems
+        yield f"{registers['present_temperature']} °C, limit {servo_map.safety.temperature_max:g} °C"
 
 
 def _position_problem(servo: MappedServo, registers: Registers) -> list[str]:
