@@ -658,11 +658,11 @@ def confirm_replay(servo_map: ServoMap, motion: MotionTask, port: str, *, asked:
     for distance in approach.distances[:1]:
         console.print(f"largest distance to the start: {distance}")
     agreed = not asked or _agreed(CLEAR, "move?")
-    if agreed and approach.far:
+    bound = servo_map.safety.start_distance
+    if agreed and (far := [distance for distance in approach.distances if distance.size > bound]):
         still = "" if asked else " (asked even with --yes)"
-        bound = servo_map.safety.start_distance
         console.print(f"more than safety.start_distance = {bound:g} rad from the start{still}:")
-        for distance in approach.far:
+        for distance in far:
             console.print(f"  {distance}")
         agreed = _agreed("All joints move to the start together. Is the whole path free?", "move to the start?")
     if not agreed:

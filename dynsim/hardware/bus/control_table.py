@@ -109,7 +109,7 @@ class ServoModel:
     stall_torque: float
     stall_current: float
     fields: dict[str, Field] = field(repr=False)
-    ampere_per_unit: float = 3.36e-3
+    ampere_per_unit: float
 
     @property
     def measures_current(self) -> bool:
@@ -193,13 +193,11 @@ _COMMON = {
     "present_temperature": Field(146, 1, writable=False),
 }
 
+_RAD_S_PER_RPM = 2 * math.pi / 60
 _LOAD = {"present_load": Field(126, 2, writable=False, signed=True)}
-_ACCELERATION_LIMIT = {"acceleration_limit": Field(40, 4, 32767, 0, 32767)}
-_BACKUP = {"startup_configuration": Field(60, 1, 0, 0, 3), "backup_ready": Field(147, 1, writable=False)}
 _EXTERNAL_PORTS = {f"external_port_mode_{k}": Field(55 + k, 1, 3, 0, 3) for k in (1, 2, 3)} | {
     f"external_port_data_{k}": Field(150 + 2 * k, 2) for k in (1, 2, 3)
 }
-_RAD_S_PER_RPM = 2 * math.pi / 60
 
 
 def _current(limit: int) -> dict[str, Field]:
@@ -216,75 +214,40 @@ def _delivered(fields: dict[str, Field], **defaults: int) -> dict[str, Field]:
     return fields | {name: replace(fields[name], default=value) for name, value in defaults.items()}
 
 
-def _geared(
-    servo: ServoModel, name: str, number: int, *, rpm: float, stall_torque: float, velocity_limit: int
-) -> ServoModel:
-    """Return a model with the same motor and control table but another gear; ``rpm`` is the no-load speed."""
-    return replace(
-        servo,
-        name=name,
-        number=number,
-        no_load_speed=rpm * _RAD_S_PER_RPM,
-        stall_torque=stall_torque,
-        fields=_delivered(servo.fields, velocity_limit=velocity_limit),
-    )
-
-
-MX_106 = ServoModel(
-    name="MX-106",
-    number=321,
-    no_load_speed=45 * _RAD_S_PER_RPM,
-    stall_torque=8.4,
-    stall_current=5.2,
-    fields=_delivered(_COMMON, velocity_limit=210) | _ACCELERATION_LIMIT | _current(2047),
-)
-MX_28 = ServoModel(
-    name="MX-28",
-    number=30,
-    no_load_speed=55 * _RAD_S_PER_RPM,
-    stall_torque=2.5,
-    stall_current=1.4,
-    fields=_COMMON | _ACCELERATION_LIMIT | _LOAD,
-)
-_X = _delivered(_COMMON, position_p_gain=800) | _BACKUP
-XL430_W250 = ServoModel(
-    name="XL430-W250",
-    number=1060,
-    no_load_speed=61 * _RAD_S_PER_RPM,
-    stall_torque=1.5,
-    stall_current=1.4,
-    fields=_delivered(
-        _X,
-        temperature_limit=72,
-        velocity_limit=265,
-        velocity_i_gain=1000,
-        position_d_gain=4000,
-        position_p_gain=640,
-    )
+_MX = _COMMON | {"acceleration_limit": Field(40, 4, 32767, 0, 32767)}
+_X = _delivered(_COMMON, position_p_gain=800) | {
+    "startup_configuration": Field(60, 1, 0, 0, 3),
+    "backup_ready": Field(147, 1, writable=False),
+}
+_XL430 = (
+    _delivered(_X, temperature_limit=72, velocity_i_gain=1000, position_d_gain=4000, position_p_gain=640)
     | {"max_voltage": Field(32, 2, 140, 60, 140), "min_voltage": Field(34, 2, 60, 60, 140)}
-    | _LOAD,
+    | _LOAD
 )
-XM430_W210 = ServoModel(
-    name="XM430-W210",
-    number=1030,
-    no_load_speed=77 * _RAD_S_PER_RPM,
-    stall_torque=3.0,
-    stall_current=2.3,
-    fields=_delivered(_X, velocity_limit=330) | _current(1193),
-    ampere_per_unit=2.69e-3,
-)
-XM430_W350 = _geared(XM430_W210, "XM430-W350", 1020, rpm=46, stall_torque=4.1, velocity_limit=200)
-XH540_W150 = ServoModel(
-    name="XH540-W150",
-    number=1110,
-    no_load_speed=70 * _RAD_S_PER_RPM,
-    stall_torque=7.1,
-    stall_current=4.9,
-    fields=_delivered(_X, velocity_limit=300) | _EXTERNAL_PORTS | _current(2047),
-    ampere_per_unit=2.69e-3,
-)
-XH540_W270 = _geared(XH540_W150, "XH540-W270", 1100, rpm=39, stall_torque=9.9, velocity_limit=167)
-MODELS = {model.name: model for model in (MX_106, MX_28, XL430_W250, XM430_W210, XM430_W350, XH540_W150, XH540_W270)}
+_XM430, _XH540 = _X | _current(1193), _X | _EXTERNAL_PORTS | _current(2047)
+MODELS = {
+    name: ServoModel(
+        name,
+        number,
+        rpm * _RAD_S_PER_RPM,
+        stall_torque,
+        stall_current,
+        _delivered(fields, velocity_limit=velocity_limit),
+        ampere_per_unit,
+    )
+    # Name, model number, no-load speed [rpm], stall torque [N·m] and current [A], default velocity limit, registers, and
+    # unit of the registers of current [A].
+    for name, number, rpm, stall_torque, stall_current, velocity_limit, fields, ampere_per_unit in (
+        ("MX-106", 321, 45, 8.4, 5.2, 210, _MX | _current(2047), 3.36e-3),
+        ("MX-28", 30, 55, 2.5, 1.4, 230, _MX | _LOAD, 3.36e-3),
+        ("XL430-W250", 1060, 61, 1.5, 1.4, 265, _XL430, 3.36e-3),
+        ("XM430-W210", 1030, 77, 3.0, 2.3, 330, _XM430, 2.69e-3),
+        ("XM430-W350", 1020, 46, 4.1, 2.3, 200, _XM430, 2.69e-3),
+        ("XH540-W150", 1110, 70, 7.1, 4.9, 300, _XH540, 2.69e-3),
+        ("XH540-W270", 1100, 39, 9.9, 4.9, 167, _XH540, 2.69e-3),
+    )
+}
+MX_106, MX_28 = MODELS["MX-106"], MODELS["MX-28"]
 MODEL_BY_NUMBER = {model.number: model for model in MODELS.values()}
 
 INDIRECT_BLOCKS = ((168, 224, 28), (578, 634, 28))

@@ -177,22 +177,13 @@ class Decoder:
                 keep = 0 if final else _header_prefix(buffer)
                 self._skip(len(buffer) - keep)
                 return
-            if start:
-                self._skip(start)
-            if len(buffer) < 7 and not final:
+            self._skip(start)
+            end = 7 + int.from_bytes(buffer[5:7], "little")
+            possible = buffer[3:4] == b"\0" and 10 <= end <= 7 + MAX_LENGTH
+            if not final and (len(buffer) < 7 or (possible and len(buffer) < end)):
                 return
-            length = int.from_bytes(buffer[5:7], "little") if len(buffer) >= 7 else 0
-            if buffer[3:4] != b"\0" or not 3 <= length <= MAX_LENGTH:
-                self._skip(1)
-                continue
-            end = 7 + length
-            if len(buffer) < end:
-                if not final:
-                    return
-                self._skip(1)
-                continue
             frame = bytes(buffer[:end])
-            if contains_bare_header(frame[7:-2]) or crc16(frame[:-2]) != int.from_bytes(frame[-2:], "little"):
+            if not possible or len(frame) < end or contains_bare_header(frame[7:-2]) or not _checksum_matches(frame):
                 self._skip(1)
                 continue
             # Unstuff the body only: FF FF FD may also occur across length field and instruction.
@@ -209,6 +200,10 @@ class Decoder:
     def _skip(self, count: int) -> None:
         self.garbage += count
         del self._buffer[:count]
+
+
+def _checksum_matches(frame: bytes) -> bool:
+    return crc16(frame[:-2]) == int.from_bytes(frame[-2:], "little")
 
 
 def _header_prefix(buffer: bytearray) -> int:

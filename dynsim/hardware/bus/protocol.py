@@ -97,31 +97,24 @@ class Bus(Protocol):
 
     def ping_all(self) -> dict[int, tuple[int, int]]:
         """Return model number and firmware version of all servos that answer a broadcast ping, by ID."""
-        ...
 
     def read(self, id_: int, field: Field) -> int:
         """Read one register. Raises NoAnswer or RequestRefused."""
-        ...
 
     def read_block(self, id_: int, address: int, length: int) -> ServoReply:
         """Read consecutive bytes. Raises NoAnswer or RequestRefused."""
-        ...
 
     def write(self, id_: int, field: Field, value: int) -> None:
         """Write one register and wait for the acknowledgement. Raises NoAnswer or RequestRefused."""
-        ...
 
     def sync_write(self, field: Field, values: dict[int, int]) -> None:
         """Write one register of many servos at once; the servos do not acknowledge it."""
-        ...
 
     def sync_read(self, ids: Sequence[int], address: int, length: int) -> BlockRead:
         """Read the same bytes of many servos; a servo that does not answer this request in time is absent."""
-        ...
 
     def torque_off_all(self) -> None:
         """Broadcast torque off three times, whatever the state of the port."""
-        ...
 
     def close(self) -> None: ...
 

@@ -144,31 +144,29 @@ class Comparison:
 
     def summary(self) -> dict[str, Any]:
         """Return the results as a dictionary for JSON, with units in the keys."""
-        joints = {
-            joint.joint: {
-                "rms_rad": joint.rms,
-                "max_rad": joint.max,
-                "rms_delay_removed_rad": joint.rms_delay_removed,
-                "delay_s": None if np.isnan(joint.delay) else joint.delay,
-            }
-            for joint in self.joints
-        }
-        units = {"rate_rms": "rad_s", "rate_max": "rad_s", "turned": "rad", "angle_max": "rad", "angle_end": "rad"}
-        wheels = {
-            wheel.wheel: {f"{name}_{unit}": getattr(wheel, name) for name, unit in units.items()}
-            for wheel in self.wheels
-        }
+        joint_units = {"rms": "rad", "max": "rad", "rms_delay_removed": "rad", "delay": "s"}
+        wheel_units = {
+            "rate_rms": "rad_s", "rate_max": "rad_s", "turned": "rad", "angle_max": "rad", "angle_end": "rad"
+        }  # fmt: skip
         return {
-            "delay_s": None if np.isnan(self.delay) else self.delay,
+            "delay_s": _number(self.delay),
             "rms_rad": self.worst.rms,
             "max_rad": max(joint.max for joint in self.joints),
             "rms_delay_removed_rad": max(joint.rms_delay_removed for joint in self.joints),
             "worst_joint": self.worst.joint,
             "wheel_rate_rms_rad_s": max((wheel.rate_rms for wheel in self.wheels), default=None),
             "wheel_angle_max_rad": max((wheel.angle_max for wheel in self.wheels), default=None),
-            "joints": joints,
-            "wheels": wheels,
+            "joints": {joint.joint: _with_units(joint, joint_units) for joint in self.joints},
+            "wheels": {wheel.wheel: _with_units(wheel, wheel_units) for wheel in self.wheels},
         }
+
+
+def _number(value: float) -> float | None:
+    return None if np.isnan(value) else value
+
+
+def _with_units(error: JointError | WheelError, units: dict[str, str]) -> dict[str, float | None]:
+    return {f"{name}_{unit}": _number(getattr(error, name)) for name, unit in units.items()}
 
 
 def compare_records(simulated: Record, measured: Record) -> Comparison:

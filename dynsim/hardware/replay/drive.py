@@ -149,14 +149,12 @@ class Feed(Protocol):
 
     def take(self, most: int) -> Sequence[Sample]:
         """Return at most ``most`` samples that arrived since the last call, the oldest first."""
-        ...
 
     def report_time(self, time: float) -> None:
         """Report the simulation time that the servos have reached [s].
 
         The simulation may advance to :func:`lead` beyond this time, and further by the delay of :class:`LiftLookahead`.
         """
-        ...
 
 
 def lead(servo_map: ServoMap) -> float:

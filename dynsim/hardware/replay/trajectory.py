@@ -36,7 +36,6 @@ class Motion(Protocol):
 
     def at(self, time: float) -> tuple[Array, Array]:
         """Return joint angles [rad] and their derivatives with respect to ``time``, shape (N,)."""
-        ...
 
 
 class GoalCourse:

@@ -349,17 +349,14 @@ class WayToStart:
 
     Attributes
     ----------
-    distances : tuple of Distance
+    distances : list of Distance
         Distances of the joints in position mode, the largest first.
     duration : float
         Duration of the move [s].
-    far : tuple of Distance
-        Distances larger than ``safety.start_distance``.
     """
 
-    distances: tuple[Distance, ...]
+    distances: list[Distance]
     duration: float
-    far: tuple[Distance, ...]
 
 
 def way_to_start(bus: Bus, servo_map: ServoMap, start: NDArray[np.float64]) -> WayToStart:
@@ -384,9 +381,8 @@ def way_to_start(bus: Bus, servo_map: ServoMap, start: NDArray[np.float64]) -> W
         if servo.in_position_mode
     ]
     distances.sort(key=lambda distance: -distance.size)
-    far = tuple(distance for distance in distances if distance.size > servo_map.safety.start_distance)
     duration = QUINTIC_PEAK * max((distance.size for distance in distances), default=0.0)
-    return WayToStart(tuple(distances), duration / servo_map.safety.approach_velocity, far)
+    return WayToStart(distances, duration / servo_map.safety.approach_velocity)
 
 
 def read_registers(bus: Bus, servos: Sequence[MappedServo], block: tuple[int, int]) -> dict[int, Registers]:

@@ -14,7 +14,7 @@ import logging
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -112,35 +112,8 @@ class MotorLaw:
         ]
 
 
-class ServoPlant(Protocol):
-    """Interface of the mechanics that servos drive.
-
-    Attributes
-    ----------
-    position, velocity, torque : array, shape (N,)
-        Servo angle [rad] (0 at tick 0), speed [rad/s], motor torque [N·m].
-    rests : bool
-        True if nothing moves while all servos are off, so that no steps are needed.
-    """
-
-    position: Array
-    velocity: Array
-    torque: Array
-
-    @property
-    def rests(self) -> bool: ...
-
-    def step(self, dt: float, drive: Drive) -> None:
-        """Advance by ``dt`` [s]."""
-        ...
-
-    def stop(self, index: int) -> None:
-        """Stop one shaft at its present angle and lock it during the next step (a jammed gear)."""
-        ...
-
-
 class InertialLoad:
-    """A separate inertia for each servo, with a critically damped second-order response."""
+    """A separate inertia for each servo, with a critically damped second-order response; see :data:`ServoPlant`."""
 
     def __init__(self, models: list[ServoModel], position: Array) -> None:
         self.law = MotorLaw(models)
@@ -154,12 +127,14 @@ class InertialLoad:
         return bool(np.abs(self.velocity).max(initial=0.0) < 1e-4)
 
     def step(self, dt: float, drive: Drive) -> None:
+        """Advance by ``dt`` [s]."""
         self.torque = self.law.torque(self.position, self.velocity, drive)
         self.velocity = np.where(self._jammed, 0.0, self.velocity + dt * self.torque / self.law.inertia)
         self.position += dt * self.velocity
         self._jammed[:] = False
 
     def stop(self, index: int) -> None:
+        """Stop one shaft at its present angle and lock it during the next step (a jammed gear)."""
         self.velocity[index] = 0.0
         self._jammed[index] = True
 
@@ -178,7 +153,7 @@ SLOW, STEADY = 1e-4, 1e-2
 
 
 class SimulatedArm:
-    """A :class:`~dynsim.hardware.virtual.simulated_plant.ServoPlant`: a robot with a position servo at each joint.
+    """A :data:`~dynsim.hardware.virtual.simulated_plant.ServoPlant`: a robot with a position servo at each joint.
 
     A joint is locked by the stand of the robot until its servo is first switched on; otherwise an arm would fall while
     its joints are armed one after another.
@@ -277,6 +252,18 @@ class SimulatedArm:
         """Return angles [rad] and speeds [rad/s] of the servos."""
         state = self.simulation.state
         return self._zero + self._scale * state.q[self._order], self._scale * state.v[self._rows]
+
+
+ServoPlant = InertialLoad | SimulatedArm
+"""Mechanics that servos drive.
+
+Attributes
+----------
+position, velocity, torque : array, shape (N,)
+    Servo angle [rad] (0 at tick 0), speed [rad/s], motor torque [N·m].
+rests : bool
+    True if nothing moves while all servos are off, so that no steps are needed.
+"""
 
 
 def served_joints(robot: Robot) -> dict[str, str]:
