@@ -39,7 +39,7 @@ from dynsim.system.terminal import Terminal, escaped, plain
 if TYPE_CHECKING:
     from dynsim.hardware.bus.protocol import Bus, Clock
     from dynsim.hardware.nudge import Nudge
-    from dynsim.hardware.replay.drive import MotionTask
+    from dynsim.hardware.replay.check import MotionTask
     from dynsim.hardware.servo_map import MappedServo, ServoMap
 
 hw = typer.Typer(
@@ -252,7 +252,7 @@ def replayed(
 def print_dry_run(result: Any) -> None:
     """Print the result of a replay without motion."""
 
-    from dynsim.hardware.replay.verify import QUANTITIES, differences
+    from dynsim.hardware.replay.rules import QUANTITIES, differences
 
     table = Table("joint", "ID", *QUANTITIES, title="limits: servo | map")
     for row in result.limits:
@@ -522,7 +522,7 @@ def hw_drive(
     require_client_library()
     from dynsim.engine.recording import RUN_FILES
     from dynsim.hardware.ports import VIRTUAL, bus_on
-    from dynsim.hardware.replay.drive import check_drive
+    from dynsim.hardware.replay.check import check_drive
     from dynsim.hardware.replay.session import shown_by
     from dynsim.hardware.servo_map import load_servo_map
     from dynsim.scenario import load_scenario
@@ -647,7 +647,7 @@ def confirm_replay(servo_map: ServoMap, motion: MotionTask, port: str, *, asked:
         If the posture cannot be read.
     """
     from dynsim.hardware.ports import bus_on
-    from dynsim.hardware.replay.verify import way_to_start
+    from dynsim.hardware.replay.rules import way_to_start
 
     with bus_on(port, servo_map) as (bus, _):
         approach = way_to_start(bus, servo_map, motion.start)

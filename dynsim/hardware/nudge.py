@@ -21,9 +21,8 @@ from dynsim.hardware.errors import ReplayAborted, ReplayInterrupted, Verificatio
 from dynsim.hardware.replay.check import CheckedMotion, plan_cycle
 from dynsim.hardware.replay.machine import Replay
 from dynsim.hardware.replay.output import ReplayState, StopRequest
-from dynsim.hardware.replay.rules import Cause
+from dynsim.hardware.replay.rules import Cause, read_ticks
 from dynsim.hardware.replay.trajectory import QUINTIC_PEAK, Path, quintic
-from dynsim.hardware.replay.verify import read_ticks
 from dynsim.hardware.servo_map import MappedServo, ServoMap, refuse_torque
 
 ANGLE = math.radians(3.0)

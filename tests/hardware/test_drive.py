@@ -20,8 +20,7 @@ from support.messages import check_message, raises
 from dynsim.errors import CheckRefused, DynsimError
 from dynsim.hardware.bus.protocol import Clock
 from dynsim.hardware.errors import OutputsFailed, PortError, ReplayAborted
-from dynsim.hardware.replay.check import MotionLimits
-from dynsim.hardware.replay.drive import SILENCE, DrivenMotion, IncrementalPath, Sample, check_drive, lead
+from dynsim.hardware.replay.check import SILENCE, DrivenMotion, IncrementalPath, MotionLimits, Sample, check_drive, lead
 from dynsim.hardware.replay.output import ReplayProgress, ReplayState, StopRequest, displayed
 from dynsim.hardware.replay.rules import Cause
 from dynsim.hardware.replay.session import run_replay, shown_by

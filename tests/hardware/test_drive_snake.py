@@ -12,8 +12,7 @@ from support.messages import check_message, raises
 from dynsim import load_scenario
 from dynsim.errors import CheckRefused
 from dynsim.hardware.bus.protocol import Clock
-from dynsim.hardware.replay.check import check_motion
-from dynsim.hardware.replay.drive import IncrementalPath, Sample, check_drive
+from dynsim.hardware.replay.check import IncrementalPath, Sample, check_drive, check_motion
 from dynsim.hardware.replay.rules import Cause
 from dynsim.hardware.servo_map import ServoMap
 from dynsim.record import Record

@@ -38,7 +38,7 @@ def check_against_the_servos(run: Run) -> None:
     for end in run.result.servos:
         registers, index = servos.registers[end.id], servos.ids.index(end.id)
         if end.doing == SILENT:
-            assert run.line.unplugged or end.id in servos.dead
+            assert run.line.servos.unplugged or end.id in servos.dead
             continue
         assert end.torque == bool(registers["torque_enable"])
         assert end.error == registers["hardware_error"]

@@ -7,8 +7,7 @@ import math
 import pytest
 from support.messages import check_message, lines_with
 
-from dynsim.hardware.replay.rules import Cause
-from dynsim.hardware.replay.verify import compare_limits, difference_lines, needs_of_map, snapshot
+from dynsim.hardware.replay.rules import Cause, compare_limits, difference_lines, needs_of_map, snapshot
 from dynsim.hardware.servo_map import load_servo_map
 
 

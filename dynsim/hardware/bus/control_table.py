@@ -235,8 +235,8 @@ MODELS = {
         _delivered(fields, velocity_limit=velocity_limit),
         ampere_per_unit,
     )
-    # Name, model number, no-load speed [rpm], stall torque [N·m] and current [A], default velocity limit, registers, and
-    # unit of the registers of current [A].
+    # Name, number, no-load speed [rpm], stall torque [N·m] and current [A], default velocity limit, registers, and unit
+    # of current [A].
     for name, number, rpm, stall_torque, stall_current, velocity_limit, fields, ampere_per_unit in (
         ("MX-106", 321, 45, 8.4, 5.2, 210, _MX | _current(2047), 3.36e-3),
         ("MX-28", 30, 55, 2.5, 1.4, 230, _MX | _LOAD, 3.36e-3),

@@ -31,8 +31,7 @@ from dynsim.hardware.bus.control_table import (
 )
 from dynsim.hardware.bus.protocol import Bus, Clock, NoAnswer, RequestRefused, too_busy
 from dynsim.hardware.errors import PortError
-from dynsim.hardware.replay.check import velocity_limit
-from dynsim.hardware.replay.drive import MotionTask
+from dynsim.hardware.replay.check import MotionTask, velocity_limit
 from dynsim.hardware.replay.measured import describe, measured_record
 from dynsim.hardware.replay.output import (
     HOLDING,
@@ -55,9 +54,20 @@ from dynsim.hardware.replay.output import (
     StopRequest,
     robot_state,
 )
-from dynsim.hardware.replay.rules import AbortRules, Cause, Cycle, Fault, watchdog_units
+from dynsim.hardware.replay.rules import (
+    AbortRules,
+    Cause,
+    Cycle,
+    Fault,
+    Registers,
+    all_registers,
+    configure,
+    difference_lines,
+    read_registers,
+    verify,
+    watchdog_units,
+)
 from dynsim.hardware.replay.trajectory import QUINTIC_PEAK, Approach, CyclePlan, GoalCourse
-from dynsim.hardware.replay.verify import Registers, all_registers, configure, difference_lines, read_registers, verify
 from dynsim.hardware.servo_map import FaultPolicy, MappedServo, ServoMap
 from dynsim.system.files import write_json
 

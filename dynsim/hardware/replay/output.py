@@ -28,8 +28,7 @@ from rich.progress import Progress as Bar
 from dynsim.hardware.bus.control_table import VOLT_PER_UNIT, describe_hardware_error
 from dynsim.hardware.bus.protocol import Clock
 from dynsim.hardware.errors import PortError
-from dynsim.hardware.replay.rules import Cause, Cycle, Fault
-from dynsim.hardware.replay.verify import LimitRow
+from dynsim.hardware.replay.rules import Cause, Cycle, Fault, LimitRow
 from dynsim.hardware.servo_map import ServoMap
 from dynsim.record import Record
 from dynsim.record.scene import Scene

@@ -1,22 +1,39 @@
-"""Abort rules of a replay: conditions on the answers of a cycle that stop the motion.
+"""Conditions for motion: verification of the servos before torque on, and abort rules on the answers of each cycle.
 
-Each rule has a bounded reaction time: the number of cycles from the first cycle whose answers show the fault to the
-cycle that declares it. The bound is set in ``safety`` of the map; it is one cycle for an alert, and one round of health
-reads of all servos for faults that only health reads can detect.
+Each abort rule has a bounded reaction time: the number of cycles from the first cycle whose answers show the fault to
+the cycle that declares it. The bound is set in ``safety`` of the map; it is one cycle for an alert, and one round of
+health reads of all servos for faults that only health reads can detect.
+
+Verification compares the limits stored in a servo with the limits of the map, because the servo silently ignores goals
+beyond its limits and switches its torque off at its own thresholds. A limit that contradicts the map prevents arming.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dynsim.hardware.bus.control_table import VOLT_PER_UNIT, WATCHDOG_SECONDS_PER_UNIT, describe_hardware_error
-from dynsim.hardware.replay.trajectory import CyclePlan
+from dynsim.hardware.bus.control_table import (
+    HARDWARE_ERRORS,
+    HEALTH_BLOCK,
+    MODEL_BY_NUMBER,
+    RAD_S_PER_UNIT,
+    RETURN_DELAY_SECONDS_PER_UNIT,
+    STATE_BLOCK,
+    VOLT_PER_UNIT,
+    WATCHDOG_SECONDS_PER_UNIT,
+    OperatingMode,
+    describe_hardware_error,
+)
+from dynsim.hardware.bus.protocol import Bus, NoAnswer, RequestRefused, too_busy
+from dynsim.hardware.errors import VerificationFailed
+from dynsim.hardware.replay.trajectory import QUINTIC_PEAK, CyclePlan, Needs
 from dynsim.hardware.servo_map import MappedServo, Safety, ServoMap
 
 
@@ -252,3 +269,387 @@ class AbortRules:
 
 def _count(counters: NDArray[np.int64], hit: NDArray[np.bool_], unknown: NDArray[np.bool_]) -> NDArray[np.int64]:
     return np.where(unknown, counters, np.where(hit, counters + 1, 0))
+
+
+# Verification before torque on: servos match the map, are configured and healthy, and are within their limits.
+
+
+EEPROM_BLOCK = (0, 64)
+TRIAL_READS = 10
+TRIAL_MISSES = 2
+"""Maximum number of TRIAL_READS that a servo may miss."""
+NEEDED_SHUTDOWN = 0b0010_0100  # overheating, overload
+STATUS_TO_ALL = 2
+NO_ANSWER_HINT = (
+    "check power, cable, ID and baud rate (`dynsim hw scan`); a servo with Protocol 1 firmware does not answer"
+)
+
+QUANTITIES = ("position °", "velocity rad/s", "torque N m", "temperature °C", "supply V")
+VOLTAGE_SHUTDOWN = 1 << next(bit for bit, name in HARDWARE_ERRORS.items() if name == "input voltage")
+ATTEMPTS = 3
+"""Number of reads after which a servo without answer counts as silent."""
+
+Registers = dict[str, int]
+
+
+def snapshot(bus: Bus, servo: MappedServo) -> Registers:
+    """Read all registers of a servo; the keys are names of registers. Raises NoAnswer or RequestRefused."""
+    eeprom = bus.read_block(servo.id, *EEPROM_BLOCK).data
+    ram = bus.read_block(servo.id, *HEALTH_BLOCK).data
+    return servo.model.registers_in(EEPROM_BLOCK[0], eeprom + ram)
+
+
+def all_registers(bus: Bus, servo_map: ServoMap) -> dict[str, Registers | str]:
+    """Read the registers of all servos, by joint; a servo without answer has an error text. Raises PortError."""
+    contents: dict[str, Registers | str] = {}
+    for servo in servo_map.servos:
+        try:
+            contents[servo.joint] = snapshot(bus, servo)
+        except (NoAnswer, RequestRefused) as error:
+            contents[servo.joint] = str(error)
+    return contents
+
+
+def configure(bus: Bus, servo_map: ServoMap, report: Callable[[str], None]) -> None:
+    """Write operating mode, return delay and drive mode (EEPROM) if they differ from the values the replay needs.
+
+    Raises
+    ------
+    NoAnswer, RequestRefused
+        If a servo does not answer or refuses a write, for example because its torque is on, which locks the EEPROM.
+    """
+    wanted = {"return_delay": int(servo_map.bus.return_delay / RETURN_DELAY_SECONDS_PER_UNIT), "drive_mode": 0}
+    for servo in servo_map.servos:
+        now = snapshot(bus, servo)
+        for name, value in {"operating_mode": int(servo.operating_mode), **wanted}.items():
+            if now[name] != value:
+                bus.write(servo.id, servo.model.fields[name], value)
+                report(f"{servo}: {name} {now[name]} -> {value}")
+
+
+def verify(
+    bus: Bus, servo_map: ServoMap, demands: Iterable[Needs], *, poll: Callable[[], None]
+) -> tuple[list[str], list[LimitRow]]:
+    """Verify the servos on the bus before a motion.
+
+    Parameters
+    ----------
+    bus : Bus
+    servo_map : ServoMap
+    demands : iterable of Needs
+        Demands of the motion on the joints, in the order of the map.
+    poll : callable
+        Called between servos; may raise an exception to cancel.
+
+    Returns
+    -------
+    problems : list of str
+        One line per problem; empty if the robot may move.
+    rows : list of LimitRow
+        Limits stored in the servos next to the limits of the map.
+    """
+    problems: list[str] = []
+    rows: list[LimitRow] = []
+    silent = False
+    present = bus.ping_all()
+    poll()
+    for id_, (model, firmware) in present.items():
+        if id_ not in servo_map.ids:
+            name = MODEL_BY_NUMBER[model].name if model in MODEL_BY_NUMBER else f"model {model}"
+            problems.append(f"ID {id_}: {name} (firmware {firmware}) is on the bus but not in the map")
+    for servo, needs in zip(servo_map.servos, demands, strict=True):
+        poll()
+        try:
+            registers = snapshot(bus, servo)
+        except NoAnswer as missing:
+            silent = True
+            hint = "check for two servos with this ID" if missing.garbled or servo.id in present else NO_ANSWER_HINT
+            problems.append(f"{servo.joint}: {missing}; {hint}")
+            continue
+        except RequestRefused as refused:
+            problems.append(f"{servo.joint}: {refused}")
+            continue
+        unfit = [*_unfit(servo, registers, servo_map)]
+        if registers["model_number"] == servo.model.number:
+            rows.append(compare_limits(servo, registers, servo_map.safety, needs))
+            unfit += [*rows[-1].refused, *_position_problem(servo, registers)]
+        problems += [f"{servo}: {text}" for text in unfit]
+    missed = [] if problems else _trial_reads(bus, servo_map, poll)
+    if (silent or missed) and (busy := too_busy(bus)):
+        missed.append(busy)
+    return problems + missed, rows
+
+
+def _unfit(servo: MappedServo, registers: Registers, servo_map: ServoMap) -> Iterator[str]:
+    if registers["model_number"] != servo.model.number:
+        yield f"is model {registers['model_number']}, the map has {servo.model.name} ({servo.model.number})"
+        return
+    if registers["firmware"] < servo.kind.firmware_min:
+        yield f"firmware {registers['firmware']} is older than firmware_min {servo.kind.firmware_min}"
+    if (mode := registers["operating_mode"]) != servo.operating_mode:
+        name = OperatingMode(mode).name.lower() if mode in list(OperatingMode) else str(mode)
+        yield f"is in mode {name}, must be {servo.kind.mode} (--configure sets it)"
+    if mode := registers["drive_mode"]:
+        yield f"drive mode is {mode}, must be 0 (--configure sets it); use sign in the map instead"
+    delay, longest = registers["return_delay"] * RETURN_DELAY_SECONDS_PER_UNIT, servo_map.bus.return_delay
+    if delay > longest + 1e-9:
+        yield f"return delay is {delay * 1e6:.0f} µs, the map has {longest * 1e6:.0f} µs (--configure sets it)"
+    if registers["status_return_level"] != STATUS_TO_ALL:
+        yield f"status return level is {registers['status_return_level']}, must be {STATUS_TO_ALL}"
+    if registers["shutdown"] & NEEDED_SHUTDOWN != NEEDED_SHUTDOWN:
+        yield f"shutdown is 0x{registers['shutdown']:02x}, must switch the torque off at overheating and overload"
+    if error := registers["hardware_error"]:
+        yield f"hardware error: {describe_hardware_error(error)}; restart the servo to clear it"
+    volts, supply = registers["present_voltage"] * VOLT_PER_UNIT, servo_map.safety.supply
+    if not supply.lowest <= volts <= supply.highest:
+        yield f"supply is {volts:.1f} V, allowed {supply.lowest:g} to {supply.highest:g} V"
+    if registers["present_temperature"] > servo_map.safety.temperature_max:
+        yield f"{registers['present_temperature']} °C, limit {servo_map.safety.temperature_max:g} °C"
+
+
+def _position_problem(servo: MappedServo, registers: Registers) -> list[str]:
+    """Return a problem if the servo is outside its limits, from where the robot must not start."""
+    tick = registers["present_position"]
+    low, high = servo.tick_limits
+    if not servo.in_position_mode or low <= tick <= high:
+        return []
+    return [
+        f"is at {servo.to_angle(tick):.3f} rad (tick {tick}), outside its limits "
+        f"{servo.position_limits[0]:.3f} to {servo.position_limits[1]:.3f} rad; move it by hand"
+    ]
+
+
+def _trial_reads(bus: Bus, servo_map: ServoMap, poll: Callable[[], None]) -> list[str]:
+    """Detect two servos with the same ID: their answers to a ping may be equal, but their measured values differ."""
+    missed = dict.fromkeys(servo_map.ids, 0)
+    for _ in range(TRIAL_READS):
+        poll()
+        replies = bus.sync_read(servo_map.ids, *STATE_BLOCK).replies
+        for id_ in servo_map.ids:
+            missed[id_] += id_ not in replies
+    if all(count == TRIAL_READS for count in missed.values()):
+        return ["no servo answers a sync read; set the latency timer of the adapter to 1 ms"]
+    return [
+        f"{servo}: {missed[servo.id]} of {TRIAL_READS} answers were missing or garbled; "
+        "check the cable, and for two servos with this ID"
+        for servo in servo_map.servos
+        if missed[servo.id] > TRIAL_MISSES
+    ]
+
+
+@dataclass(frozen=True)
+class LimitRow:
+    """Limits of one servo next to the limits of the map.
+
+    Attributes
+    ----------
+    joint : str
+    id : int
+    cells : tuple of (str, str)
+        Limit stored in the servo and limit of the map, for each of QUANTITIES.
+    refused : tuple of str
+        Differences that prevent arming.
+    differs : tuple of str
+        Other differences, shown as notes.
+    """
+
+    joint: str
+    id: int
+    cells: tuple[tuple[str, str], ...]
+    refused: tuple[str, ...]
+    differs: tuple[str, ...]
+
+
+def needs_of_map(servo: MappedServo) -> Needs:
+    """Return the full range that the map allows."""
+    low, high = servo.position_limits
+    return Needs(low, high, servo.kind.limits.velocity)
+
+
+def compare_limits(servo: MappedServo, registers: Registers, safety: Safety, needs: Needs) -> LimitRow:
+    """Compare the limits in the EEPROM of a servo with the limits of the map.
+
+    A limit is refused if the servo would ignore goals of the motion or lag behind it. A threshold is refused if the
+    servo would switch its torque off before the rule of the replay stops it, or later than its data sheet specifies.
+    """
+    compared = (
+        _position(servo, registers, needs),
+        _velocity(servo, registers, needs),
+        _torque(servo, registers),
+        _temperature(servo, registers, safety),
+        _supply(registers, safety),
+    )
+    return LimitRow(
+        servo.joint,
+        servo.id,
+        tuple((row.servo, row.map) for row in compared),
+        tuple(row.refused for row in compared if row.refused),
+        tuple(row.differs for row in compared if row.differs),
+    )
+
+
+class _Compared(NamedTuple):
+    servo: str = "-"
+    map: str = "-"
+    refused: str = ""
+    differs: str = ""
+
+
+def _position(servo: MappedServo, registers: Registers, needs: Needs) -> _Compared:
+    if not servo.in_position_mode:
+        return _Compared()
+    low, high = registers["min_position"], registers["max_position"]
+    own = np.degrees(sorted((servo.to_angle(low), servo.to_angle(high))))
+    bounds = np.degrees(servo.position_limits)
+    goals, allowed = sorted((servo.to_ticks(needs.low), servo.to_ticks(needs.high))), servo.tick_limits
+    refused = differs = ""
+    if goals[0] < low or goals[1] > high:
+        refused = f"the motion needs ticks {goals[0]} to {goals[1]}, the servo allows {low} to {high}"
+    elif allowed[0] < low or allowed[1] > high:
+        differs = f"position limits of the servo are narrower than in the map: ticks {low} to {high}"
+    return _Compared(f"{own[0]:.0f} to {own[1]:.0f}", f"{bounds[0]:.0f} to {bounds[1]:.0f}", refused, differs)
+
+
+def _velocity(servo: MappedServo, registers: Registers, needs: Needs) -> _Compared:
+    units, allowed = registers["velocity_limit"], servo.kind.limits.velocity
+    own = units * RAD_S_PER_UNIT / servo.gear
+    refused = differs = ""
+    below = units < abs(servo.to_velocity_units(allowed))
+    if below and not servo.in_position_mode:
+        refused = f"velocity limit of the servo is {own:.2f} rad/s, below the map; it would ignore faster goals"
+    elif units < abs(servo.to_velocity_units(needs.fastest)):
+        refused = f"the motion needs {needs.fastest:.2f} rad/s, the servo allows {own:.2f} and would lag"
+    elif below:
+        differs = f"velocity limit of the servo is {own:.2f} rad/s, below the map"
+    return _Compared(f"{own:.2f}", f"{allowed:.2f}", refused, differs)
+
+
+def _torque(servo: MappedServo, registers: Registers) -> _Compared:
+    allowed = servo.kind.limits.torque
+    if "current_limit" not in registers:
+        return _Compared(map=f"{allowed:.1f}")
+    # The limit applies to modes that control current, which a map cannot select.
+    own = servo.gear * servo.model.torque(registers["current_limit"])
+    below = f"current limit of the servo corresponds to {own:.1f} N m, below the map" if own < allowed else ""
+    return _Compared(f"{own:.1f}", f"{allowed:.1f}", differs=below)
+
+
+def _temperature(servo: MappedServo, registers: Registers, safety: Safety) -> _Compared:
+    own, allowed = registers["temperature_limit"], safety.temperature_max
+    refused = ""
+    if own <= allowed:
+        refused = f"switches its torque off at {own} °C, before temperature_max ({allowed:g} °C) stops the robot"
+    elif own > (highest := servo.model.fields["temperature_limit"].default):
+        refused = f"temperature limit is {own} °C, a {servo.model.name} must shut down at {highest} °C"
+    return _Compared(f"{own}", f"{allowed:g}", refused)
+
+
+def _supply(registers: Registers, safety: Safety) -> _Compared:
+    low, high = registers["min_voltage"] * VOLT_PER_UNIT, registers["max_voltage"] * VOLT_PER_UNIT
+    allowed = safety.supply
+    refused = differs = ""
+    if not (low <= allowed.lowest and allowed.highest <= high):
+        outside = f"outside {low:g} to {high:g} V, a narrower range than safety.supply"
+        if registers["shutdown"] & VOLTAGE_SHUTDOWN:
+            refused = f"switches its torque off {outside}"
+        else:
+            differs = f"raises an alert {outside}"
+    return _Compared(f"{low:g} to {high:g}", f"{allowed.lowest:g} to {allowed.highest:g}", refused, differs)
+
+
+def difference_lines(rows: Sequence[LimitRow]) -> list[str]:
+    """Return the lines of a text table with cells "servo | map", followed by the differences."""
+    table = [["joint", "ID", *QUANTITIES]]
+    table += [[row.joint, str(row.id), *(" | ".join(cell) for cell in row.cells)] for row in rows]
+    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+    lines = ["  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() for line in table]
+    return ["limits (stored in the servo | in the map):", *lines, *differences(rows)]
+
+
+def differences(rows: Sequence[LimitRow]) -> list[str]:
+    """Return one line per difference, the refused limits first."""
+    refused = [f"{row.joint} (ID {row.id}): {text}" for row in rows for text in row.refused]
+    return refused + [f"note: {row.joint} (ID {row.id}): {text}" for row in rows for text in row.differs]
+
+
+@dataclass(frozen=True)
+class Distance:
+    """Present angle of one joint, and its angle at the start of the motion [rad]."""
+
+    joint: str
+    now: float
+    start: float
+
+    @property
+    def size(self) -> float:
+        return abs(self.start - self.now)
+
+    def __str__(self) -> str:
+        return f"{self.joint} {self.size:.3f} rad (from {self.now:.3f} to {self.start:.3f})"
+
+
+@dataclass(frozen=True)
+class WayToStart:
+    """Move to the start posture before a replay.
+
+    Attributes
+    ----------
+    distances : list of Distance
+        Distances of the joints in position mode, the largest first.
+    duration : float
+        Duration of the move [s].
+    """
+
+    distances: list[Distance]
+    duration: float
+
+
+def way_to_start(bus: Bus, servo_map: ServoMap, start: NDArray[np.float64]) -> WayToStart:
+    """Read the present posture and plan the move to the start.
+
+    Parameters
+    ----------
+    bus : Bus
+    servo_map : ServoMap
+    start : array, shape (N,)
+        Posture at the start of the motion [rad].
+
+    Raises
+    ------
+    VerificationFailed
+        If a servo does not answer.
+    """
+    ticks = read_ticks(bus, [servo for servo in servo_map.servos if servo.in_position_mode])
+    distances = [
+        Distance(servo.joint, servo.to_angle(ticks[servo.id]), float(target))
+        for servo, target in zip(servo_map.servos, start, strict=True)
+        if servo.in_position_mode
+    ]
+    distances.sort(key=lambda distance: -distance.size)
+    duration = QUINTIC_PEAK * max((distance.size for distance in distances), default=0.0)
+    return WayToStart(distances, duration / servo_map.safety.approach_velocity)
+
+
+def read_registers(bus: Bus, servos: Sequence[MappedServo], block: tuple[int, int]) -> dict[int, Registers]:
+    """Read a block of registers of all servos that answer one of ATTEMPTS reads, by ID. Raises PortError."""
+    registers: dict[int, Registers] = {}
+    for _ in range(ATTEMPTS):
+        missing = {servo.id: servo for servo in servos if servo.id not in registers}
+        if not missing:
+            break
+        replies = bus.sync_read([*missing], *block).replies
+        registers |= {id_: missing[id_].model.registers_in(block[0], reply.data) for id_, reply in replies.items()}
+    return registers
+
+
+def read_ticks(bus: Bus, servos: Sequence[MappedServo]) -> dict[int, int]:
+    """Return the position of each servo [ticks], by ID. Raises VerificationFailed if a servo does not answer."""
+    registers = read_registers(bus, servos, STATE_BLOCK)
+    ticks = {id_: values["present_position"] for id_, values in registers.items()}
+    silent = [str(servo) for servo in servos if servo.id not in ticks]
+    if silent:
+        busy = too_busy(bus)
+        raise VerificationFailed(
+            f"no answer from {', '.join(silent)}; check power, cable, ID and baud rate{busy and '; '}{busy}"
+        )
+    return ticks

@@ -13,7 +13,7 @@ from typing import Any
 from dynsim.errors import DynsimError
 from dynsim.hardware.bus.protocol import Bus, Clock
 from dynsim.hardware.errors import OutputsFailed, PortError, ReplayAborted, ReplayInterrupted, VerificationFailed
-from dynsim.hardware.replay.drive import MotionTask
+from dynsim.hardware.replay.check import MotionTask
 from dynsim.hardware.replay.machine import RECORD, Replay
 from dynsim.hardware.replay.measured import write_measured
 from dynsim.hardware.replay.output import (

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import random
 import select
 import sys
 import time
@@ -20,12 +21,11 @@ import serial
 from dynamixel_sdk import PortHandler
 
 from dynsim.hardware.bus.control_table import BAUD_RATES, RAD_PER_TICK, RETURN_DELAY_SECONDS_PER_UNIT
-from dynsim.hardware.bus.packet import STATUS, Decoder, Packet
+from dynsim.hardware.bus.packet import STATUS, Decoder, Packet, crc16
 from dynsim.hardware.bus.protocol import Clock, fcntl, require_posix, termios, tty
 from dynsim.hardware.errors import PortError
 from dynsim.hardware.servo_map import ServoMap
 from dynsim.hardware.virtual.faults import FaultScript
-from dynsim.hardware.virtual.injection import Injection
 from dynsim.hardware.virtual.servos import PHYSICS_STEP, Firmware, ServoRegisters, VirtualServos
 from dynsim.hardware.virtual.simulated_plant import ServoPlant
 
@@ -68,27 +68,21 @@ class VirtualLine:
         script = script or FaultScript()
         self.servos = VirtualServos(servos, positions=positions, plant=plant, script=script)
         self.listener = listener
-        self._faults = Injection(self.servos, script)
+        self._random = random.Random(script.seed)
         self._firmware = Firmware(self.servos)
         self._decoders: dict[int, Decoder] = {}
         self._last_byte = 0.0
-        self._faults.apply()
 
     @property
     def time(self) -> float:
         """Time of the servos [s]."""
         return self.servos.time
 
-    @property
-    def unplugged(self) -> bool:
-        """True if the adapter was unplugged."""
-        return self._faults.unplugged
-
     def advance(self, now: float) -> None:
         """Advance the servos to the time ``now`` [s]."""
         while now - self.servos.time >= PHYSICS_STEP:
             self.servos.step(now)
-            self._faults.apply()
+            self.servos.inject()
 
     @property
     def baud(self) -> int:
@@ -118,10 +112,10 @@ class VirtualLine:
         """
         end = start + len(data) * 10 / baud
         self.advance(end)
-        if self.unplugged:
+        if self.servos.unplugged:
             raise serial.SerialException(5, "Input/output error")
         arrivals: list[tuple[float, bytes]] = []
-        if self._faults.echo:
+        if any(fault.kind == "echo" for fault in self.servos.active_faults()):
             arrivals.append((end + ADAPTER_LATENCY, data))
         # An incomplete packet is discarded after a pause.
         expired = start - self._last_byte > BYTE_TIMEOUT
@@ -146,8 +140,39 @@ class VirtualLine:
             if not answer.chained:
                 now += self.servos.registers[first]["return_delay"] * RETURN_DELAY_SECONDS_PER_UNIT + TURNAROUND
             now += len(answer.frame) * 10 / baud
-            arrivals += self._faults.disturb(first, answer.frame, now + ADAPTER_LATENCY)
+            arrivals += self._disturb(first, answer.frame, now + ADAPTER_LATENCY)
         return arrivals
+
+    def _disturb(self, id_: int, frame: bytes, arrival: float) -> list[tuple[float, bytes]]:
+        """Return the arrival time and the bytes of a status packet after the scripted faults; empty if it is lost."""
+        chance = self._random.random
+        for fault in self.servos.active_faults():
+            if getattr(fault, "id", None) not in (None, id_):
+                continue
+            match fault.kind:
+                case "lost_status" if chance() < fault.probability:
+                    return []
+                case "truncated_status" if chance() < fault.probability:
+                    frame = frame[: self._random.randrange(1, len(frame))]
+                case "bad_crc" if chance() < fault.probability:
+                    at = self._random.randrange(7, len(frame))
+                    frame = frame[:at] + bytes([frame[at] ^ 1 << self._random.randrange(8)]) + frame[at + 1 :]
+                case "noise" if chance() < fault.probability:
+                    frame = self._random.randbytes(self._random.randrange(1, 12)) + frame
+                case "late_status" if chance() < fault.probability:
+                    arrival += fault.delay
+                case "duplicate_id":
+                    # Both servos drive the line and a zero bit wins. The frames differ in the measured values only.
+                    frame = bytes(a & b for a, b in zip(frame, self._duplicate_frame(frame), strict=True))
+        return [(arrival, frame)]
+
+    def _duplicate_frame(self, frame: bytes) -> bytes:
+        if len(frame) < 15:
+            return frame
+        body = bytearray(frame[:-2])
+        for k in range(9, len(body)):
+            body[k] ^= self._random.randrange(4)
+        return bytes(body) + crc16(body).to_bytes(2, "little")
 
 
 def line_for_map(servo_map: ServoMap, **options: Any) -> VirtualLine:
@@ -239,7 +264,7 @@ class VirtualPort(PortHandler):
 
     def _receive(self) -> None:
         self.line.advance(self.clock.now())
-        if self.line.unplugged:
+        if self.line.servos.unplugged:
             raise serial.SerialException(5, "Input/output error")
         while self._arriving and self._arriving[0][0] <= self.clock.now() + 1e-12:
             self._input += self._arriving.popleft()[1]
@@ -310,7 +335,7 @@ class PseudoTerminal:
         """Answer requests until ``keep_on`` returns False or a scripted fault unplugs the adapter."""
         origin = last = time.monotonic()
         outgoing: deque[tuple[float, bytes]] = deque()
-        while keep_on() and not self.line.unplugged:
+        while keep_on() and not self.line.servos.unplugged:
             now = time.monotonic() - origin
             wait = min(IDLE, max(0.0, outgoing[0][0] - now)) if outgoing else IDLE
             readable, _, _ = select.select([self._master], [], [], wait)

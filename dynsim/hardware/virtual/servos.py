@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -197,6 +197,7 @@ SUPPLY, SUPPLY_RESISTANCE = 12.0, 0.05  # V, Ω
 BROWN_OUT = 6.0
 """Supply below which the electronics of the servos stop; they restart above it [V] (unverified)."""
 OVERHEATING, OVERLOAD, INPUT_VOLTAGE = 1 << 2, 1 << 5, 1 << 0
+WRONG_REGISTERS = {"wrong_model": "model_number", "wrong_firmware": "firmware", "wrong_mode": "operating_mode"}
 
 
 @dataclass
@@ -239,8 +240,7 @@ class VirtualServos:
     plant : ServoPlant or None
         Plant that the servos drive; if None, a separate inertia for each servo.
     script : FaultScript
-        Source of voltage sags, temperature ramps and angle faults;
-        :class:`~dynsim.hardware.virtual.injection.Injection` applies the other faults.
+        Scripted faults; :class:`~dynsim.hardware.virtual.line.VirtualLine` applies those of status packets.
 
     Attributes
     ----------
@@ -260,6 +260,8 @@ class VirtualServos:
         Time of the last packet that each servo could receive, for the watchdogs [s].
     dead : set of int
         IDs without power or cable.
+    unplugged : bool
+        True if the adapter was unplugged.
     temperature : array, shape (N,)
         Temperature of the windings [°C].
     play : array, shape (N,)
@@ -283,6 +285,8 @@ class VirtualServos:
         self.time = 0.0
         self.torque_since = math.inf
         self.dead: set[int] = set()
+        self.unplugged = False
+        self._fired: set[int] = set()
         self._powered = self._switched_on = True
         self._script = script
         count = len(self.ids)
@@ -308,6 +312,7 @@ class VirtualServos:
             self.reload(index)
             self.hold_position(index)
             self.reload(index)
+        self.inject()
 
     def active_faults(self) -> list[Fault]:
         """Return the faults of the script that are active now."""
@@ -320,6 +325,47 @@ class VirtualServos:
         """Return the time at which the next fault starts or ends [s]."""
         changes = [self.torque_since + time for fault in self._script.faults for time in fault.span]
         return min((time for time in changes if time > self.time), default=math.inf)
+
+    def inject(self) -> None:
+        """Apply the faults that change a servo: once when they become active, a jam at every step."""
+        on = not any(fault.kind == "supply_loss" for fault in self.active_faults())
+        if on != self._switched_on:
+            self._switched_on = on
+            self._update_supply(0.0)
+        for number, fault in enumerate(self._script.faults):
+            if not fault.active(self.time - self.torque_since):
+                continue
+            if fault.kind == "stuck" and fault.id in self.registers:
+                self.plant.stop(self.ids.index(fault.id))
+            if number in self._fired:
+                continue
+            self._fired.add(number)
+            if fault.kind == "unplug":
+                self.unplugged = True
+            if getattr(fault, "id", None) in self.registers:
+                self._inject_into_servo(fault)
+
+    def _inject_into_servo(self, fault: Any) -> None:
+        index, registers = self.ids.index(fault.id), self.registers[fault.id]
+        match fault.kind:
+            case "wrong_model" | "wrong_firmware" | "wrong_mode":
+                registers[WRONG_REGISTERS[fault.kind]] = fault.value
+                self.reload(index)
+            case "drop_off":
+                self.dead.add(fault.id)
+                registers["torque_enable"] = 0
+                self.reload(index)
+            case "reboot":
+                self.reboot(fault.id)
+            case "overload":
+                self.raise_error(index, OVERLOAD)
+            case "overheat":
+                self.temperature[index] = registers["temperature_limit"] + 1.0
+                self.raise_error(index, OVERHEATING)
+            case "watchdog_trip":
+                self.trip_watchdog(index)
+            case "backlash":
+                self.play[index] = self.plant.position[index]
 
     # -- requests -----------------------------------------------------------------------------------------------------
 
@@ -383,12 +429,6 @@ class VirtualServos:
         self._overload[index] = 0.0
         self._boot_until[id_] = self.time + BOOT_TIME
         self.reload(index)
-
-    def set_power(self, *, on: bool) -> None:
-        """Switch the supply of all servos; they restart when it returns."""
-        if on != self._switched_on:
-            self._switched_on = on
-            self._update_supply(0.0)
 
     def _update_supply(self, current: float) -> None:
         """Update the supply voltage for a current [A]; servos fail below BROWN_OUT and restart above it."""

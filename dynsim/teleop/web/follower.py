@@ -27,7 +27,7 @@ import numpy as np
 from dynsim.engine.recording import save_drive
 from dynsim.errors import CheckRefused, DynsimError, RecordError
 from dynsim.hardware.bus.protocol import require_posix
-from dynsim.hardware.replay.drive import LiftLookahead, Sample, lead
+from dynsim.hardware.replay.check import LiftLookahead, Sample, lead
 from dynsim.hardware.replay.output import ignore_stops
 from dynsim.hardware.replay.trajectory import GROUNDED as LIFTED
 from dynsim.hardware.replay.trajectory import column_of
@@ -308,7 +308,7 @@ PATIENCE = 5.0
 
 
 class PipeFeed:
-    """A :class:`~dynsim.hardware.replay.drive.Feed` from another process.
+    """A :class:`~dynsim.hardware.replay.check.Feed` from another process.
 
     Attributes
     ----------

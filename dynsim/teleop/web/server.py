@@ -57,6 +57,7 @@ class _Client:
     messages: int = 0
 
 
+@dataclass(eq=False)
 class Server:
     """Server that runs in a separate thread from :meth:`start` to :meth:`stop`.
 
@@ -76,30 +77,25 @@ class Server:
         Called when the pilot ends the drive.
     """
 
-    def __init__(
-        self,
-        deadman: Deadman,
-        hello: Mapping[str, Any],
-        axes: int,
-        modes: tuple[int, ...],
-        page: Callable[[str], str],
-        end: Callable[[], None],
-    ) -> None:
-        self._deadman, self._hello, self._axes, self._modes, self._end = deadman, hello, axes, modes, end
-        self._make_page = page
-        self.token = secrets.token_urlsafe(24)
-        self._clients: dict[ServerConnection, _Client] = {}
-        self._pilot: _Client | None = None
-        self._frame = ""
-        self._loop: asyncio.AbstractEventLoop | None = None
-        self._thread: threading.Thread | None = None
-        self._ready = threading.Event()
-        self._quit: asyncio.Event | None = None
-        self._why = ""
-        self.failure: BaseException | None = None
-        self.port = 0
-        self._page = b""
-        self.had_clients = False
+    deadman: Deadman
+    hello: Mapping[str, Any]
+    axes: int
+    modes: tuple[int, ...]
+    page: Callable[[str], str]
+    end: Callable[[], None]
+    token: str = field(default_factory=lambda: secrets.token_urlsafe(24))
+    port: int = 0
+    failure: BaseException | None = None
+    had_clients: bool = False
+    _clients: dict[ServerConnection, _Client] = field(default_factory=dict)
+    _pilot: _Client | None = None
+    _frame: str = ""
+    _loop: asyncio.AbstractEventLoop | None = None
+    _thread: threading.Thread | None = None
+    _ready: threading.Event = field(default_factory=threading.Event)
+    _quit: asyncio.Event | None = None
+    _why: str = ""
+    _page: bytes = b""
 
     @property
     def address(self) -> str:
@@ -171,7 +167,7 @@ class Server:
             server_header=None,
         ) as listener:
             self.port = _port(listener)
-            self._page = self._make_page(self.socket).encode()
+            self._page = self.page(self.socket).encode()
             self._ready.set()
             await self._quit.wait()
             messages = (client.socket.send(json.dumps({"over": self._why})) for client in self._clients.values())
@@ -207,7 +203,7 @@ class Server:
         self.had_clients = True
         sender: asyncio.Task[None] | None = None
         try:
-            await socket.send(json.dumps({"hello": dict(self._hello)}))
+            await socket.send(json.dumps({"hello": dict(self.hello)}))
             await self._send_roles()
             sender = asyncio.create_task(self._send(client))
             async for message in socket:
@@ -235,7 +231,7 @@ class Server:
 
     async def _handle(self, client: _Client, message: str | bytes) -> None:
         try:
-            parsed = parse(message, self._axes, self._modes)
+            parsed = parse(message, self.axes, self.modes)
         except Refused as reason:
             client.refused += 1
             await client.socket.send(json.dumps({"refused": str(reason)}))
@@ -248,16 +244,16 @@ class Server:
         elif client is not self._pilot:
             return
         elif isinstance(parsed, PilotCommand):
-            self._deadman.receive(parsed)
+            self.deadman.receive(parsed)
         elif parsed == "leave":
             self._release()
             await self._send_roles()
         elif parsed == "end":
-            self._end()
+            self.end()
 
     def _release(self) -> None:
         self._pilot = None
-        self._deadman.reset()
+        self.deadman.reset()
 
     async def _send_roles(self) -> None:
         for client in list(self._clients.values()):
