@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Sequence
 from contextlib import nullcontext
 from enum import StrEnum
@@ -50,10 +49,7 @@ hw = typer.Typer(
 console = Terminal(soft_wrap=True, highlight=False, markup=False, emoji=False)
 
 
-class Policy(StrEnum):
-    hold = "hold"
-    decelerate = "decelerate"
-    off = "off"
+Policy = StrEnum("Policy", ["hold", "decelerate", "off"])
 
 
 RecordFile = Annotated[Path, typer.Argument(metavar="RECORD", help="Record of a run (record.h5).")]
@@ -210,7 +206,7 @@ def replay(
     moves = live or port == VIRTUAL
     if live and port != VIRTUAL:
         confirm_replay(servo_map, motion, port, asked=not yes)
-    with shown_by({"standard output": sys.stdout}, folder) as lost:
+    with shown_by(folder) as lost:
         result = replayed(
             motion,
             servo_map,
@@ -545,13 +541,7 @@ def hw_drive(
         with console.status("loading the kernels; the first time, compiling them takes half a minute"):
             ready = process.ready()
         motion = check_drive(
-            ready.first,
-            servo_map,
-            process.feed,
-            step=ready.step,
-            longest=longest,
-            rate=rate,
-            scene=ready.still.scene,
+            ready.first, servo_map, process.feed, step=ready.step, longest=longest, rate=rate, scene=ready.still.scene
         )
         if live and port != VIRTUAL:
             confirm_replay(servo_map, motion, port, asked=not yes, at_most=True)
@@ -560,7 +550,7 @@ def hw_drive(
         posture = dict(zip(servo_map.joints, motion.start.tolist(), strict=True))
         error: DynsimError | None = None
         try:
-            with shown_by({"standard output": sys.stdout}, folder / SERVOS) as lost:
+            with shown_by(folder / SERVOS) as lost:
                 result = replayed(
                     motion,
                     servo_map,
@@ -571,11 +561,7 @@ def hw_drive(
                     live=moves,
                     policy=policy,
                     write_eeprom=configure,
-                    provenance={
-                        "port": port,
-                        "record": str(folder / "record.h5"),
-                        "simulated": ready.still.provenance,
-                    },
+                    provenance={"port": port, "record": str(folder / "record.h5"), "simulated": ready.still.provenance},
                 )
         except DynsimError as stopped:
             error, result = stopped, getattr(stopped, "result", None)
@@ -650,16 +636,16 @@ def confirm_replay(servo_map: ServoMap, motion: MotionTask, port: str, *, asked:
     from dynsim.hardware.replay.rules import way_to_start
 
     with bus_on(port, servo_map) as (bus, _):
-        approach = way_to_start(bus, servo_map, motion.start)
+        distances, duration = way_to_start(bus, servo_map, motion.start)
     console.print(
         f"{servo_map.robot}: {len(servo_map.servos)} servos will move for {'at most ' if at_most else ''}"
-        f"{motion.duration:.1f} s, after an approach of {approach.duration:.1f} s."
+        f"{motion.duration:.1f} s, after an approach of {duration:.1f} s."
     )
-    for distance in approach.distances[:1]:
+    for distance in distances[:1]:
         console.print(f"largest distance to the start: {distance}")
     agreed = not asked or _agreed(CLEAR, "move?")
     bound = servo_map.safety.start_distance
-    if agreed and (far := [distance for distance in approach.distances if distance.size > bound]):
+    if agreed and (far := [distance for distance in distances if distance.size > bound]):
         still = "" if asked else " (asked even with --yes)"
         console.print(f"more than safety.start_distance = {bound:g} rad from the start{still}:")
         for distance in far:
@@ -701,7 +687,7 @@ def find_directions(
     VerificationFailed, ReplayAborted
         If a servo is not ready to move, or an abort rule ended a nudge; torque is off.
     """
-    from dynsim.hardware.nudge import ANGLE, swapped
+    from dynsim.hardware.nudge import ANGLE
     from dynsim.hardware.ports import VIRTUAL, bus_on
 
     real = port != VIRTUAL
@@ -729,7 +715,9 @@ def find_directions(
             agrees[servo.joint] = answer == "y"
     if real and not live:
         console.print("dry run: nothing was moved; use --live to move")
-    signs = swapped(servo_map, agrees)
+    signs: dict[str, int] = {
+        servo.joint: -servo.sign for servo in servo_map.servos if not agrees.get(servo.joint, True)
+    }
     for joint, sign in signs.items():
         console.print(f"{joint}: turns opposite to the map; its sign should be {sign}")
     return signs, blocked

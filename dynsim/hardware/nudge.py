@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -130,19 +129,6 @@ def nudge(
     angles = result.record[servo.kind.follows.position][:, 0][result.record["state"] == ReplayState.REPLAY]
     moved = float(angles[np.nanargmax((angles - start) * np.sign(distance))] - start)
     return Nudge(servo.joint, servo.id, distance, moved, round(servo.sign * servo.gear * moved / RAD_PER_TICK))
-
-
-def swapped(servo_map: ServoMap, agrees: Mapping[str, bool]) -> dict[str, int]:
-    """Return the corrected sign of every joint that moved against the direction in the map.
-
-    Parameters
-    ----------
-    servo_map : ServoMap
-        Map whose signs were checked.
-    agrees : mapping of str to bool
-        Whether each joint moved as in the map; joints that are missing count as correct.
-    """
-    return {servo.joint: -servo.sign for servo in servo_map.servos if not agrees.get(servo.joint, True)}
 
 
 def _signed_distance(servo: MappedServo, start: float) -> float:

@@ -476,7 +476,7 @@ class Driven:
         self.outputs, self.error = outputs, None
         with watched(outputs) as console:
             try:
-                with shown_by({}, folder) as lost, displayed(console, lost) as observer:
+                with shown_by(folder) as lost, displayed(console, lost) as observer:
                     run_replay(
                         self.run.replay.motion,
                         rig.map,

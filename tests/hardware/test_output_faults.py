@@ -72,7 +72,7 @@ class Case:
             try:
                 with warnings.catch_warnings(record=True) as self.warnings:
                     warnings.simplefilter("always")
-                    with shown_by({}, folder) as lost, displayed(console, lost) as observer:
+                    with shown_by(folder) as lost, displayed(console, lost) as observer:
                         self.result = run_replay(
                             motion,
                             short.map,

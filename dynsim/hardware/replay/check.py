@@ -303,7 +303,7 @@ def plan_cycle(servo_map: ServoMap, rate: float) -> CyclePlan:
             f"{count} servos at {servo_map.bus.baud / 1e6:g} Mbit/s need {cycle_time * 1e3:.2f} ms per cycle, but "
             f"{rate:g} Hz leaves {1e3 / rate:.2f} ms; use --rate {highest} or less, or a higher baud rate"
         )
-    return CyclePlan(rate, cycle_time, health_time, max(1, math.ceil(health_time / available)))
+    return CyclePlan(rate, cycle_time, max(1, math.ceil(health_time / available)))
 
 
 class MotionLimits:

@@ -276,10 +276,7 @@ class ReplayResult:
 
     def summary(self) -> dict[str, Any]:
         """Return end state and faults for ``summary.json``."""
-        summary: dict[str, Any] = {
-            "end_state": self.end_state,
-            "servos": [servo.as_dict() for servo in self.servos],
-        }
+        summary: dict[str, Any] = {"end_state": self.end_state, "servos": [servo.as_dict() for servo in self.servos]}
         if self.fault is not None:
             summary |= {"fault": self.fault.cause.value, "fault_text": self.fault.text}
             summary["faults"] = [
@@ -481,9 +478,6 @@ class Recorder:
         self._rows: list[bytes] = []
         self._columns = {servo.id: column for column, servo in enumerate(servo_map.servos)}
         self._volts, self._celsius = np.full(count, np.nan), np.full(count, np.nan)
-
-    def __len__(self) -> int:
-        return len(self._rows)
 
     def add(self, cycle: Cycle, state: ReplayState, path_time: float, origin: float) -> None:
         """Add one cycle.

@@ -588,23 +588,7 @@ class Distance:
         return f"{self.joint} {self.size:.3f} rad (from {self.now:.3f} to {self.start:.3f})"
 
 
-@dataclass(frozen=True)
-class WayToStart:
-    """Move to the start posture before a replay.
-
-    Attributes
-    ----------
-    distances : list of Distance
-        Distances of the joints in position mode, the largest first.
-    duration : float
-        Duration of the move [s].
-    """
-
-    distances: list[Distance]
-    duration: float
-
-
-def way_to_start(bus: Bus, servo_map: ServoMap, start: NDArray[np.float64]) -> WayToStart:
+def way_to_start(bus: Bus, servo_map: ServoMap, start: NDArray[np.float64]) -> tuple[list[Distance], float]:
     """Read the present posture and plan the move to the start.
 
     Parameters
@@ -613,6 +597,13 @@ def way_to_start(bus: Bus, servo_map: ServoMap, start: NDArray[np.float64]) -> W
     servo_map : ServoMap
     start : array, shape (N,)
         Posture at the start of the motion [rad].
+
+    Returns
+    -------
+    distances : list of Distance
+        Distances of the joints in position mode, the largest first.
+    duration : float
+        Duration of the move [s].
 
     Raises
     ------
@@ -626,8 +617,8 @@ def way_to_start(bus: Bus, servo_map: ServoMap, start: NDArray[np.float64]) -> W
         if servo.in_position_mode
     ]
     distances.sort(key=lambda distance: -distance.size)
-    duration = QUINTIC_PEAK * max((distance.size for distance in distances), default=0.0)
-    return WayToStart(distances, duration / servo_map.safety.approach_velocity)
+    farthest = max((distance.size for distance in distances), default=0.0)
+    return distances, QUINTIC_PEAK * farthest / servo_map.safety.approach_velocity
 
 
 def read_registers(bus: Bus, servos: Sequence[MappedServo], block: tuple[int, int]) -> dict[int, Registers]:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import errno
 import json
+import sys
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -99,15 +100,14 @@ def run_replay(
 
 
 @contextmanager
-def shown_by(outputs: Mapping[str, Any], folder: Path) -> Iterator[Failures]:
+def shown_by(folder: Path) -> Iterator[Failures]:
     """Report failures to display a replay in the block in the same way as files that could not be written.
 
-    The failures are added to ``outputs_failed`` in the summary, which has been written before.
+    The failures, also those of standard output, are added to ``outputs_failed`` in the summary, which has been written
+    before.
 
     Parameters
     ----------
-    outputs : mapping of str to stream
-        Names and streams; an error in the attribute ``failure`` is reported.
     folder : Path
         Folder with the summary.
 
@@ -125,27 +125,27 @@ def shown_by(outputs: Mapping[str, Any], folder: Path) -> Iterator[Failures]:
     try:
         yield failures
     except DynsimError as error:
-        _flush(outputs, failures)
+        _flush(failures)
         if failures:
             warnings.warn(_failure_text(failures), stacklevel=3)
             # With other errors the summary may belong to an earlier replay.
             if isinstance(error, ReplayAborted | OutputsFailed):
                 _add_to_summary(folder, failures)
         raise
-    _flush(outputs, failures)
+    _flush(failures)
     if failures:
         _add_to_summary(folder, failures)
         raise OutputsFailed(f"the replay succeeded, but {_failure_text(failures)}; see {folder / LOG}")
 
 
-def _flush(outputs: Mapping[str, Any], failures: Failures) -> None:
-    for name, stream in outputs.items():
-        if stream is not None:
-            stream.flush()
-        failure = getattr(stream, "failure", None)
-        # A reader that closes the pipe early (``| head``) is not a failure.
-        if failure is not None and failure.errno != errno.EPIPE:
-            failures[name] = failure
+def _flush(failures: Failures) -> None:
+    """Add the failure of standard output."""
+    if sys.stdout is not None:
+        sys.stdout.flush()
+    failure = getattr(sys.stdout, "failure", None)
+    # A reader that closes the pipe early (``| head``) is not a failure.
+    if failure is not None and failure.errno != errno.EPIPE:
+        failures["standard output"] = failure
 
 
 def _add_to_summary(folder: Path, failures: Failures) -> None:

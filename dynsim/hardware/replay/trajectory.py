@@ -113,15 +113,12 @@ class CyclePlan:
         Cycles per second [Hz].
     cycle_time : float
         Planned duration of writing all goals and reading all states [s].
-    health_time : float
-        Planned duration of one health read [s].
     health_every : int
         Number of cycles per health read of one servo.
     """
 
     rate: float
     cycle_time: float
-    health_time: float
     health_every: int
 
 
@@ -216,9 +213,9 @@ class Path:
         """Return the path with one more knot; the rates are at the start and the end of the new interval."""
         return Path(
             np.append(self.time, time),
-            np.concatenate([self.position, position[None]]),
-            np.concatenate([self.rate_after, rate_after[None]]),
-            np.concatenate([self.rate_before, rate_before[None]]),
+            np.vstack([self.position, position]),
+            np.vstack([self.rate_after, rate_after]),
+            np.vstack([self.rate_before, rate_before]),
         )
 
     def _cubics(self, k: int | slice) -> tuple[Array, ...]:
@@ -499,9 +496,9 @@ def _at_rest_at_both_ends(path: Path, acceleration: float) -> Path:
     if (fastest := np.abs(first).max()) > REST:
         duration = fastest / acceleration
         path = Path(
-            np.concatenate([[-duration], path.time]),
-            np.concatenate([path.position[:1] - 0.5 * duration * first, path.position]),
-            np.concatenate([still[None], path.rate_after]),
-            np.concatenate([first[None], path.rate_before]),
+            np.append(-duration, path.time),
+            np.vstack([path.position[0] - 0.5 * duration * first, path.position]),
+            np.vstack([still, path.rate_after]),
+            np.vstack([first, path.rate_before]),
         )
     return path

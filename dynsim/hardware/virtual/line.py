@@ -84,11 +84,6 @@ class VirtualLine:
             self.servos.step(now)
             self.servos.inject()
 
-    @property
-    def baud(self) -> int:
-        """Bit rate of the first servo [bit/s]."""
-        return next(iter(self.servos.registers.values())).baud
-
     def transmit(self, data: bytes, start: float, baud: int) -> list[tuple[float, bytes]]:
         """Send bytes on the line.
 
@@ -131,7 +126,7 @@ class VirtualLine:
 
     def _execute(self, packet: Packet, now: float, baud: int) -> list[tuple[float, bytes]]:
         group = self.servos.baud_groups[baud]
-        self.servos.reset_watchdogs(group, now)
+        self.servos.last_packet[group.members] = now
         if self.listener:
             self.listener(now, packet)
         arrivals: list[tuple[float, bytes]] = []
@@ -364,7 +359,8 @@ class PseudoTerminal:
         with contextlib.suppress(OSError):
             settings = fcntl.ioctl(self._slave, _TCGETS2, bytes(44))
             return int.from_bytes(settings[_OUTPUT_SPEED], sys.byteorder)
-        return _BAUD_BY_CODE.get(termios.tcgetattr(self._slave)[5], self.line.baud)
+        first = next(iter(self.line.servos.registers.values()))
+        return _BAUD_BY_CODE.get(termios.tcgetattr(self._slave)[5], first.baud)
 
     def _send(self, data: bytes) -> None:
         # As with a real adapter, a client that does not read loses bytes.

@@ -32,11 +32,9 @@ from dynsim.hardware.virtual.simulated_plant import Drive, InertialLoad, ServoPl
 # Registers of one virtual servo, with the access rules of a real servo.
 
 
-GOAL_FIELDS = ("goal_pwm", "goal_current", "goal_velocity", "goal_position")
-MODES = {
-    True: (0, 1, 3, 4, 5, 16),  # with current sensor
-    False: (1, 3, 4, 16),
-}
+GOAL_LIMITS = {"goal_pwm": "pwm_limit", "goal_current": "current_limit", "goal_velocity": "velocity_limit"}
+MODES = {True: (0, 1, 3, 4, 5, 16), False: (1, 3, 4, 16)}
+"""Operating modes of servos with and without a current sensor."""
 
 
 class ServoRegisters:
@@ -144,7 +142,7 @@ class ServoRegisters:
             return StatusError.DATA_RANGE
         if name == "operating_mode" and value not in MODES[self.model.measures_current]:
             return StatusError.DATA_RANGE
-        if name in GOAL_FIELDS:
+        if name in GOAL_LIMITS or name == "goal_position":
             if self["bus_watchdog"] == -1:
                 return StatusError.DATA_RANGE
             low, high = self._goal_range(name)
@@ -160,9 +158,7 @@ class ServoRegisters:
                 return self["min_position"], self["max_position"]
             # Multi-turn modes have no position limits.
             return -1_048_575, 1_048_575
-        limit = self[
-            {"goal_pwm": "pwm_limit", "goal_current": "current_limit", "goal_velocity": "velocity_limit"}[name]
-        ]
+        limit = self[GOAL_LIMITS[name]]
         return -limit, limit
 
     def _resolve(self, address: int) -> int:
@@ -369,10 +365,6 @@ class VirtualServos:
 
     # -- requests -----------------------------------------------------------------------------------------------------
 
-    def reset_watchdogs(self, group: BaudGroup, now: float) -> None:
-        """Restart the watchdogs of the servos that received a packet at ``now`` [s]."""
-        self.last_packet[group.members] = now
-
     def receives(self, id_: int) -> bool:
         """Return True if a servo can receive packets."""
         there = self._powered and id_ in self.registers and id_ not in self.dead
@@ -394,14 +386,12 @@ class VirtualServos:
     def write(self, id_: int, address: int, data: bytes) -> StatusError:
         """Write to a control table, and apply the consequences."""
         registers, index = self.registers[id_], self.ids.index(id_)
-        if GOALS.start <= address and address + len(data) <= GOALS.stop:
-            error = registers.write(address, data)
-            if not error:
-                self._load_goals(index)
-            return error
         torque, mode = registers["torque_enable"], registers["operating_mode"]
         if error := registers.write(address, data):
             return error
+        if GOALS.start <= address and address + len(data) <= GOALS.stop:
+            self._load_goals(index)
+            return StatusError.NONE
         if registers["operating_mode"] != mode:
             self.reload(index)
             self.reset_turns(index)

@@ -412,11 +412,6 @@ class SimulationProcess:
             self._process.join()
         self.feed.close()
 
-    @property
-    def pid(self) -> int:
-        """ID of the process."""
-        return int(self._process.pid)
-
     def ready(self) -> Ready:
         """Wait until the simulation can be driven, which may include the compilation of kernels.
 

@@ -18,7 +18,6 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
-from websockets.asyncio.server import Server as Listener
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
@@ -166,7 +165,7 @@ class Server:
             close_timeout=1.0,
             server_header=None,
         ) as listener:
-            self.port = _port(listener)
+            self.port = listener.sockets[0].getsockname()[1]
             self._page = self.page(self.socket).encode()
             self._ready.set()
             await self._quit.wait()
@@ -273,11 +272,6 @@ class Server:
                 await asyncio.sleep(1.0 / FRAMES)
         except ConnectionClosed:
             return
-
-
-def _port(listener: Listener) -> int:
-    (socket,) = listener.sockets
-    return int(socket.getsockname()[1])
 
 
 def _answer(status: http.HTTPStatus, body: bytes = b"") -> Response:
