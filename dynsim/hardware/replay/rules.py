@@ -175,22 +175,29 @@ class AbortRules:
         self._following = _count(self._following, error > self._following_limit, missed)
         self._torque = _count(self._torque, np.abs(cycle.torque) > self._torque_limit, missed)
         self._late = self._late + 1 if cycle.lateness > self._late_after else 0
+        return [*self._faults(cycle, error)]
+
+    def _faults(self, cycle: Cycle, error: NDArray[np.float64]) -> Iterator[Fault]:
+        """Declare the faults of a cycle; ``error`` has the magnitudes of the following errors."""
         safety = self._safety
-        return [
-            *filter(None, [self.stall(cycle.silence)]),
-            *self._alert(cycle),
-            *(fault for id_, registers in cycle.health.items() for fault in self._health(self._by_id[id_], registers)),
-            *self._silent(np.flatnonzero(self._missed >= safety.missed_cycles), cycle),
-            *self._beyond(
-                Cause.FOLLOWING_ERROR, self._following >= safety.following_cycles, error,
-                f"off its goal for {safety.following_cycles} cycles",
-            ),
-            *self._beyond(
-                Cause.TORQUE, self._torque >= safety.torque_cycles, cycle.torque,
-                f"too much torque for {safety.torque_cycles} cycles",
-            ),
-            *self._deadline(cycle),
-        ]  # fmt: skip
+        if stall := self.stall(cycle.silence):
+            yield stall
+        if hit := self._newly(Cause.ALERT, np.flatnonzero(cycle.alert)):
+            text = f"hardware error reported by {', '.join(map(str, hit))}"
+            yield Fault(Cause.ALERT, text, tuple(servo.id for servo in hit))
+        for id_, registers in cycle.health.items():
+            yield from self._health(self._by_id[id_], registers)
+        yield from self._silent(np.flatnonzero(self._missed >= safety.missed_cycles), cycle)
+        text = f"off its goal for {safety.following_cycles} cycles"
+        yield from self._beyond(Cause.FOLLOWING_ERROR, self._following >= safety.following_cycles, error, text)
+        text = f"too much torque for {safety.torque_cycles} cycles"
+        yield from self._beyond(Cause.TORQUE, self._torque >= safety.torque_cycles, cycle.torque, text)
+        if self._late >= safety.late_cycles and self._new(Cause.DEADLINE):
+            yield Fault(
+                Cause.DEADLINE,
+                f"{self._late} cycles in a row started late, the last by {cycle.lateness * 1e3:.1f} ms: "
+                "the computer is too slow or too busy; close other programs, or lower --rate",
+            )
 
     def stall(self, silence: float) -> Fault | None:
         """Declare a stall if no packet was sent for ``silence`` [s], long enough for the watchdogs to trip."""
@@ -212,11 +219,6 @@ class AbortRules:
     def _newly(self, cause: Cause, indices: Iterable[int]) -> list[MappedServo]:
         """Mark a fault of some servos as declared and return the servos for which it was not declared before."""
         return [self._servos[k] for k in indices if self._new(cause, self._servos[k].id)]
-
-    def _alert(self, cycle: Cycle) -> Iterator[Fault]:
-        if hit := self._newly(Cause.ALERT, np.flatnonzero(cycle.alert)):
-            text = f"hardware error reported by {', '.join(map(str, hit))}"
-            yield Fault(Cause.ALERT, text, tuple(servo.id for servo in hit))
 
     def _health(self, servo: MappedServo, registers: dict[str, int]) -> Iterator[Fault]:
         celsius, volts = registers["present_temperature"], registers["present_voltage"] * VOLT_PER_UNIT
@@ -257,14 +259,6 @@ class AbortRules:
             value = {servo.id: values[k] for k, servo in enumerate(self._servos)}
             names = ", ".join(f"{servo.joint} (ID {servo.id}, {value[servo.id]:.3f})" for servo in hit)
             yield Fault(cause, f"{quantity}: {names}", tuple(servo.id for servo in hit))
-
-    def _deadline(self, cycle: Cycle) -> Iterator[Fault]:
-        if self._late >= self._safety.late_cycles and self._new(Cause.DEADLINE):
-            yield Fault(
-                Cause.DEADLINE,
-                f"{self._late} cycles in a row started late, the last by {cycle.lateness * 1e3:.1f} ms: "
-                "the computer is too slow or too busy; close other programs, or lower --rate",
-            )
 
 
 def _count(counters: NDArray[np.int64], hit: NDArray[np.bool_], unknown: NDArray[np.bool_]) -> NDArray[np.int64]:
