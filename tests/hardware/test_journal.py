@@ -11,7 +11,7 @@ from dynsim.hardware.replay.output import Journal, Recorder, RunLog, StopRequest
 
 @pytest.fixture
 def journal(rig) -> Journal:
-    return Journal(VirtualClock(), Recorder(rig.map), RunLog(None), None, StopRequest())
+    return Journal(VirtualClock(), Recorder(rig.map), RunLog(), None, StopRequest())
 
 
 def test_an_output_that_fails_is_kept_and_switched_off(journal: Journal) -> None:

@@ -162,7 +162,7 @@ def test_who_looks_for_the_record_is_told_to_recover_it(streamed, tmp_path: Path
 
 
 def test_a_stream_in_use_is_left_alone(tmp_path: Path) -> None:
-    growing = GrowingFile(tmp_path / PART)
+    growing = GrowingFile("streamed record", tmp_path / PART, bytes)
     with raises(RecordError, "measured.part"):
         recover(tmp_path)
     with raises(PortError, str(tmp_path), "--out"):
@@ -269,7 +269,7 @@ def test_a_complete_record_is_not_called_failed(rig: Rig, tmp_path: Path, monkey
     assert summary["outputs_failed"].keys() == {"removal of measured.part"}
     assert summary["timing"]["cycles"] == len(Record.load(tmp_path / "left/measured.h5"))
     with monkeypatch.context() as patch:
-        patch.setattr(output.RowStream, "pump", no_room)
+        patch.setattr(output.Recorder, "pending", no_room)
         with raises(
             OutputsFailed, "streamed record", "No space left on device", str(tmp_path / "streamed" / "measured.h5")
         ):

@@ -4,12 +4,18 @@ import threading
 
 import pytest
 
-from dynsim.hardware.replay.output import Background, RunLog
+from dynsim.hardware.replay.output import Background, GrowingFile, RunLog
+
+
+def opened(folder):
+    """A log and its file."""
+    log = RunLog()
+    return log, GrowingFile("log", folder / "replay.log", log.pending)
 
 
 def test_lines_reach_the_file_while_the_run_goes_on_and_no_terminal_obeys_them(tmp_path):
-    log = RunLog(tmp_path / "replay.log")
-    background = Background([log], interval=60.0)
+    log, file = opened(tmp_path)
+    background = Background([file], interval=60.0)
     log.wake = background.wake
     for text in ("enter", "\x1b[31mgone\ud800"):
         log.write(1.0, "FAULT", text)
@@ -20,20 +26,20 @@ def test_lines_reach_the_file_while_the_run_goes_on_and_no_terminal_obeys_them(t
 
 
 def test_a_full_disk_ends_the_file_and_not_the_run(tmp_path, monkeypatch):
-    log = RunLog(tmp_path / "replay.log")
+    log, file = opened(tmp_path)
     asked = []
 
     def full(data):
         asked.append(data)
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(log._file, "append", full)
-    background = Background([log], interval=0.001)
+    monkeypatch.setattr(file, "append", full)
+    background = Background([file], interval=0.001)
     log.write(1.0, "REPLAY", "one")
-    while log.failure is None:
+    while file.failure is None:
         background.wake()
     log.write(2.0, "FAULT", "two")
-    assert background.close() == {"log": log.failure}
+    assert background.close() == {"log": file.failure}
     assert len(asked) == 1
     assert len(log.lines) == 2
 
@@ -56,8 +62,8 @@ class Stuck:
 
 
 def test_an_outlet_that_does_not_come_back_is_named_and_not_waited_for(tmp_path):
-    stuck, log = Stuck(), RunLog(tmp_path / "replay.log")
-    background = Background([log, stuck], interval=0.001)
+    stuck, (log, file) = Stuck(), opened(tmp_path)
+    background = Background([file, stuck], interval=0.001)
     log.wake = background.wake
     assert stuck.entered.wait(60.0)
     log.write(1.0, "REPLAY", "one")  # waits for nobody
@@ -74,7 +80,7 @@ def test_where_the_system_gives_no_thread_the_outlets_are_closed(tmp_path, monke
         raise RuntimeError("can't start new thread")
 
     monkeypatch.setattr(threading.Thread, "start", none_left)
-    log = RunLog(tmp_path / "replay.log")
+    _, file = opened(tmp_path)
     with pytest.raises(RuntimeError):
-        Background([log], interval=0.001)
-    assert log._file._stream.closed
+        Background([file], interval=0.001)
+    assert file._stream.closed

@@ -636,7 +636,7 @@ class Replay:
     live: bool = True
     write_eeprom: bool = False
     stop: StopRequest = field(default_factory=StopRequest)
-    log: RunLog = field(default_factory=lambda: RunLog(None))
+    log: RunLog = field(default_factory=RunLog)
     dump_folder: FilePath | None = None
     observer: Callable[[ReplayProgress], None] | None = None
     provenance: dict[str, Any] = field(default_factory=dict)

@@ -429,8 +429,6 @@ class Journal:
 
     def _write(self, time: float, state: str, text: str) -> None:
         self.guard("log", self.log.write, time, state, text)
-        if self.log.failure is not None:
-            self.failures.setdefault("log", self.log.failure)
 
     def _observe(self, fraction: float, following_error: float) -> None:
         if self.observer and self._buffer is None:
@@ -476,6 +474,7 @@ class Recorder:
         self._names = self.type.names or ()
         self.hottest = math.nan
         self._rows: list[bytes] = []
+        self._taken = 0
         self._columns = {servo.id: column for column, servo in enumerate(servo_map.servos)}
         self._volts, self._celsius = np.full(count, np.nan), np.full(count, np.nan)
 
@@ -498,12 +497,14 @@ class Recorder:
         values |= {"volts": self._volts, "celsius": self._celsius}
         self._rows.append(np.array(tuple(values[name] for name in self._names), dtype=self.type).tobytes())
 
-    def since(self, first: int) -> bytes:
-        """Return the rows from number ``first`` on."""
-        return b"".join(self._rows[first:])
+    def pending(self) -> bytes:
+        """Return the rows since the last call."""
+        rows = self._rows[self._taken :]
+        self._taken += len(rows)
+        return b"".join(rows)
 
     def all(self) -> Rows:
-        return np.frombuffer(self.since(0), dtype=self.type)
+        return np.frombuffer(b"".join(self._rows), dtype=self.type)
 
 
 @dataclass(frozen=True)
@@ -546,14 +547,40 @@ class Layout:
                 yield name, source, [column for column, other in enumerate(names) if other == name]
 
 
-class GrowingFile:
+class Outlet:
+    """Output that writes data of the control loop from memory to a file, or to a display.
+
+    Attributes
+    ----------
+    name : str
+    failure : Exception or None
+        Error after which no more data were written.
+    """
+
+    name: str
+    failure: Exception | None = None
+
+    def pump(self) -> None:
+        """Write the data since the last call. After an exception it is not called again."""
+        raise NotImplementedError
+
+    def close(self) -> None:
+        """Close the output after the last call of ``pump``, even if that failed."""
+
+
+class GrowingFile(Outlet):
     """New file that can be read while it grows; it is locked until it is closed.
 
     See :func:`dynsim.system.files.lock`.
 
-    Attributes
+    Parameters
     ----------
+    name : str
     path : Path
+    pending : callable
+        Returns the data since its last call.
+    durable : bool
+        If True, each call of :meth:`pump` waits until its data are on the disk.
 
     Raises
     ------
@@ -561,9 +588,10 @@ class GrowingFile:
         If the file cannot be created or exists already.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, name: str, path: Path, pending: Callable[[], bytes], *, durable: bool = False) -> None:
+        self.name, self._pending, self._durable = name, pending, durable
+        self._path = path
         # Unbuffered: closing would try to write the content of a buffer again after an error, and fail again.
-        self.path = path
         self._stream = path.open("xb", buffering=0)
         try:
             lock(self._stream.fileno(), wait=False)
@@ -577,12 +605,13 @@ class GrowingFile:
         while left:
             left = left[self._stream.write(left) or 0 :]
 
-    def sync(self) -> None:
-        """Wait until all data are on the disk. Raises OSError."""
-        os.fsync(self._stream.fileno())
+    def pump(self) -> None:
+        if data := self._pending():
+            self.append(data)
+            if self._durable:
+                os.fsync(self._stream.fileno())
 
     def close(self) -> None:
-        """Close the file. Raises OSError."""
         self._stream.close()
 
     def discard(self) -> None:
@@ -590,121 +619,56 @@ class GrowingFile:
         with suppress(OSError):
             self._stream.close()
         with suppress(OSError):
-            self.path.unlink()
+            self._path.unlink()
 
 
-class Outlet:
-    """Output that writes data of the control loop from memory to a file, or to a display.
-
-    Attributes
-    ----------
-    name : str
-    failure : Exception or None
-        Error after which no more data were written.
-    """
-
-    name: str
-    failure: Exception | None = None
-    _file: GrowingFile | None = None
-
-    def pump(self) -> None:
-        """Write the data since the last call. After an exception it is not called again."""
-        raise NotImplementedError
-
-    def close(self) -> None:
-        """Close the output after the last call of ``pump``, even if that failed."""
-        if self._file:
-            self._file.close()
-
-    def discard(self) -> None:
-        """Close and remove the file, if its run does not start."""
-        if self._file:
-            self._file.discard()
-
-
-class RunLog(Outlet):
-    """Log with lines "time [s]  state  text". Another thread writes them to the file by :meth:`pump`.
-
-    Parameters
-    ----------
-    path : path or None
-        Log file; None keeps the lines in memory only.
+class RunLog:
+    """Log with lines "time [s]  state  text", kept in memory; another thread may write them to a file.
 
     Attributes
     ----------
     lines : list of str
     wake : callable
-        Called after each line, to wake the thread that calls :meth:`pump`.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be created.
+        Called after each line, to wake the thread that writes the lines.
     """
 
-    name = "log"
-
-    def __init__(self, path: Path | None) -> None:
+    def __init__(self) -> None:
         self.lines: list[str] = []
         self.wake: Callable[[], None] = lambda: None
-        self._file = GrowingFile(path) if path else None
-        self._written = 0
+        self._taken = 0
 
     def write(self, time: float, state: str, text: str) -> None:
         self.lines.append(plain(f"{time:10.4f}  {state:<13}  {text}"))
         self.wake()
 
-    def pump(self) -> None:
-        lines = self.lines[self._written :]
-        if self._file and lines:
-            self._written += len(lines)
-            self._file.append("".join(f"{line}\n" for line in lines).encode("utf-8", errors="backslashreplace"))
+    def pending(self) -> bytes:
+        """Return the lines since the last call."""
+        lines = self.lines[self._taken :]
+        self._taken += len(lines)
+        return "".join(f"{line}\n" for line in lines).encode("utf-8", errors="backslashreplace")
 
 
-class RowStream(Outlet):
-    """Stream the rows of a replay to ``measured.part``: one line of JSON, then binary rows.
-
-    Parameters
-    ----------
-    path : path
-        File to create.
-    recorder : Recorder
-        Source of the rows.
-    layout : Layout
-    scene : Scene or None
-        Scene of the replayed record.
+def row_stream(path: Path, recorder: Recorder, layout: Layout, scene: Scene | None) -> GrowingFile:
+    """Create ``measured.part`` for the rows of a replay: one line of JSON, then binary rows.
 
     Raises
     ------
     OSError
         If the file cannot be created or its first line cannot be written.
     """
-
-    name = "streamed record"
-    _file: GrowingFile
-
-    def __init__(self, path: Path, recorder: Recorder, layout: Layout, scene: Scene | None) -> None:
-        self._recorder = recorder
-        self._written = 0
-        header = {
-            "format": PART_FORMAT,
-            "row": recorder.type.descr,
-            "layout": vars(layout),
-            "scene": scene.to_json() if scene else "",
-        }
-        self._file = GrowingFile(path)
-        try:
-            self._file.append(json.dumps(header, default=str).encode("utf-8") + b"\n")
-        except BaseException:
-            self._file.discard()
-            raise
-
-    def pump(self) -> None:
-        rows = self._recorder.since(self._written)
-        if rows:
-            self._written += len(rows) // self._recorder.type.itemsize
-            self._file.append(rows)
-            self._file.sync()
+    header = {
+        "format": PART_FORMAT,
+        "row": recorder.type.descr,
+        "layout": vars(layout),
+        "scene": scene.to_json() if scene else "",
+    }
+    file = GrowingFile("streamed record", path, recorder.pending, durable=True)
+    try:
+        file.append(json.dumps(header, default=str).encode("utf-8") + b"\n")
+    except BaseException:
+        file.discard()
+        raise
+    return file
 
 
 class Background:

@@ -24,10 +24,11 @@ from dynsim.hardware.replay.output import (
     PART,
     SUMMARY,
     Background,
+    GrowingFile,
     ReplayResult,
-    RowStream,
     RunLog,
     move_away,
+    row_stream,
 )
 from dynsim.hardware.replay.rules import Cause
 from dynsim.hardware.servo_map import ServoMap
@@ -79,9 +80,10 @@ def run_replay(
     result: ReplayResult | None = None
     try:
         with connection as (bus, clock):
-            log, moved = _open_log(folder)
+            log = RunLog()
+            file, moved = _open_log(folder, log)
             replay = Replay(motion, servo_map, bus, clock, live=live, log=log, dump_folder=folder, **options)
-            background = _stream(replay, log, folder)
+            background = _stream(replay, file, folder)
             try:
                 if moved:
                     replay.journal.add_line(f"files of an earlier replay were moved to {moved}")
@@ -155,28 +157,28 @@ def _add_to_summary(folder: Path, failures: Failures) -> None:
         write_json(folder / SUMMARY, summary | {"outputs_failed": summary["outputs_failed"] | _messages(failures)})
 
 
-def _open_log(folder: Path) -> tuple[RunLog, Path | None]:
+def _open_log(folder: Path, log: RunLog) -> tuple[GrowingFile, Path | None]:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         moved = move_away(folder)
-        log = RunLog(folder / LOG)
+        file = GrowingFile("log", folder / LOG, log.pending)
     except OSError as error:
         raise PortError(f"{folder}: cannot be written ({error.strerror}); nothing was moved") from error
-    return log, moved
+    return file, moved
 
 
-def _stream(replay: Replay, log: RunLog, folder: Path) -> Background:
+def _stream(replay: Replay, log_file: GrowingFile, folder: Path) -> Background:
     stream = None
     try:
-        stream = RowStream(folder / PART, replay.recorder, replay.layout, replay.motion.scene)
-        background = Background([log, stream], INTERVAL)
+        stream = row_stream(folder / PART, replay.recorder, replay.layout, replay.motion.scene)
+        background = Background([log_file, stream], INTERVAL)
     except (OSError, RuntimeError) as error:
         # Remove the empty files, which would look like a replay that died.
-        for outlet in (log, stream):
-            if outlet is not None:
-                outlet.discard()
+        for file in (log_file, stream):
+            if file is not None:
+                file.discard()
         raise PortError(f"{folder}: cannot be written ({error}); nothing was moved") from error
-    log.wake = background.wake
+    replay.log.wake = background.wake
     return background
 
 

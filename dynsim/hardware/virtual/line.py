@@ -181,13 +181,11 @@ def line_for_map(servo_map: ServoMap, **options: Any) -> VirtualLine:
         passed to :class:`VirtualLine`.
     """
     posture = options.pop("posture", {})
-    angles = []
+    angles, servos = [], {}
     for servo in servo_map.servos:
         start = posture.get(servo.joint, servo.hold_at or 0.0)
         low, high = servo.position_limits
         angles.append(servo.to_ticks(min(max(start, low), high)) * RAD_PER_TICK)
-    servos = {}
-    for servo in servo_map.servos:
         registers = ServoRegisters(servo.model, servo.id, BAUD_RATES.index(servo_map.bus.baud))
         registers["operating_mode"] = servo.operating_mode
         registers["return_delay"] = int(servo_map.bus.return_delay / RETURN_DELAY_SECONDS_PER_UNIT)
