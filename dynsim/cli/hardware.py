@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from contextlib import nullcontext
+from contextlib import closing, nullcontext
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -385,11 +385,8 @@ def virtual(
         f"{len(servo_map.servos)} virtual servos at {servo_map.bus.baud} bit/s on {plain(link or terminal.device)}",
         flush=True,
     )
-    try:
-        with stop_on_signals(stop):
-            terminal.serve(lambda: stop.count == 0)
-    finally:
-        terminal.close()
+    with closing(terminal), stop_on_signals(stop):
+        terminal.serve(lambda: stop.count == 0)
 
 
 @hw.command("stop", epilog="Example: dynsim hw stop --port /dev/ttyUSB0")
@@ -586,12 +583,10 @@ def hw_drive(
             print_drive(done.report, done.driven, folder)
     if error is None and not quiet:
         print_replay(result, "driven", folder / SERVOS, folder / "record.h5")
-    if error is not None:
-        if done.failure is not None:
-            errors.print(f"[red]error:[/] simulation: {escaped(str(done.failure))}")
-        raise error
-    if done.failure is not None:
-        raise done.failure
+    if error is not None and done.failure is not None:
+        errors.print(f"[red]error:[/] simulation: {escaped(str(done.failure))}")
+    if failure := error or done.failure:
+        raise failure
 
 
 def _write_page(name: str, folder: Path, result: Any, *, quiet: bool) -> None:

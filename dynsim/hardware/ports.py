@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -75,8 +75,5 @@ def bus_on(
     latency = servo_map.bus.latency
     if port != VIRTUAL and str(Path(port).resolve()).startswith("/dev/pts/"):
         latency = max(latency, PSEUDO_TERMINAL_LATENCY)
-    bus = DynamixelBus(handler, latency=latency, return_delay=servo_map.bus.return_delay)
-    try:
+    with closing(DynamixelBus(handler, latency=latency, return_delay=servo_map.bus.return_delay)) as bus:
         yield bus, clock
-    finally:
-        bus.close()

@@ -25,7 +25,7 @@ import os
 import select
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -328,11 +328,9 @@ class DynamixelBus:
                 self._library.write1ByteTxOnly(self.port, BROADCAST_ID, TORQUE_ENABLE, 0)
 
     def close(self) -> None:
-        try:
+        # A port that is gone need not be closed.
+        with suppress(OSError, TerminalError):
             self.port.closePort()
-        except (OSError, TerminalError):
-            # The port is gone and need not be closed.
-            return
 
     @contextmanager
     def _transaction(self) -> Iterator[None]:

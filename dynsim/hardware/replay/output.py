@@ -772,13 +772,10 @@ def move_away(folder: Path) -> Path | None:
 def is_locked(part: Path) -> bool:
     """Return True if the process that writes a streamed record is alive. Raises OSError."""
     try:
-        descriptor = os.open(part, os.O_RDONLY)
+        with part.open("rb") as stream:
+            return not lock(stream.fileno(), wait=False)
     except FileNotFoundError:
         return False
-    try:
-        return not lock(descriptor, wait=False)
-    finally:
-        os.close(descriptor)
 
 
 def _new_folder(folder: Path) -> Path:

@@ -257,21 +257,17 @@ class Server:
     async def _send_roles(self) -> None:
         for client in list(self._clients.values()):
             role = "pilot" if client is self._pilot else "watching"
-            try:
+            with suppress(ConnectionClosed):
                 await client.socket.send(json.dumps({"role": role, "free": self._pilot is None}))
-            except ConnectionClosed:
-                continue
 
     async def _send(self, client: _Client) -> None:
         """Send frames as they arrive, the newest only."""
-        try:
+        with suppress(ConnectionClosed):
             while True:
                 await client.new_frame.wait()
                 client.new_frame.clear()
                 await client.socket.send(self._frame)
                 await asyncio.sleep(1.0 / FRAMES)
-        except ConnectionClosed:
-            return
 
 
 def _answer(status: http.HTTPStatus, body: bytes = b"") -> Response:
