@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from multiprocessing import get_context, resource_tracker
 from multiprocessing.connection import Connection
 from pathlib import Path
+from queue import SimpleQueue
 from types import TracebackType
 from typing import Any
 
@@ -214,21 +215,21 @@ def simulate(request: DriveRequest, control: Connection, samples: Connection, se
     # On a busy computer the servos have priority.
     with suppress(AttributeError, OSError):
         os.nice(NICENESS)
-    listener = _EndListener(control)
+    drives: SimpleQueue[LiveDrive] = SimpleQueue()
+    threading.Thread(target=_end_on_message, args=(control, drives), name="dynsim ending", daemon=True).start()
     try:
         session = begin(request.scenario, limits=request.limits, longest=request.longest)
         follower = ServoFollower(session, request.servo_map, samples, servo_time)
         drive = LiveDrive(session, request.scenario.variant or request.scenario.name, follower)
         address = drive.open(request.http_port)
     except Exception as error:
-        _send_message(
-            control, error if isinstance(error, DynsimError) else DynsimError(f"the simulation failed: {error!r}")
-        )
+        known = isinstance(error, DynsimError)
+        _send_message(control, error if known else DynsimError(f"the simulation failed: {error!r}"))
         return
     how = BROKEN
     refused: CheckRefused | None = None
     try:
-        listener.set_drive(drive)
+        drives.put(drive)
         _send_message(control, Ready(address, session.still, follower.first, session.period))
         if drive.run(until_closed=request.until_closed).stop is None:
             follower.finish()
@@ -250,10 +251,9 @@ def _saved(session: Session, report: DriveReport, folder: Path, refused: CheckRe
         return Done(report, time, saved=False, failure=stop)
     try:
         save_drive(session.record() if stop is None or stop.record is None else stop.record, folder)
-    except DynsimError as error:
-        return Done(report, time, saved=False, failure=error)
     except Exception as error:
-        return Done(report, time, saved=False, failure=RecordError(f"the drive could not be saved: {error!r}"))
+        failure = error if isinstance(error, DynsimError) else RecordError(f"the drive could not be saved: {error!r}")
+        return Done(report, time, saved=False, failure=failure)
     return Done(report, time, saved=True, failure=refused if stop is None else type(stop)(str(stop)))
 
 
@@ -262,35 +262,16 @@ def _send_message(control: Connection, message: Any) -> None:
         control.send(message)
 
 
-class _EndListener:
-    """Thread that waits for the message to end the drive."""
-
-    def __init__(self, control: Connection) -> None:
-        self._drive: LiveDrive | None = None
-        self._why = ""
-        self._lock = threading.Lock()
-        self._control = control
-        threading.Thread(target=self._listen, name="dynsim ending", daemon=True).start()
-
-    def set_drive(self, drive: LiveDrive) -> None:
-        """Set the drive to end."""
-        with self._lock:
-            self._drive = drive
-            if self._why:
-                drive.end(self._why, at_once=True)
-
-    def _listen(self) -> None:
-        try:
-            why = str(self._control.recv())
-        except (EOFError, OSError):
-            why = "the process of the servos has ended"
-            if self._drive is None:
-                # The drive has not started, and no process waits for it.
-                os._exit(1)
-        with self._lock:
-            self._why = why
-            if self._drive is not None:
-                self._drive.end(why, at_once=True)
+def _end_on_message(control: Connection, drives: SimpleQueue[LiveDrive]) -> None:
+    """Wait for a message or for the end of the process of the servos, then end the drive, also if it starts later."""
+    try:
+        why = str(control.recv())
+    except (EOFError, OSError):
+        why = "the process of the servos has ended"
+        if drives.empty():
+            # The drive has not started, and no process waits for it.
+            os._exit(1)
+    drives.get().end(why, at_once=True)
 
 
 # The servo side of a drive: start and end the process of the simulation, and follow its postures.
