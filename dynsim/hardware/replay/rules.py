@@ -145,7 +145,6 @@ class AbortRules:
     """
 
     def __init__(self, servo_map: ServoMap, plan: CyclePlan) -> None:
-        count = len(servo_map.servos)
         self._servos = servo_map.servos
         self._by_id = {servo.id: servo for servo in servo_map.servos}
         self._safety = servo_map.safety
@@ -154,9 +153,7 @@ class AbortRules:
         self._in_position_mode = np.array([servo.in_position_mode for servo in self._servos])
         self._following_limit = np.array([servo.kind.following_error for servo in self._servos])
         self._torque_limit = np.array([servo.kind.limits.torque for servo in self._servos])
-        self._missed = np.zeros(count, dtype=int)
-        self._following = np.zeros(count, dtype=int)
-        self._torque = np.zeros(count, dtype=int)
+        self._missed, self._following, self._torque = np.zeros((3, len(self._servos)), dtype=int)
         self._late = 0
         self._declared: set[tuple[Cause, int | None]] = set()
 

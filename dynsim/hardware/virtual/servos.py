@@ -286,17 +286,14 @@ class VirtualServos:
         self._powered = self._switched_on = True
         self._script = script
         count = len(self.ids)
-        self.last_packet = np.zeros(count)
+        self.last_packet, self._set_rate, self._watchdog, self._overload = np.zeros((4, count))
         self._drive = Drive(
             np.zeros(count, dtype=bool), np.ones(count, dtype=bool), self.plant.position.copy(), np.zeros(count), SUPPLY
         )
         self._goal_position, self._goal_velocity = self.plant.position.copy(), np.zeros(count)
         self._profile_velocity, self._profile_acceleration = np.zeros(count), np.zeros(count)
-        self._set_rate = np.zeros(count)
-        self._watchdog = np.zeros(count)
         self._temperature_limit, self._min_voltage = np.zeros(count), np.zeros(count)
         self.temperature = np.full(count, AMBIENT + 5.0)
-        self._overload = np.zeros(count)
         self.play = self.plant.position.copy()
         self._turns = np.zeros(count, dtype=np.int64)
         self._sense = [1] * count
