@@ -612,7 +612,6 @@ class Replay:
     write_eeprom : bool
         If True, write EEPROM settings that differ from the map.
     stop : StopRequest, optional
-    log : RunLog, optional
     dump_folder : path, optional
         Folder for register dumps.
     observer : callable, optional
@@ -636,7 +635,6 @@ class Replay:
     live: bool = True
     write_eeprom: bool = False
     stop: StopRequest = field(default_factory=StopRequest)
-    log: RunLog = field(default_factory=RunLog)
     dump_folder: FilePath | None = None
     observer: Callable[[ReplayProgress], None] | None = None
     provenance: dict[str, Any] = field(default_factory=dict)
@@ -648,7 +646,7 @@ class Replay:
         self._found_holding = False
         self.recorder = Recorder(servo_map)
         self.layout = Layout.of(servo_map, provenance | servo_map.lifting | self.provenance)
-        self.journal = Journal(self.clock, self.recorder, self.log, self.observer, self.stop)
+        self.journal = Journal(self.clock, self.recorder, RunLog(), self.observer, self.stop)
         self.loop = Loop(motion.plan, servo_map, self.bus, self.clock, self.stop, self.recorder, self.journal)
         self.result = ReplayResult(policy_goals=self.loop.policy_goals)
         self._ending = Ending(self.loop, self.result, self.policy or servo_map.safety.policy)

@@ -26,7 +26,6 @@ from dynsim.hardware.replay.output import (
     Background,
     GrowingFile,
     ReplayResult,
-    RunLog,
     move_away,
     row_stream,
 )
@@ -80,13 +79,9 @@ def run_replay(
     result: ReplayResult | None = None
     try:
         with connection as (bus, clock):
-            log = RunLog()
-            file, moved = _open_log(folder, log)
-            replay = Replay(motion, servo_map, bus, clock, live=live, log=log, dump_folder=folder, **options)
-            background = _stream(replay, file, folder)
+            replay = Replay(motion, servo_map, bus, clock, live=live, dump_folder=folder, **options)
+            background = _open_outputs(replay, folder)
             try:
-                if moved:
-                    replay.journal.add_line(f"files of an earlier replay were moved to {moved}")
                 result = replay.run()
             finally:
                 failures |= background.close()
@@ -157,28 +152,24 @@ def _add_to_summary(folder: Path, failures: Failures) -> None:
         write_json(folder / SUMMARY, summary | {"outputs_failed": summary["outputs_failed"] | _messages(failures)})
 
 
-def _open_log(folder: Path, log: RunLog) -> tuple[GrowingFile, Path | None]:
+def _open_outputs(replay: Replay, folder: Path) -> Background:
+    """Move the files of an earlier replay away, and open log and streamed record."""
+    log, files = replay.journal.log, list[GrowingFile]()
     try:
         folder.mkdir(parents=True, exist_ok=True)
         moved = move_away(folder)
-        file = GrowingFile("log", folder / LOG, log.pending)
-    except OSError as error:
-        raise PortError(f"{folder}: cannot be written ({error.strerror}); nothing was moved") from error
-    return file, moved
-
-
-def _stream(replay: Replay, log_file: GrowingFile, folder: Path) -> Background:
-    stream = None
-    try:
-        stream = row_stream(folder / PART, replay.recorder, replay.layout, replay.motion.scene)
-        background = Background([log_file, stream], INTERVAL)
+        files.append(GrowingFile("log", folder / LOG, log.pending))
+        files.append(row_stream(folder / PART, replay.recorder, replay.layout, replay.motion.scene))
+        background = Background(files, INTERVAL)
     except (OSError, RuntimeError) as error:
         # Remove the empty files, which would look like a replay that died.
-        for file in (log_file, stream):
-            if file is not None:
-                file.discard()
-        raise PortError(f"{folder}: cannot be written ({error}); nothing was moved") from error
-    replay.log.wake = background.wake
+        for file in files:
+            file.discard()
+        reason = getattr(error, "strerror", None) or error
+        raise PortError(f"{folder}: cannot be written ({reason}); nothing was moved") from error
+    log.wake = background.wake
+    if moved:
+        replay.journal.add_line(f"files of an earlier replay were moved to {moved}")
     return background
 
 

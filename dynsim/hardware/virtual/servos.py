@@ -370,9 +370,7 @@ class VirtualServos:
     def read(self, id_: int, address: int, length: int) -> bytes | None:
         """Return present bytes of the control table of a servo; None outside the table."""
         index = self.ids.index(id_)
-        self._measure_motion(index)
-        if not (STATE.start <= address and address + length <= STATE.stop):
-            self._measure_supply(index)
+        self.measure(index, motion_only=STATE.start <= address and address + length <= STATE.stop)
         if address < TRAJECTORY[1] and address + length > TRAJECTORY[0]:
             registers = self.registers[id_]
             registers["position_trajectory"] = self._present_ticks(index, self._drive.set_position[index])
@@ -548,12 +546,8 @@ class VirtualServos:
         self._profile_velocity[index] = registers["profile_velocity"] * RAD_S_PER_UNIT
         self._profile_acceleration[index] = registers["profile_acceleration"] * RAD_S2_PER_UNIT
 
-    def measure(self, index: int) -> None:
+    def measure(self, index: int, *, motion_only: bool = False) -> None:
         """Update the measurements in the registers of one servo."""
-        self._measure_motion(index)
-        self._measure_supply(index)
-
-    def _measure_motion(self, index: int) -> None:
         id_ = self.ids[index]
         registers, sense = self.registers[id_], self._sense[index]
         angle = self.plant.position[index]
@@ -572,9 +566,8 @@ class VirtualServos:
         registers["present_velocity"] = velocity
         registers["present_position"] = self._present_ticks(index, float(angle))
         registers["moving"] = int(abs(velocity) > registers["moving_threshold"])
-
-    def _measure_supply(self, index: int) -> None:
-        registers = self.registers[self.ids[index]]
+        if motion_only:
+            return
         registers["present_voltage"] = max(0, round(self._drive.voltage / VOLT_PER_UNIT))
         registers["present_temperature"] = min(255, max(0, round(float(self.temperature[index]))))
         registers["realtime_tick"] = int(self.time * 1e3) % 32768
