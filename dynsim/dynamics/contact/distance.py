@@ -12,6 +12,15 @@ from typing import NamedTuple
 
 import numpy as np
 
+from dynsim.dynamics.tree.spatial import (
+    first_axis,
+    rotate,
+    rotate_back,
+    rotation,
+    second_axis,
+    third_axis,
+    vector,
+)
 from dynsim.jit.kernel import internal_kernel, kernel
 
 # ShapeArrays.kind, int
@@ -54,7 +63,7 @@ def distance(shapes: ShapeArrays, k, x, y, z):
     if kind == HEIGHT_FIELD:
         return field_distance(shapes, k, x, y, z)
     x, y, z = x - data[k, POSITION], y - data[k, POSITION + 1], z - data[k, POSITION + 2]
-    nx, ny, nz = data[k, AXES], data[k, AXES + 1], data[k, AXES + 2]
+    nx, ny, nz = vector(data, k, AXES)
     if kind == PLANE:
         return nx * x + ny * y + nz * z, nx, ny, nz, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     if kind == BOX:
@@ -69,18 +78,9 @@ def distance(shapes: ShapeArrays, k, x, y, z):
     sign = math.copysign(1.0, size)
     scale = 1.0 / max(r, 1e-300)
     x, y, z, h = x * scale, y * scale, z * scale, sign * scale
-    return (
-        sign * r - size,
-        sign * x,
-        sign * y,
-        sign * z,
-        h * (1.0 - x * x - nx * nx),
-        h * (-x * y - nx * ny),
-        h * (-x * z - nx * nz),
-        h * (1.0 - y * y - ny * ny),
-        h * (-y * z - ny * nz),
-        h * (1.0 - z * z - nz * nz),
-    )
+    hxx, hxy, hxz = h * (1.0 - x * x - nx * nx), h * (-x * y - nx * ny), h * (-x * z - nx * nz)
+    hyy, hyz, hzz = h * (1.0 - y * y - ny * ny), h * (-y * z - ny * nz), h * (1.0 - z * z - nz * nz)
+    return sign * r - size, sign * x, sign * y, sign * z, hxx, hxy, hxz, hyy, hyz, hzz
 
 
 @internal_kernel
@@ -92,9 +92,8 @@ def box_distance(shapes: ShapeArrays, k, x, y, z):
     nearest face.
     """
     data = shapes.data
-    px = data[k, AXES] * x + data[k, AXES + 1] * y + data[k, AXES + 2] * z
-    py = data[k, AXES + 3] * x + data[k, AXES + 4] * y + data[k, AXES + 5] * z
-    pz = data[k, AXES + 6] * x + data[k, AXES + 7] * y + data[k, AXES + 8] * z
+    R = rotation(data, k, AXES)
+    px, py, pz = rotate(R, (x, y, z))
     ox, oy, oz = abs(px) - data[k, SIZE], abs(py) - data[k, SIZE + 1], abs(pz) - data[k, SIZE + 2]
     inside = max(ox, max(oy, oz))
     if inside <= 0.0:
@@ -109,22 +108,15 @@ def box_distance(shapes: ShapeArrays, k, x, y, z):
     h = 1.0 / r if fx + fy + fz > 1.0 else 0.0
     ox, oy, oz = math.copysign(ox, px) / r, math.copysign(oy, py) / r, math.copysign(oz, pz) / r
     # In the axes of the box H = h (diag(f) − o oᵀ); transform to W with the axes as rows.
-    x0, x1, x2 = data[k, AXES], data[k, AXES + 1], data[k, AXES + 2]
-    y0, y1, y2 = data[k, AXES + 3], data[k, AXES + 4], data[k, AXES + 5]
-    z0, z1, z2 = data[k, AXES + 6], data[k, AXES + 7], data[k, AXES + 8]
-    nx, ny, nz = x0 * ox + y0 * oy + z0 * oz, x1 * ox + y1 * oy + z1 * oz, x2 * ox + y2 * oy + z2 * oz
-    return (
-        far - data[k, EDGE],
-        nx,
-        ny,
-        nz,
-        h * (fx * x0 * x0 + fy * y0 * y0 + fz * z0 * z0 - nx * nx),
-        h * (fx * x0 * x1 + fy * y0 * y1 + fz * z0 * z1 - nx * ny),
-        h * (fx * x0 * x2 + fy * y0 * y2 + fz * z0 * z2 - nx * nz),
-        h * (fx * x1 * x1 + fy * y1 * y1 + fz * z1 * z1 - ny * ny),
-        h * (fx * x1 * x2 + fy * y1 * y2 + fz * z1 * z2 - ny * nz),
-        h * (fx * x2 * x2 + fy * y2 * y2 + fz * z2 * z2 - nz * nz),
-    )
+    nx, ny, nz = rotate_back(R, (ox, oy, oz))
+    x, y, z = first_axis(R), second_axis(R), third_axis(R)
+    hxx = h * (fx * x[0] * x[0] + fy * x[1] * x[1] + fz * x[2] * x[2] - nx * nx)
+    hxy = h * (fx * x[0] * y[0] + fy * x[1] * y[1] + fz * x[2] * y[2] - nx * ny)
+    hxz = h * (fx * x[0] * z[0] + fy * x[1] * z[1] + fz * x[2] * z[2] - nx * nz)
+    hyy = h * (fx * y[0] * y[0] + fy * y[1] * y[1] + fz * y[2] * y[2] - ny * ny)
+    hyz = h * (fx * y[0] * z[0] + fy * y[1] * z[1] + fz * y[2] * z[2] - ny * nz)
+    hzz = h * (fx * z[0] * z[0] + fy * z[1] * z[1] + fz * z[2] * z[2] - nz * nz)
+    return far - data[k, EDGE], nx, ny, nz, hxx, hxy, hxz, hyy, hyz, hzz
 
 
 @internal_kernel
@@ -186,24 +178,17 @@ def field_height(shapes: ShapeArrays, k, x, y):
     """Return h and its derivatives x, y, xx, xy, yy at a point of the field; linear extrapolation beyond its grid."""
     fields, data, kind = shapes.fields, shapes.data, shapes.kind
     nx, ny = kind[k, COUNT], kind[k, COUNT + 1]
-    i, x0, x1, x2, x3, dx0, dx1, dx2, dx3, ex0, ex1, ex2, ex3 = spline_weights(
-        (x - data[k, POSITION]) / data[k, SIZE], 1.0 / data[k, SIZE], nx
-    )
-    j, y0, y1, y2, y3, dy0, dy1, dy2, dy3, ey0, ey1, ey2, ey3 = spline_weights(
-        (y - data[k, POSITION + 1]) / data[k, SIZE + 1], 1.0 / data[k, SIZE + 1], ny
-    )
+    i, u, du, ddu = spline_weights((x - data[k, POSITION]) / data[k, SIZE], 1.0 / data[k, SIZE], nx)
+    j, v, dv, ddv = spline_weights((y - data[k, POSITION + 1]) / data[k, SIZE + 1], 1.0 / data[k, SIZE + 1], ny)
     h, p, q, a, b, c = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for s in range(4):
-        w, dw, ew = (
-            (y0, dy0, ey0) if s == 0 else (y1, dy1, ey1) if s == 1 else (y2, dy2, ey2) if s == 2 else (y3, dy3, ey3)
-        )
         f = kind[k, FIELD] + (j + s) * (nx + 2) + i
         f0, f1, f2, f3 = fields[f], fields[f + 1], fields[f + 2], fields[f + 3]
-        value = x0 * f0 + x1 * f1 + x2 * f2 + x3 * f3
-        slope = dx0 * f0 + dx1 * f1 + dx2 * f2 + dx3 * f3
-        bend = ex0 * f0 + ex1 * f1 + ex2 * f2 + ex3 * f3
-        h, p, q = h + w * value, p + w * slope, q + dw * value
-        a, b, c = a + w * bend, b + dw * slope, c + ew * value
+        value = u[0] * f0 + u[1] * f1 + u[2] * f2 + u[3] * f3
+        slope = du[0] * f0 + du[1] * f1 + du[2] * f2 + du[3] * f3
+        bend = ddu[0] * f0 + ddu[1] * f1 + ddu[2] * f2 + ddu[3] * f3
+        h, p, q = h + v[s] * value, p + v[s] * slope, q + dv[s] * value
+        a, b, c = a + v[s] * bend, b + dv[s] * slope, c + ddv[s] * value
     return h, p, q, a, b, c
 
 
@@ -222,21 +207,9 @@ def spline_weights(x, per, count):
     w0, w1 = s * s * s / 6.0 + beyond * d0, (0.5 * t - 1.0) * t * t + 2.0 / 3.0 + beyond * d1
     w2, w3 = ((1.0 - t) * t + 1.0) * 0.5 * t + 1.0 / 6.0 + beyond * d2, t * t * t / 6.0 + beyond * d3
     square = per * per if beyond == 0.0 else 0.0
-    return (
-        i,
-        w0,
-        w1,
-        w2,
-        w3,
-        per * d0,
-        per * d1,
-        per * d2,
-        per * d3,
-        square * s,
-        square * (3.0 * t - 2.0),
-        square * (1.0 - 3.0 * t),
-        square * t,
-    )
+    slopes = per * d0, per * d1, per * d2, per * d3
+    curvatures = square * s, square * (3.0 * t - 2.0), square * (1.0 - 3.0 * t), square * t
+    return i, (w0, w1, w2, w3), slopes, curvatures
 
 
 @internal_kernel
@@ -252,7 +225,7 @@ def nearest(shapes: ShapeArrays, k, x, y, z, dx, dy, dz):
     x, y, z = data[k, POSITION] - x, data[k, POSITION + 1] - y, data[k, POSITION + 2] - z
     length = dx * dx + dy * dy + dz * dz
     if kind == CYLINDER:
-        nx, ny, nz = data[k, AXES], data[k, AXES + 1], data[k, AXES + 2]
+        nx, ny, nz = vector(data, k, AXES)
         along = nx * dx + ny * dy + nz * dz
         dx, dy, dz = dx - along * nx, dy - along * ny, dz - along * nz
     across = dx * dx + dy * dy + dz * dz
