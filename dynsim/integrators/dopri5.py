@@ -1,4 +1,4 @@
-"""DOPRI5, the explicit Runge–Kutta method 5(4) of Dormand and Prince: coefficients and one step."""
+"""Steps of explicit Runge–Kutta methods; coefficients of DOPRI5, the method 5(4) of Dormand and Prince."""
 
 from __future__ import annotations
 
@@ -57,17 +57,18 @@ def explicit_error(system: System, ws: Workspace, run: Run, row):
 
 
 @inline_kernel
-def step_dopri5(system: System, ws: Workspace, run: Run):
-    """Take one step of Dormand and Prince's method and return the error norm.
+def step_explicit(system: System, ws: Workspace, run: Run, rows, nodes, errors, inner):
+    """Take one step of an explicit method and return the error norm.
 
-    The last stage, the derivative at y_new, is left in stage[6], the error estimate in stage[7].
+    The last row of ``rows`` is the solution, whose derivative, the first stage of the next step, is left in stage[6];
+    the error estimate is in stage[7]. Stages ``inner`` and ``inner + 1`` are inside the step.
     """
     t, h, y, y_new, k = run.clock[ki.TIME], run.clock[ki.STEP], run.y, run.y_new, run.stage
-    for s in range(1, 7):
-        combine(y, h, A_DOPRI5[s], s, k, y_new)
-        derivative(system, t + NODE_DOPRI5[s] * h, y_new, ws, k[s])
-        # Stages at 0.3 and 0.8 of the step.
-        if run.event.shape[0] > 0 and 2 <= s <= 3:
-            note_inside(system, ws, run, s - 2, NODE_DOPRI5[s])
-    run.count[ki.EVALUATIONS] += 6
-    return explicit_error(system, ws, run, ERROR_DOPRI5)
+    last = rows.shape[0] - 1
+    for s in range(1, last + 1):
+        combine(y, h, rows[s], s, k, y_new)
+        derivative(system, t + nodes[s] * h, y_new, ws, k[6 if s == last else s])
+        if run.event.shape[0] > 0 and inner <= s <= inner + 1:
+            note_inside(system, ws, run, s - inner, nodes[s])
+    run.count[ki.EVALUATIONS] += last
+    return explicit_error(system, ws, run, errors)

@@ -10,7 +10,7 @@ Methods, all with dense output (so that records do not force steps):
 - ``TIME_STEPPING``: contacts open and close within fixed steps, see ``stepping``; samples are linear within a step.
 
 After each accepted step of the adaptive methods, q and v are projected onto the active rows if they are off by more
-than ``GAP_TOLERANCE`` or ``RATE_TOLERANCE``, see ``project``.
+than ``GAP_TOLERANCE`` or ``RATE_TOLERANCE``, see ``project_level``.
 
 A sample at a tick has the values in force from the tick on: it is recorded at the end of the preceding step, and again
 after the commands are taken.
@@ -30,7 +30,7 @@ from dynsim.dynamics.tree.joints import normalise, read_positions
 from dynsim.dynamics.tree.support import watch_support
 from dynsim.integrators import run as ki
 from dynsim.integrators.contacts.events import consistent, solve_modes, switch_contacts, take_directions, watch_modes
-from dynsim.integrators.dopri5 import step_dopri5
+from dynsim.integrators.dopri5 import A_DOPRI5, ERROR_DOPRI5, NODE_DOPRI5, step_explicit
 from dynsim.integrators.events import arm_events, cut_step, fire_events, take_ticks
 from dynsim.integrators.methods import compiled
 from dynsim.integrators.radau5.step import after_step, end_accepted, end_workspace, step_radau5
@@ -195,21 +195,25 @@ def conclude(system: System, ws: Workspace, run: Run, error, order):
     return run.event.shape[0] > 0 and fire_events(run)
 
 
-@free_kernel
-def advance_dopri5(system: System, ws: Workspace, run: Run, limit):
-    """Run :func:`advance` with DOPRI5."""
+@inline_kernel
+def advance_explicit(system: System, ws: Workspace, run: Run, limit, rows, nodes, errors, inner, order):
+    """Run :func:`advance` with an explicit method, see :func:`dynsim.integrators.dopri5.step_explicit`."""
     taken, error = 0, 0.0
-    if limit < 0:
-        return
-    while can_step(system, ws, run):
+    while limit >= 0 and can_step(system, ws, run):
         if taken >= limit or finished(run) or stalled(run):
             return
         taken += 1
         if run.count[ki.PENDING] == 0:
             propose(run)
-            error = step_dopri5(system, ws, run)
-        if conclude(system, ws, run, error, 5.0):
+            error = step_explicit(system, ws, run, rows, nodes, errors, inner)
+        if conclude(system, ws, run, error, order):
             return
+
+
+@free_kernel
+def advance_dopri5(system: System, ws: Workspace, run: Run, limit):
+    """Run :func:`advance` with DOPRI5, whose inner stages are at 0.3 and 0.8 of the step."""
+    advance_explicit(system, ws, run, limit, A_DOPRI5, NODE_DOPRI5, ERROR_DOPRI5, 2, 5.0)
 
 
 @noinline_kernel
