@@ -13,8 +13,8 @@ import numpy as np
 
 from dynsim.compile.model import Model
 from dynsim.config.problems import listed
-from dynsim.dynamics.contact.delassus import RANK_TOLERANCE
 from dynsim.dynamics.contact.mobility import IMMOBILE
+from dynsim.dynamics.linear import RANK_TOLERANCE
 from dynsim.errors import ModelError
 from dynsim.model.description import Array, Contact, Robot
 from dynsim.model.surfaces import Quadric

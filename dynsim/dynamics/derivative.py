@@ -29,7 +29,7 @@ from dynsim.dynamics.tables import (
     workspace,
 )
 from dynsim.dynamics.tree.articulated import accelerate, add_row_forces, factor, row_system
-from dynsim.dynamics.tree.joints import position_rates, read_positions
+from dynsim.dynamics.tree.joints import positions_along, read_positions
 from dynsim.dynamics.tree.loads import LoadArrays, add_loads
 from dynsim.dynamics.tree.sweep import forward_sweep
 from dynsim.jit.kernel import integers, internal_kernel, kernel, reals
@@ -100,9 +100,8 @@ def m_star_acceleration(
     if dense is None:  # resolved at compile time; the default program then excludes M*
         return
     ws.counts[ka.DEPENDENT] = dependent
-    passes = 1
-    solve_m_star(dense, model, drives, unilateral, ws)
-    while sign_changed(ws, passes):
+    passes = 0
+    while passes == 0 or sign_changed(ws, passes):
         passes += 1
         solve_m_star(dense, model, drives, unilateral, ws)
 
@@ -138,7 +137,9 @@ def derivative(system: System, t, y, ws: Workspace, dy):
     admissible_forces(model, contacts, system.unilateral, ws)
 
     if not plain:
-        position_rates(model, ws, dy, layout.q)
+        for k in range(layout.q, layout.v):
+            dy[k] = 0.0
+        positions_along(model, y, layout.q, joints[:, ka.QD], dy)
     for i in range(n):
         if plain:
             dy[layout.q + i] = joints[i, ka.QD]

@@ -10,7 +10,8 @@ import numpy as np
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import distance as kd
 from dynsim.dynamics.contact.distance import ShapeArrays, distance
-from dynsim.dynamics.contact.rows import hessian_product, surface_distance
+from dynsim.dynamics.contact.rows import quadric_gap
+from dynsim.dynamics.linear import factor_symmetric, solve_symmetric
 from dynsim.dynamics.tables import ContactArrays, ModelArrays, Workspace
 from dynsim.dynamics.tree.joints import point_jacobian, point_position, read_positions
 from dynsim.dynamics.tree.sweep import kinematics
@@ -69,7 +70,6 @@ def follow_path(
         Remaining distance [m].
     """
     moving, rows = path.column.shape[0], path.error.shape[0]
-    limited = is_limited(path)
     for k in range(begin, end):
         for e in range(base.shape[1]):
             q[carried + e] = base[k, e]
@@ -78,8 +78,7 @@ def follow_path(
             # motion that the hand does not determine would run away.
             for j in range(moving):
                 q[path.place[j]] = 3.0 * result[k - 1, j] - 3.0 * result[k - 2, j] + result[k - 3, j]
-        if limited:
-            clip_to_limits(path, q)
+        clip_to_limits(path, q)
         best = math.inf
         for _ in range(ITERATIONS):
             left = errors(model, ws, path, targets[k], q)
@@ -87,25 +86,14 @@ def follow_path(
             # Two orders below the tolerance: the references must be smooth, not just close.
             if left < 1e-4 * tolerance:
                 break
-            if limited:
-                exclude_limited(path, q)
+            exclude_limited(path, q)
             step(path, 1e-12 + 0.1 * left * left, q)
-            if limited:
-                clip_to_limits(path, q)
+            clip_to_limits(path, q)
         if not best <= tolerance:
             return k, best
         for j in range(moving):
             result[k, j] = q[path.place[j]]
     return end, 0.0
-
-
-@internal_kernel
-def is_limited(path: PathArrays):
-    """True if any joint has a limit."""
-    for j in range(path.column.shape[0]):  # noqa: SIM110 (kernels have no generators)
-        if path.lower[j] > -math.inf or path.upper[j] < math.inf:
-            return True
-    return False
 
 
 @internal_kernel
@@ -125,11 +113,7 @@ def exclude_limited(path: PathArrays, q):
 def clip_to_limits(path: PathArrays, q):
     """Put joints beyond a limit on it."""
     for j in range(path.column.shape[0]):
-        at = q[path.place[j]]
-        if at > path.upper[j]:
-            q[path.place[j]] = path.upper[j]
-        elif at < path.lower[j]:
-            q[path.place[j]] = path.lower[j]
+        q[path.place[j]] = max(min(q[path.place[j]], path.upper[j]), path.lower[j])
 
 
 @internal_kernel
@@ -166,23 +150,15 @@ def gap_and_normal(shapes: ShapeArrays | None, braces: ContactArrays, b, x, y, z
     """Return the distance of brace b, at a point in W, from its surface [m], and the normal there (3 numbers)."""
     if shapes is not None:  # noqa: SIM102 (resolved at compile time)
         if shapes.kind[b, kd.SURFACE] != kd.AS_POINT:
-            gap = distance(shapes, b, x, y, z)
-            return gap[0] - shapes.data[b, kd.RADIUS], gap[1], gap[2], gap[3]
-    table, s = braces.point, ka.QUADRIC
-    qx = table[b, s] * x + table[b, s + 1] * y + table[b, s + 2] * z
-    qy = table[b, s + 1] * x + table[b, s + 3] * y + table[b, s + 4] * z
-    qz = table[b, s + 2] * x + table[b, s + 4] * y + table[b, s + 5] * z
-    bx, by, bz = table[b, s + 6], table[b, s + 7], table[b, s + 8]
-    value = bx * x + by * y + bz * z + table[b, s + 9] + 0.5 * (qx * x + qy * y + qz * z)
-    nx, ny, nz = bx + qx, by + qy, bz + qz
-    slope = math.sqrt(nx * nx + ny * ny + nz * nz)
-    nx, ny, nz = nx / slope, ny / slope, nz / slope
-    return surface_distance(value, slope, hessian_product(table, b, (nx, ny, nz))), nx, ny, nz
+            centre = distance(shapes, b, x, y, z)
+            return centre[0] - shapes.data[b, kd.RADIUS], centre[1], centre[2], centre[3]
+    gap, n, _ = quadric_gap(braces.point, b, braces.link[b, ka.CURVED] != 0, (x, y, z))
+    return gap, n[0], n[1], n[2]
 
 
 @internal_kernel
 def step(path: PathArrays, damping, q):
-    """Take the damped step: (J Jᵀ + λ 1) y = e by Cholesky, dq = Jᵀ y, each entry limited to ``STEP_MAX``."""
+    """Take the damped step: (J Jᵀ + λ 1) y = e, dq = Jᵀ y, each entry limited to ``STEP_MAX``."""
     rates, system, y, change = path.rates, path.system, path.error, path.change
     rows, moving = rates.shape
     for a in range(rows):
@@ -190,17 +166,9 @@ def step(path: PathArrays, damping, q):
             total = damping if a == b else 0.0
             for j in range(moving):
                 total += rates[a, j] * rates[b, j]
-            for c in range(b):
-                total -= system[a, c] * system[b, c]
-            system[a, b] = math.sqrt(max(total, damping)) if a == b else total / system[b, b]
-    for a in range(rows):
-        for b in range(a):
-            y[a] -= system[a, b] * y[b]
-        y[a] /= system[a, a]
-    for a in range(rows - 1, -1, -1):
-        for b in range(a + 1, rows):
-            y[a] -= system[b, a] * y[b]
-        y[a] /= system[a, a]
+            system[a, b] = total
+    factor_symmetric(system, rows, rows)
+    solve_symmetric(system, y, rows)
     longest = 0.0
     for j in range(moving):
         change[j] = 0.0

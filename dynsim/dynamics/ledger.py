@@ -39,6 +39,17 @@ def drive_powers(drives: DriveArrays, ws: Workspace):
 
 
 @internal_kernel
+def damping_powers(model: ModelArrays, ws: Workspace):
+    """Return the viscous losses of all gears and of all joints [W]."""
+    gear, joint = 0.0, 0.0
+    for i in range(ws.joints.shape[0]):
+        square = ws.joints[i, ka.QD] * ws.joints[i, ka.QD]
+        gear += model.body[i, ka.GEAR_DAMPING] * square
+        joint += model.body[i, ka.DAMPING] * square
+    return gear, joint
+
+
+@internal_kernel
 def ledger_rates(model: ModelArrays, drives: DriveArrays, ws: Workspace, out, layout):
     """Write the rates of all integrals to the blocks ledger and contact of ``out`` [W; N, m/s], and the normal forces.
 
@@ -47,13 +58,9 @@ def ledger_rates(model: ModelArrays, drives: DriveArrays, ws: Workspace, out, la
     direction d; constraint Σ f J v of all rows (zero on the constraint); mechanical Σ tau v with
     tau = K_m i − J_m vdot − D_m v − drag ([WM] eq 25).
     """
-    joints, state = ws.joints, ws.contacts
+    state = ws.contacts
     electrical, drawn, joule, mechanical, drag = drive_powers(drives, ws)
-    gear, joint = 0.0, 0.0
-    for i in range(joints.shape[0]):
-        square = joints[i, ka.QD] * joints[i, ka.QD]
-        gear += model.body[i, ka.GEAR_DAMPING] * square
-        joint += model.body[i, ka.DAMPING] * square
+    gear, joint = damping_powers(model, ws)
     friction, constraint = 0.0, 0.0
     start, first = layout.ledger, layout.contact
     rows = ws.rows

@@ -61,23 +61,10 @@ def state_layout(
 
     ``losses``, ``scheme`` and ``elastic`` are the sizes of the last blocks.
     """
-    starts = np.cumsum([0, nq, n, circuits, LEDGER_SIZE, CONTACT_SIZE * contacts, loads, losses, scheme, elastic])
-    q, v, current, ledger, contact, load, loss, scheme_start, elastic_start, size = (int(start) for start in starts)
-    return StateLayout(
-        q,
-        v,
-        current,
-        ledger,
-        contact,
-        load,
-        loss,
-        scheme_start,
-        elastic_start,
-        size,
-        tracked=ledger,
-        extra=nq - n,
-        circuits=circuits,
-    )
+    sizes = [nq, n, circuits, LEDGER_SIZE, CONTACT_SIZE * contacts, loads, losses, scheme, elastic]
+    starts = [int(start) for start in np.cumsum([0, *sizes])]
+    # Under error control are the entries before the ledger.
+    return StateLayout(*starts, starts[3], nq - n, circuits)
 
 
 class OutputLayout(NamedTuple):

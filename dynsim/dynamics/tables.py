@@ -179,11 +179,10 @@ OWNER = 1  # candidate, tie, coupling or, numbered after the couplings, joint st
 BODY_A = 2  # link, or the following joint of a joint row
 BODY_B = 3  # link at the other end, -1 for the world; the leading joint of a joint row
 LAW = 4  # FRICTION_SIGNED unless DIRECTION depends on the sign of the force
-ORDER = 5  # scratch of the solve: order of exchanged columns
 # and, in the same array, for each candidate
-MODE = 6  # OPEN, SLIDING or STICKING
-FIRST_ROW = 7
-ACTIVE_SIZE = 8
+MODE = 5  # OPEN, SLIDING or STICKING
+FIRST_ROW = 6
+ACTIVE_SIZE = 7
 # Kinds of rows: point that slides on its surface, point that sticks to it, row between two bodies, or two joints.
 SLIDING_ROW, STICKING_ROW, BODY_ROW, JOINT_ROW = 0, 1, 2, 3
 # Workspace.counts, int
@@ -218,9 +217,8 @@ class ReferenceArrays(NamedTuple):
     held: np.ndarray  # (na,) constant angle of a held joint
     grid: np.ndarray  # (2,) time of the first knot, knot distance [s]
     coefficients: np.ndarray  # (segments, splines, 6) ascending powers of t - t_knot
-    voltage: np.ndarray = np.zeros(
-        (0, 0, 6)
-    )  # (segments, na, 6) added to the commands of DC motors [V]; no segments: no addition
+    # (segments, na, 6) added to the commands of DC motors [V]; no segments: no addition
+    voltage: np.ndarray = np.zeros((0, 0, 6))
 
 
 class ContactArrays(NamedTuple):

@@ -18,9 +18,9 @@ from dynsim.compile.model import Model
 from dynsim.compile.shapes import share_of_axis
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import delassus as kq
-from dynsim.dynamics.contact.delassus import RANK_TOLERANCE
 from dynsim.dynamics.contact.rows import SIGNS_LIMIT
 from dynsim.dynamics.derivative import System, derivative, new_workspace
+from dynsim.dynamics.linear import RANK_TOLERANCE
 from dynsim.dynamics.tree.articulated import accelerate
 from dynsim.integrators import run as ki
 from dynsim.model.description import Contact

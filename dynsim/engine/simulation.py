@@ -33,7 +33,7 @@ from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.cone import steps as kc
 from dynsim.dynamics.contact.unilateral import UnilateralArrays
-from dynsim.dynamics.drive.law import take_measured_commands
+from dynsim.dynamics.drive.law import take_commands
 from dynsim.dynamics.state import block
 from dynsim.dynamics.tree import loads as kl
 from dynsim.dynamics.tree.joints import normalise
@@ -283,7 +283,7 @@ class Simulation:
         system, workspace = self._prepared.system, self._prepared.workspace
         driven = system.drives.table[:, ka.DRIVEN]
         workspace.joints[driven, ka.Q], workspace.joints[driven, ka.QD] = position, rate
-        take_measured_commands(system.drives, system.reference, self._time, workspace)
+        take_commands(system.drives, system.reference, self._time, workspace)
         self._restart()
 
     @property

@@ -247,10 +247,7 @@ def fire_events(run: Run):
     for e in range(event.shape[0]):
         if count[ki.FIRED] == 1 and happened(run, e, event[e, ki.VALUE]):
             action = run.event_table[e, ki.ON_EVENT]
-            if count[ki.LOGGED] < run.log_time.shape[0]:
-                run.log_time[count[ki.LOGGED]] = run.clock[ki.TIME]
-                run.log_event[count[ki.LOGGED]] = e
-                count[ki.LOGGED] += 1
+            ke.log(run, e)
             event[e, ki.SIDE] = -event[e, ki.SIDE]
             if action == ki.STOP:
                 count[ki.STATUS] = ki.STOPPED

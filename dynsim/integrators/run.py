@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -12,14 +11,14 @@ from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import delassus as kq
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.delassus import force_verdict, solve_small
-from dynsim.dynamics.contact.rows import force_vectors, row_errors
+from dynsim.dynamics.contact.rows import force_vectors, row_errors, slip_speed
 from dynsim.dynamics.contact.unilateral import UnilateralArrays
 from dynsim.dynamics.derivative import System, derivative
 from dynsim.dynamics.ledger import kinetic_energy, magnetic_energy, potential_energy
 from dynsim.dynamics.state import OutputLayout, StateLayout, block
 from dynsim.dynamics.tables import Workspace, row_limit, workspace
 from dynsim.dynamics.tree import support as ks
-from dynsim.dynamics.tree.articulated import accelerate
+from dynsim.dynamics.tree.articulated import accelerate_by_impulses, row_mobilities
 from dynsim.dynamics.tree.joints import displace, normalise, point_position
 from dynsim.dynamics.tree.support import SupportArrays, ground_reaction, no_support
 from dynsim.integrators import methods
@@ -388,53 +387,36 @@ PROJECTION_LIMIT = 6
 @internal_kernel
 def off_surface(ws: Workspace):
     """True if the state is off an active row by more than the projection tolerances."""
-    state, rows, active = ws.contacts, ws.rows, ws.active
+    rows, active = ws.rows, ws.active
     row_errors(ws)
     for r in range(ws.counts[ka.ROWS]):
         # Rounding limits the accuracy of the rate to a fraction of the speed.
         if active[r, ka.ROW_KIND] == ka.JOINT_ROW:
             speed = abs(rows[r, ka.ROW + 1] * ws.joints[active[r, ka.BODY_B], ka.QD])
         else:
-            k = active[r, ka.OWNER]
-            x, y, z = state[k, ka.SLIP_VELOCITY], state[k, ka.SLIP_VELOCITY + 1], state[k, ka.SLIP_VELOCITY + 2]
-            speed = math.sqrt(x * x + y * y + z * z)
+            speed = slip_speed(ws, active[r, ka.OWNER])
         if abs(rows[r, ka.ROW_GAP]) > GAP_TOLERANCE or abs(rows[r, ka.ROW_RATE]) > RATE_TOLERANCE * (1.0 + speed):
             return True
     return False
 
 
 @internal_kernel
-def project(system: System, ws: Workspace, y):
-    """Take one Newton step of q and v onto the active rows, weighted by the mass matrix, after :func:`off_surface`.
-
-    dq = −M⁻¹ Jᵀ λ with J M⁻¹ Jᵀ λ = gap, and the same for v with J v: the nearest point in the kinetic metric. The
-    factors of M + J_m and the eliminated rows are still in the workspace from the derivative.
-    """
-    project_level(system, ws, y, 0)
-    project_level(system, ws, y, 1)
-
-
-@internal_kernel
 def project_level(system: System, ws: Workspace, y, level):
-    """Project positions (level 0) or rates (1), see `project`; return ½ λᵀ J v, the energy that rates lose [J]."""
-    state, active, column, small = ws.rows, ws.active, ws.column, ws.small
-    n, p = ws.joints.shape[0], ws.counts[ka.ROWS]
+    """Take one Newton step of q (level 0) or v (1) onto the active rows; return ½ λᵀ J v, the energy that v loses [J].
+
+    Call after :func:`off_surface`. dq = −M⁻¹ Jᵀ λ with J M⁻¹ Jᵀ λ = gap, and the same for v with J v: the nearest point
+    in the kinetic metric. Factors of M + J_m and eliminated rows are still in the workspace from the derivative.
+    """
+    state, n, p = ws.rows, ws.joints.shape[0], ws.counts[ka.ROWS]
     start = system.layout.q if level == 0 else system.layout.v
-    for k in range(p):
-        state[k, ka.RHS] = state[k, ka.ROW_GAP] if level == 0 else state[k, ka.ROW_RATE]
-        for m in range(p):
-            small[0, k, m] = 0.0
-            for i in range(n):
-                small[0, k, m] += column[i, 1 + 2 * k] * column[i, 1 + 2 * m] * ws.links[i, ka.INVERSE_D]
-    solve_small(small, state, active, p)
     energy = 0.0
     for k in range(p):
+        state[k, ka.RHS] = -state[k, ka.ROW_GAP] if level == 0 else -state[k, ka.ROW_RATE]
+    row_mobilities(ws, ws.small[0])
+    solve_small(ws.small, state, p)
+    for k in range(p):
         energy += 0.5 * state[k, ka.FORCE] * state[k, ka.RHS]
-    for i in range(n):
-        column[i, 0] = 0.0
-        for k in range(p):
-            column[i, 0] -= state[k, ka.FORCE] * column[i, 1 + 2 * k]
-    accelerate(system.model, ws)
+    accelerate_by_impulses(system.model, ws, state[:, ka.FORCE])
     if level == 0 and system.layout.extra > 0:
         displace(system.model, ws, y, start)
     else:
@@ -451,7 +433,8 @@ def settle(system: System, t, y, ws: Workspace, dy, run: Run):
     for _ in range(PROJECTION_LIMIT):
         if not off_surface(ws):
             return True
-        project(system, ws, y)
+        project_level(system, ws, y, 0)
+        project_level(system, ws, y, 1)
         derivative(system, t, y, ws, dy)
         run.count[EVALUATIONS] += 1
         run.count[PROJECTIONS] += 1

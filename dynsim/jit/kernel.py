@@ -301,6 +301,12 @@ def _compile(function: F, **options: Any) -> F:
     return compiled
 
 
+@internal_kernel
+def every(mask):
+    """Return whether a condition is true, on lanes for all of them, see :mod:`dynsim.jit.simd`."""
+    return mask
+
+
 def reals(values: Any) -> np.ndarray:
     """Return the canonical float array of every kernel argument: float64, C order, writable, a copy."""
     return np.array(values, dtype=np.float64, order="C")

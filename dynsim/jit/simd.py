@@ -2,7 +2,8 @@
 
 Arithmetic, roots and ``min``/``max`` work lane by lane in vector instructions. A comparison gives a :class:`Mask`. It
 has no truth value: a branch on it does not compile, because lanes could not take different branches. Kernels that
-branch on data have variants for lanes, made with :func:`select` and :func:`every`, see dynsim.integrators.simd.forms.
+branch on data ask for ``every`` lane or have variants for lanes, made with :func:`select`, see
+dynsim.integrators.simd.forms.
 
 LLVM maps ``<N x double>`` to the registers of the processor: eight lanes are one register of AVX-512, two of AVX2 or
 four of SSE2.
@@ -194,7 +195,7 @@ def select(typingctx: Any, mask: Any, a: Any, b: Any) -> Any:
 
 
 @intrinsic
-def every(typingctx: Any, mask: Any) -> Any:
+def all_lanes(typingctx: Any, mask: Any) -> Any:
     """Return whether the mask is true for all lanes."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:

@@ -8,7 +8,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from dynsim.dynamics import tables as ka
-from dynsim.dynamics.contact.delassus import RANK_TOLERANCE, solve_dependent, solve_small
+from dynsim.dynamics.contact.delassus import solve_dependent, solve_small
+from dynsim.dynamics.linear import RANK_TOLERANCE
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -19,7 +20,7 @@ def solve(A: np.ndarray, b: np.ndarray, room: int = 0, solver=solve_small) -> tu
     ws = ka.workspace(1, 0, 0, p + room)
     ws.small[:], ws.rows[:] = np.nan, np.nan
     ws.small[0, :p, :p], ws.rows[:p, ka.RHS] = A, b
-    dependent = solver(ws.small, ws.rows, ws.active, p)
+    dependent = solver(ws.small, ws.rows, p)
     assert np.array_equal(ws.small[0, :p, :p], A, equal_nan=True)
     assert np.isnan(ws.rows[p:, ka.FORCE]).all()
     return ws.rows[:p, ka.FORCE].copy(), bool(dependent)

@@ -11,7 +11,7 @@ from support.pinocchio_oracle import Oracle
 
 import dynsim
 from dynsim import Model
-from dynsim.dynamics.tree.joints import position_rates
+from dynsim.dynamics.tree.joints import positions_along
 from dynsim.model.description import Inertia, Link, Robot
 from dynsim.model.joints.ball import ball, floating
 from dynsim.model.joints.planar import planar, rolling
@@ -53,8 +53,7 @@ def machines() -> dict[str, Robot]:
 def difference(model: Model, q: np.ndarray, v: np.ndarray, vdot: np.ndarray, along: np.ndarray) -> np.ndarray:
     """∂tau/∂q along rates, by central differences of fourth order."""
     slope, step = np.zeros(model.nq), 1e-3
-    model.inverse_dynamics(q, along, np.zeros(model.n))
-    position_rates(model.arrays, model._workspace, slope, 0)
+    positions_along(model.arrays, q, 0, along, slope)
 
     def at(h: float) -> np.ndarray:
         return model.inverse_dynamics(q + h * slope, v, vdot)

@@ -19,6 +19,7 @@ from dynsim.dynamics.drive.law import (
     dc_torque,
     drive_block,
     open_torque,
+    segment_of,
     servo_command,
     servo_torque,
     take_commands,
@@ -189,7 +190,7 @@ def test_linear_blocks_equal_complex_step_derivatives(name, sampled):
     current = 0.6
     b.derivative(b.state(np.array([q]), np.array([v]), np.full(b.robot.circuits, current)))
     block = np.full(ka.BLOCK_SIZE, np.nan)
-    drive_block(drives, b.ws, 0, block)
+    drive_block(drives, b.ws, 0, segment_of(drives, b.system.reference, 0.0, b.ws, 0), block)
     f = law(motor, drives, 1.0, sampled)
     expected = np.zeros((2, 3))
     for k in range(3):

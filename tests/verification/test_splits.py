@@ -12,11 +12,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import linprog, minimize, minimize_scalar
 
-from dynsim.dynamics.contact.cone.program import best_split, cone_program, solve_cone_program, split_room
-from dynsim.dynamics.contact.delassus import ONE_WAY, null_space
+from dynsim.dynamics.contact.cone.program import best_split, cone_program, solve_cone_program, split_sizes
+from dynsim.dynamics.contact.delassus import ONE_WAY
+from dynsim.dynamics.linear import null_space
 from dynsim.jit.kernel import integers, reals
 
 seeds = st.integers(0, 2**32 - 1)
+
+
+def split_room(r: int, count: int):
+    """Scratch for null spaces of up to r columns and ``count`` contacts."""
+    return cone_program(*split_sizes(r, count))
 
 
 def margins(f: np.ndarray, first: np.ndarray, mu: np.ndarray) -> np.ndarray:
@@ -56,9 +62,9 @@ def test_null_spaces_are_orthonormal_and_whole(seed):
     p = int(rng.integers(1, 9))
     rank = int(rng.integers(0, p + 1))
     B = rng.normal(size=(p, rank))
-    W, N, order = np.zeros((9, 9)), np.full((9, 9), np.nan), np.zeros(9, dtype=int)
+    W, N = np.zeros((9, 9)), np.full((9, 9), np.nan)
     W[:p, :p] = B @ B.T
-    width = null_space(W, p, N, order, p)
+    width = null_space(W, p, N, p)
     assert width == p - rank
     N = N[:p, :width]
     np.testing.assert_allclose(N.T @ N, np.eye(width), atol=1e-14)
@@ -222,7 +228,16 @@ def test_joints_that_rub_share_their_forces_as_a_linear_programme_has_it(seed):
     out, joints = np.full(p, np.nan), p - stops
     mu = np.append(bound[:joints], np.full(stops, ONE_WAY))
     margin = best_split(
-        reals(f0), reals(N), N.shape[1], integers(np.arange(p)), reals(mu), 0, p, out, split_room(r, p), True
+        reals(f0),
+        reals(N),
+        N.shape[1],
+        integers(np.arange(p)),
+        reals(mu),
+        0,
+        p,
+        out,
+        split_room(r, p),
+        True,
     )
     ones = np.ones((p, 1))
     rows, limits = (

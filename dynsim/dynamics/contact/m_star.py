@@ -27,9 +27,7 @@ def solve_m_star(K, model: ModelArrays, drives: DriveArrays, unilateral: Unilate
     n, p, na = model.tree.shape[0], ws.counts[ka.ROWS], drives.table.shape[0]
     size = K.shape[0]
     links, joints, motors, state = ws.links, ws.joints, ws.motors, ws.rows
-    for i in range(size):
-        for j in range(size + 1):
-            K[i, j] = 0.0
+    K[:, : size + 1] = 0.0
     newton_euler(model, ws, 1.0, 0.0, 1.0)
     for i in range(n):
         K[i, size] = joints[i, ka.APPLIED] - joints[i, ka.BIAS]

@@ -85,9 +85,7 @@ def set_modes(
             new_row(ws, p, ka.SLIDING_ROW, k, contacts.link[k, ka.LINK])
             p += 1
     # Solves write the joints that a row involves, and read all other entries as zero.
-    for i in range(ws.column.shape[0]):
-        for s in range(ws.column.shape[1]):
-            ws.column[i, s] = 0.0
+    ws.column[:] = 0.0
 
 
 @internal_kernel
@@ -97,10 +95,7 @@ def dry_rows(unilateral: UnilateralArrays, ws: Workspace, p):
     for k in range(table.shape[0]):
         if table[k, ku.DRY_HOLDS] == 0:
             continue
-        joint = table[k, ku.DRY_JOINT]
-        new_row(ws, p, ka.JOINT_ROW, owner + k, joint)
-        ws.active[p, ka.BODY_B] = joint
-        ws.rows[p, ka.ROW], ws.rows[p, ka.DIRECTION], ws.rows[p, ka.ROW_OFFSET] = 1.0, 1.0, unilateral.dry[k, ku.DRY_AT]
+        row_of_joint(ws, p, owner + k, table[k, ku.DRY_JOINT], 1.0, unilateral.dry[k, ku.DRY_AT])
         table[k, ku.DRY_ROW] = p
         p += 1
     return p
@@ -125,17 +120,18 @@ def stop_rows(unilateral: UnilateralArrays, couplings, ws: Workspace, p):
     for k in range(table.shape[0]):
         stop[k, ku.STOP_FORCE] = 0.0
         if table[k, ku.STOP_CLOSED] == 1:
-            joint = table[k, ku.STOP_JOINT]
-            new_row(ws, p, ka.JOINT_ROW, couplings + k, joint)
-            ws.active[p, ka.BODY_B] = joint
-            ws.rows[p, ka.ROW], ws.rows[p, ka.DIRECTION], ws.rows[p, ka.ROW_OFFSET] = (
-                stop[k, ku.SIDE],
-                stop[k, ku.SIDE],
-                stop[k, ku.LIMIT],
-            )
+            row_of_joint(ws, p, couplings + k, table[k, ku.STOP_JOINT], stop[k, ku.SIDE], stop[k, ku.LIMIT])
             table[k, ku.STOP_ROW] = p
             p += 1
     return p
+
+
+@internal_kernel
+def row_of_joint(ws: Workspace, r, owner, joint, side, offset):
+    """Initialise row r of one joint, whose position times ``side`` is to be ``offset``."""
+    new_row(ws, r, ka.JOINT_ROW, owner, joint)
+    ws.active[r, ka.BODY_B] = joint
+    ws.rows[r, ka.ROW], ws.rows[r, ka.DIRECTION], ws.rows[r, ka.ROW_OFFSET] = side, side, offset
 
 
 @internal_kernel
@@ -144,8 +140,7 @@ def new_row(ws: Workspace, r, kind, owner, link):
     active = ws.active
     active[r, ka.ROW_KIND], active[r, ka.OWNER], active[r, ka.LAW] = kind, owner, ka.FRICTION_SIGNED
     active[r, ka.BODY_A], active[r, ka.BODY_B] = link, -1
-    for s in range(ka.ROW_STATE_SIZE):
-        ws.rows[r, s] = 0.0
+    ws.rows[r] = 0.0
     ws.rows[r, ka.SIGN] = 1.0
 
 
@@ -202,8 +197,7 @@ def sticking_rows(model: ModelArrays, ws: Workspace, k, i):
         r = first + m
         d = vector(state, k, ka.NORMAL if m == 0 else ka.FIRST_TANGENT if m == 1 else ka.SECOND_TANGENT)
         point_row(rows, r, at, d)
-        for s in range(6):
-            rows[r, ka.DIRECTION + s] = rows[r, ka.ROW + s]
+        put_six(rows, r, ka.DIRECTION, six(rows, r, ka.ROW))
         if m > 0:
             rows[r, ka.TARGET] = -dot_vector(d, a)
             rows[r, ka.ROW_RATE] = dot_vector(d, v)
@@ -241,6 +235,23 @@ def row_errors(ws: Workspace):
     for k in range(ws.contacts.shape[0]):
         r = active[k, ka.FIRST_ROW]
         rows[r, ka.ROW_GAP], rows[r, ka.ROW_RATE] = ws.contacts[k, ka.GAP], ws.contacts[k, ka.GAP_RATE]
+
+
+@internal_kernel
+def largest_of_rows(ws: Workspace, column):
+    """Return the largest absolute value in this column of the active rows."""
+    largest = 0.0
+    for r in range(ws.counts[ka.ROWS]):
+        largest = max(largest, abs(ws.rows[r, column]))
+    return largest
+
+
+@internal_kernel
+def slip_speed(ws: Workspace, k):
+    """Return |v_t| of candidate k [m/s]."""
+    state = ws.contacts
+    x, y, z = state[k, ka.SLIP_VELOCITY], state[k, ka.SLIP_VELOCITY + 1], state[k, ka.SLIP_VELOCITY + 2]
+    return math.sqrt(x * x + y * y + z * z)
 
 
 @internal_kernel
@@ -287,6 +298,25 @@ def hessian_product(point, k, u):
 
 
 @internal_kernel
+def quadric_gap(point, k, curved, at):
+    """Return signed distance and normal of the quadric of candidate k at a point in W, and 1/|∇C|.
+
+    ∇C of a plane, which is not ``curved``, is its unit normal: this saves every right-hand side two roots and three
+    divisions.
+    """
+    n = vector(point, k, ka.QUADRIC + 6)
+    gap, inverse = dot_vector(n, at) + point[k, ka.QUADRIC + 9], 1.0
+    if curved:
+        bent = times_inertia(six(point, k, ka.QUADRIC), at)
+        n = n[0] + bent[0], n[1] + bent[1], n[2] + bent[2]
+        slope = math.sqrt(dot_vector(n, n))
+        inverse = 1.0 / slope
+        n = times_number(n, inverse)
+        gap = surface_distance(gap + 0.5 * dot_vector(bent, at), slope, hessian_product(point, k, n))
+    return gap, n, inverse
+
+
+@internal_kernel
 def contact_rows(model: ModelArrays, contacts: ContactArrays, unilateral: UnilateralArrays | None, ws: Workspace):
     """Compute position, gap, slip, constraint row and force direction of every candidate, after ``forward_sweep``.
 
@@ -298,52 +328,53 @@ def contact_rows(model: ModelArrays, contacts: ContactArrays, unilateral: Unilat
     zero slip. σ is 1 in the paper's law; for the dissipative law it is the sign of f_n, kept between calls. Under the
     unilateral law t and μ come from :func:`~dynsim.dynamics.contact.unilateral.slide_direction`.
     """
-    links, state, rows, point, gravity = ws.links, ws.contacts, ws.rows, contacts.point, model.gravity
+    links, point, gravity = ws.links, contacts.point, model.gravity
     for k in range(contacts.link.shape[0]):
-        i, m = contacts.link[k, ka.LINK], ws.active[k, ka.FIRST_ROW]
-        mu = signed_friction(ws, m)
+        i, mu = contacts.link[k, ka.LINK], signed_friction(ws, ws.active[k, ka.FIRST_ROW])
         R = rotation(links, i, ka.R)
         at = transform(vector(links, i, ka.P), R, vector(point, k, ka.POINT))
-        # ∇C and C; ∇C of a plane is its unit normal, which saves every right-hand side two roots and three divisions.
-        n = vector(point, k, ka.QUADRIC + 6)
-        gap = dot_vector(n, at) + point[k, ka.QUADRIC + 9]
-        inverse, curved = 1.0, contacts.link[k, ka.CURVED] != 0
-        if curved:
-            bent = times_inertia(six(point, k, ka.QUADRIC), at)
-            n = n[0] + bent[0], n[1] + bent[1], n[2] + bent[2]
-            slope = math.sqrt(dot_vector(n, n))
-            inverse = 1.0 / slope
-            n = times_number(n, inverse)
-            gap = surface_distance(gap + 0.5 * dot_vector(bent, at), slope, hessian_product(point, k, n))
+        curved = contacts.link[k, ka.CURVED] != 0
+        gap, n, inverse = quadric_gap(point, k, curved, at)
         # Velocity of the point, and its acceleration at vdot = 0 (A includes −g from the root).
         V = six(links, i, ka.V)
         v, a = point_velocity(V, at), point_acceleration(six(links, i, ka.A), V, at)
         a = a[0] + gravity[0], a[1] + gravity[1], a[2] + gravity[2]
         rate = dot_vector(n, v)
         slip = v[0] - rate * n[0], v[1] - rate * n[1], v[2] - rate * n[2]
-        if unilateral is None:
-            t = times_number(
-                slip, 1.0 / math.sqrt(dot_vector(slip, slip) + contacts.law[k, ka.V_S] * contacts.law[k, ka.V_S])
-            )
-        else:
-            x, y, z, mu = slide_direction(unilateral, contacts, k, slip, n)
-            t = x, y, z
-            rows[m, ka.ROW_MU] = mu
-        state[k, ka.GAP], state[k, ka.GAP_RATE] = gap, rate
+        t, mu = slip_friction(unilateral, contacts, ws, k, slip, n, mu)
         target = -dot_vector(n, a)
-        rows[m, ka.TARGET] = target - hessian_product(point, k, v) * inverse if curved else target
-        put_vector(state, k, ka.POSITION, at)
-        put_vector(state, k, ka.NORMAL, n)
-        put_vector(state, k, ka.SLIP_VELOCITY, slip)
+        target = target - hessian_product(point, k, v) * inverse if curved else target
         # Only stores follow: a store to one table makes the compiler reload values of the other.
-        put_vector(state, k, ka.TANGENT, t)
-        point_row(rows, m, at, n)
-        unit_force(rows, m, mu, at, n, t)
+        write_candidate(ws, k, at, gap, n, rate, slip, t, mu, target)
     if ws.counts[ka.STUCK] == 0:
         return
     for k in range(contacts.link.shape[0]):
         if ws.active[k, ka.MODE] == ka.STICKING:
             sticking_rows(model, ws, k, contacts.link[k, ka.LINK])
+
+
+@internal_kernel
+def slip_friction(unilateral: UnilateralArrays | None, contacts: ContactArrays, ws: Workspace, k, slip, n, mu):
+    """Return the direction of slip of candidate k and the friction against it; under the bilateral law this is mu."""
+    if unilateral is None:  # resolved at compile time
+        v_s = contacts.law[k, ka.V_S]
+        return times_number(slip, 1.0 / math.sqrt(dot_vector(slip, slip) + v_s * v_s)), mu
+    x, y, z, mu = slide_direction(unilateral, contacts, k, slip, n)
+    ws.rows[ws.active[k, ka.FIRST_ROW], ka.ROW_MU] = mu
+    return (x, y, z), mu
+
+
+@internal_kernel
+def write_candidate(ws: Workspace, k, at, gap, n, rate, slip, t, mu, target):
+    """Write position, gap, slip, row and force direction of candidate k."""
+    state, rows, m = ws.contacts, ws.rows, ws.active[k, ka.FIRST_ROW]
+    state[k, ka.GAP], state[k, ka.GAP_RATE], rows[m, ka.TARGET] = gap, rate, target
+    put_vector(state, k, ka.POSITION, at)
+    put_vector(state, k, ka.NORMAL, n)
+    put_vector(state, k, ka.SLIP_VELOCITY, slip)
+    put_vector(state, k, ka.TANGENT, t)
+    point_row(rows, m, at, n)
+    unit_force(rows, m, mu, at, n, t)
 
 
 @internal_kernel
@@ -386,9 +417,7 @@ def sign_changed(ws: Workspace, passes):
     """
     rows, active, p = ws.rows, ws.active, ws.counts[ka.ROWS]
     limit = 2 * p + SIGN_PASSES
-    changed, largest = False, 0.0
-    for k in range(p):
-        largest = max(largest, abs(rows[k, ka.FORCE]))
+    changed, largest = False, largest_of_rows(ws, ka.FORCE)
     for k in range(p):
         if active[k, ka.LAW] == ka.FRICTION_DISSIPATIVE:
             agreement = rows[k, ka.FORCE] * rows[k, ka.SIGN]
@@ -457,7 +486,7 @@ def shaped_row(
 
     so that in comparison with a held point, ω × v_c becomes ω × ċ. There is no anchor to which it must return.
     """
-    links, state, rows, point, data = ws.links, ws.contacts, ws.rows, contacts.point, shapes.data
+    links, rows, point, data = ws.links, ws.rows, contacts.point, shapes.data
     i, m, radius = contacts.link[k, ka.LINK], ws.active[k, ka.FIRST_ROW], shapes.data[k, kd.RADIUS]
     R = rotation(links, i, ka.R)
     s = transform(vector(links, i, ka.P), R, vector(point, k, ka.POINT))
@@ -487,20 +516,8 @@ def shaped_row(
     rate = dot_vector(n, v)
     v = along(v, cross(w, n), -radius)
     slip = along(v, n, -rate)
-    if unilateral is None:
-        t = times_number(
-            slip, 1.0 / math.sqrt(dot_vector(slip, slip) + contacts.law[k, ka.V_S] * contacts.law[k, ka.V_S])
-        )
-    else:
-        tx, ty, tz, rows[m, ka.ROW_MU] = slide_direction(unilateral, contacts, k, slip, n)
-        t = tx, ty, tz
-    state[k, ka.GAP], state[k, ka.GAP_RATE], rows[m, ka.TARGET] = far - radius, rate, -second
-    put_vector(state, k, ka.POSITION, c)
-    put_vector(state, k, ka.NORMAL, n)
-    put_vector(state, k, ka.SLIP_VELOCITY, slip)
-    put_vector(state, k, ka.TANGENT, t)
-    point_row(rows, m, c, n)
-    unit_force(rows, m, signed_friction(ws, m), c, n, t)
+    t, mu = slip_friction(unilateral, contacts, ws, k, slip, n, signed_friction(ws, m))
+    write_candidate(ws, k, c, far - radius, n, rate, slip, t, mu, -second)
     if ws.active[k, ka.MODE] != ka.STICKING:
         return
     rolls = radius > 0.0 or shapes.kind[k, kd.MOVES] != 0

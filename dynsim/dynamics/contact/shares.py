@@ -25,23 +25,17 @@ from dynsim.jit.kernel import internal_kernel, noinline_kernel
 def solve_rows(unilateral: UnilateralArrays | None, ws: Workspace, p):
     """Solve for the forces of the p active rows; return whether they are dependent, as :func:`solve_small`."""
     if unilateral is None:  # resolved at compile time
-        return solve_small(ws.small, ws.rows, ws.active, p)
+        return solve_small(ws.small, ws.rows, p)
     if unilateral.number[ku.SHARED] == 1.0:
         return solve_near_shares(unilateral, ws, p)
     if unilateral.number[ku.REDUNDANT] == 1.0:
-        return solve_dependent(ws.small, ws.rows, ws.active, p)
-    return solve_small(ws.small, ws.rows, ws.active, p)
-
-
-@internal_kernel
-def solve_near_shares(unilateral: UnilateralArrays, ws: Workspace, p):
-    """Solve for the forces nearest to the shares; SIMD lanes use a variant of this kernel."""
-    return solve_nearest(unilateral, ws, p)
+        return solve_dependent(ws.small, ws.rows, p)
+    return solve_small(ws.small, ws.rows, p)
 
 
 @noinline_kernel
-def solve_nearest(unilateral: UnilateralArrays, ws: Workspace, p):
-    """Do the work of :func:`solve_near_shares` for one state; the right-hand side is unchanged."""
+def solve_near_shares(unilateral: UnilateralArrays, ws: Workspace, p):
+    """Solve for the forces nearest to the shares; the right-hand side is unchanged."""
     rows, W, share, right = ws.rows, ws.small[0], unilateral.vector[0], unilateral.vector[1]
     for r in range(p):
         slot = share_slot(unilateral, ws, r)
@@ -49,7 +43,7 @@ def solve_nearest(unilateral: UnilateralArrays, ws: Workspace, p):
     for r in range(p):
         for s in range(p):
             rows[r, ka.RHS] -= W[r, s] * share[s]
-    dependent = solve_dependent(ws.small, rows, ws.active, p)
+    dependent = solve_dependent(ws.small, rows, p)
     for r in range(p):
         rows[r, ka.FORCE] += share[r]
         rows[r, ka.RHS] = right[r]
@@ -76,11 +70,17 @@ def keep_shares(unilateral: UnilateralArrays, ws: Workspace, modes):
     """
     if unilateral.number[ku.REDUNDANT] == 0.0:
         return
+    write_shares(unilateral, ws)
+    unilateral.number[ku.SHARED] = 1.0 if some_slide(modes) else 0.0
+
+
+@internal_kernel
+def write_shares(unilateral: UnilateralArrays, ws: Workspace):
+    """Write the present forces of the rows to ``shares``."""
     for r in range(ws.counts[ka.ROWS]):
         slot = share_slot(unilateral, ws, r)
         if slot >= 0:
             unilateral.shares[slot] = ws.rows[r, ka.FORCE]
-    unilateral.number[ku.SHARED] = 1.0 if some_slide(modes) else 0.0
 
 
 @internal_kernel

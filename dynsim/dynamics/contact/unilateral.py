@@ -116,9 +116,9 @@ MODE_SIZE = 9
 # UnilateralArrays.vector: three for the splits of forces, then five for the problem that chooses modes
 OFFSET, SOLUTION, CONE_FRICTION, FIRST_PART, SECOND_PART = 3, 4, 5, 6, 7
 VECTORS = 8
-# UnilateralArrays.index, int: four for the splits of forces; kinds of the problem's rows, and their rows in the table
-KINDS, TABLE_ROW = 4, 5
-INDICES = 6
+# UnilateralArrays.index, int: three for the splits of forces; kinds of the problem's rows, and their rows in the table
+KINDS, TABLE_ROW = 3, 4
+INDICES = 5
 # UnilateralArrays.room
 SPLIT_MATRIX, NULL_SPACE, PROBLEM, SCRATCH = 0, 1, 2, 3
 ROOM = SCRATCH + kc.CONE_ROOM

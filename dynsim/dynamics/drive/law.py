@@ -65,12 +65,6 @@ def dc_block(motor, a, follows):
     )
 
 
-def at_current_limit(motor, a, u, v):
-    """Return whether the voltage from :func:`within_current` is at the current limit."""
-    drop = motor[a, ka.RESISTANCE] * motor[a, ka.I_MAX]
-    return abs(u - motor[a, ka.K_M] * v) >= drop * (1.0 - 1e-12)
-
-
 # Position servo: voltage loop, motor without inductance, limits of voltage and current, friction of the gear.
 
 
@@ -109,14 +103,7 @@ def servo_circuit_on(motor, a, mode, segment, command, v):
 
 def servo_circuit(motor, a, mode, command, v):
     """Return terminal voltage u [V] and current i [A] of a command, both within their limits."""
-    if mode == ka.OFF:
-        return motor[a, ka.K_M] * v, 0.0 * v
-    u = clipped(command, motor[a, ka.U_MAX])
-    wanted = (u - motor[a, ka.K_M] * v) / motor[a, ka.RESISTANCE]
-    i = clipped(wanted, motor[a, ka.I_MAX])
-    if i != wanted:
-        u = motor[a, ka.RESISTANCE] * i + motor[a, ka.K_M] * v
-    return u, i
+    return servo_circuit_on(motor, a, mode, servo_segment(motor, a, mode, command, v), command, v)
 
 
 def servo_drag(motor, a, mode, v):
@@ -164,11 +151,9 @@ def open_torque(motor, a, command):
     return clipped(command, motor[a, ka.I_MAX])
 
 
-for _law in (at_current_limit, clipped, dc_balance, dc_block, dc_command, dc_torque, open_torque):
-    internal_kernel(_law)
-for _law in (servo_segment, servo_circuit_on, servo_circuit, servo_block_on, servo_block):
-    internal_kernel(_law)
-for _law in (servo_command, servo_drag, servo_torque):
+_DC_LAWS = clipped, dc_balance, dc_block, dc_command, dc_torque, open_torque
+_SERVO_LAWS = servo_segment, servo_circuit_on, servo_circuit, servo_block_on, servo_block
+for _law in (*_DC_LAWS, *_SERVO_LAWS, servo_command, servo_drag, servo_torque):
     internal_kernel(_law)
 # Not inlined: few motors use it, and its product K_m v would be shared with the balance, whose last bits would change.
 noinline_kernel(within_current)
@@ -257,9 +242,8 @@ def drive(drives: DriveArrays, reference: ReferenceArrays, t, y, layout: StateLa
     for a in range(na):
         j, kind = table[a, ka.DRIVEN], table[a, ka.DRIVE_KIND]
         v = joints[j, ka.QD]
-        asked = drives.input[a, ka.COMMAND] if table[a, ka.SAMPLED] else command(drives, ws, a)
+        asked = asked_of(drives, reference, t, ws, a)
         if kind == ka.DC_MOTOR:
-            asked = fed_forward(reference.voltage, reference.grid, t, a, asked)
             drive_dc(drives, asked, y[layout.current + table[a, ka.CIRCUIT]], ws, a)
         elif kind == ka.POSITION_SERVO:
             mode = drives.table[a, ka.SERVO_MODE]
@@ -271,9 +255,12 @@ def drive(drives: DriveArrays, reference: ReferenceArrays, t, y, layout: StateLa
             joints[j, ka.APPLIED] += motors[a, ka.CURRENT]
 
 
-@internal_kernel
+@kernel
 def take_commands(drives: DriveArrays, reference: ReferenceArrays, t, ws: Workspace):
-    """Take the commands of all sampled drives at a tick, at the state in ``ws.joints``; they are held from now on."""
+    """Take the commands of all sampled drives at a tick, at the state in ``ws.joints``; they are held from now on.
+
+    The caller may have put measured joint states there.
+    """
     evaluate_reference(drives, reference, t, ws)
     for a in range(ws.motors.shape[0]):
         if drives.table[a, ka.SAMPLED] == ka.AT_TICKS:
@@ -281,40 +268,21 @@ def take_commands(drives: DriveArrays, reference: ReferenceArrays, t, ws: Worksp
             drives.input[a, ka.COMMAND] = fed_forward(reference.voltage, reference.grid, t, a, asked)
 
 
-@kernel
-def take_measured_commands(drives: DriveArrays, reference: ReferenceArrays, t, ws: Workspace):
-    """Call :func:`take_commands` after the caller has put the measured joint states into ``ws.joints``."""
-    take_commands(drives, reference, t, ws)
-
-
 @internal_kernel
-def drive_block(drives: DriveArrays, ws: Workspace, a, block):
-    """Write ∂τ/∂(q, v, i) and ∂(di/dt)/∂(q, v, i) of drive a to the row ``block``, (BLOCK_SIZE,).
-
-    Call after ``derivative``: references, voltages and states come from the workspace.
-    """
-    motors, motor, kind, mode = ws.motors, drives.motor, drives.table[a, ka.DRIVE_KIND], drives.table[a, ka.SERVO_MODE]
+def drive_block(drives: DriveArrays, ws: Workspace, a, limit, block):
+    """Write ∂τ/∂(q, v, i) and ∂(di/dt)/∂(q, v, i) of drive a at this limit to the row ``block``, (BLOCK_SIZE,)."""
+    motor, kind, mode = drives.motor, drives.table[a, ka.DRIVE_KIND], drives.table[a, ka.SERVO_MODE]
     sampled = drives.table[a, ka.SAMPLED] != 0
-    for s in range(block.shape[0]):
-        block[s] = 0.0
+    block[:] = 0.0
     if kind == ka.DC_MOTOR:
-        u, v = motors[a, ka.VOLTAGE], ws.joints[drives.table[a, ka.DRIVEN], ka.QD]
-        limited = drives.table[a, ka.CURRENT_LIMITED] != 0 and at_current_limit(motor, a, u, v)
-        fill_dc_block(motor, a, 1.0 if not sampled and abs(u) < motor[a, ka.U_MAX] else 0.0, block)
-        if limited:
+        slopes = dc_block(motor, a, 1.0 if limit == 0 and not sampled else 0.0)
+        block[ka.TORQUE_Q], block[ka.TORQUE_V], block[ka.TORQUE_I] = slopes[0], slopes[1], slopes[2]
+        block[ka.RATE_Q], block[ka.RATE_V], block[ka.RATE_I] = slopes[3], slopes[4], slopes[5]
+        if limit == 2 or limit == -2:
             block[ka.RATE_Q], block[ka.RATE_V] = 0.0, 0.0
     elif kind == ka.POSITION_SERVO:
-        asked = drives.input[a, ka.COMMAND] if sampled else command(drives, ws, a)
         v = ws.joints[drives.table[a, ka.DRIVEN], ka.QD]
-        block[ka.TORQUE_Q], block[ka.TORQUE_V] = servo_block(motor, a, mode, sampled, asked, v)
-
-
-@internal_kernel
-def fill_dc_block(motor, a, follows, block):
-    """Write :func:`dc_block` to the row ``block``."""
-    slopes = dc_block(motor, a, follows)
-    block[ka.TORQUE_Q], block[ka.TORQUE_V], block[ka.TORQUE_I] = slopes[0], slopes[1], slopes[2]
-    block[ka.RATE_Q], block[ka.RATE_V], block[ka.RATE_I] = slopes[3], slopes[4], slopes[5]
+        block[ka.TORQUE_Q], block[ka.TORQUE_V] = servo_block_on(motor, a, mode, limit, sampled, v)
 
 
 @internal_kernel
@@ -359,9 +327,8 @@ def drive_on_segments(
     evaluate_reference(drives, reference, t, ws)
     for a in range(motors.shape[0]):
         j, kind, mode, limit = table[a, ka.DRIVEN], table[a, ka.DRIVE_KIND], table[a, ka.SERVO_MODE], segment[a]
-        v, asked, sampled = joints[j, ka.QD], asked_of(drives, reference, t, ws, a), table[a, ka.SAMPLED] != 0
-        for s in range(linear.shape[1]):
-            linear[a, s] = 0.0
+        v, asked = joints[j, ka.QD], asked_of(drives, reference, t, ws, a)
+        drive_block(drives, ws, a, limit, linear[a])
         if kind == ka.DC_MOTOR:
             i, u = y[layout.current + table[a, ka.CIRCUIT]], asked
             if limit == 1 or limit == -1:
@@ -371,14 +338,10 @@ def drive_on_segments(
             motors[a, ka.CURRENT], motors[a, ka.VOLTAGE] = i, u
             motors[a, ka.DIDT] = dc_balance(motor, a, u, v, i) / motor[a, ka.INDUCTANCE]
             joints[j, ka.APPLIED] += dc_torque(motor, a, i)
-            fill_dc_block(motor, a, 1.0 if limit == 0 and not sampled else 0.0, linear[a])
-            if limit == 2 or limit == -2:
-                linear[a, ka.RATE_Q], linear[a, ka.RATE_V] = 0.0, 0.0
         elif kind == ka.POSITION_SERVO:
             motors[a, ka.VOLTAGE], motors[a, ka.CURRENT] = servo_circuit_on(motor, a, mode, limit, asked, v)
             motors[a, ka.DRAG] = servo_drag(motor, a, mode, v)
             joints[j, ka.APPLIED] += motor[a, ka.K_M] * motors[a, ka.CURRENT] - motors[a, ka.DRAG]
-            linear[a, ka.TORQUE_Q], linear[a, ka.TORQUE_V] = servo_block_on(motor, a, mode, limit, sampled, v)
         else:
             motors[a, ka.VOLTAGE], motors[a, ka.CURRENT] = v, open_torque(motor, a, asked)
             joints[j, ka.APPLIED] += motors[a, ka.CURRENT]

@@ -237,6 +237,17 @@ def add_row_forces(model: ModelArrays, ws: Workspace):
             i = tree[i, ka.PARENT]
 
 
+@internal_kernel
+def row_mobilities(ws: Workspace, W):
+    """Write the symmetric J M⁻¹ Jᵀ of the active rows to W, from their columns: the changes of rates by impulses."""
+    column, p = ws.column, ws.counts[ka.ROWS]
+    for r in range(p):
+        for s in range(p):
+            W[r, s] = 0.0
+            for i in range(ws.joints.shape[0]):
+                W[r, s] += column[i, 1 + 2 * r] * column[i, 1 + 2 * s] * ws.links[i, ka.INVERSE_D]
+
+
 @inline_kernel
 def sweep_accelerations(model: ModelArrays, ws: Workspace, onto):
     """Compute vdot = (M + J_m)⁻¹ b from the eliminated b in ``ws.column[:, 0]``, in a forward sweep. F is scratch.
@@ -267,6 +278,16 @@ def accelerate(model: ModelArrays, ws: Workspace):
 def change_accelerations(model: ModelArrays, ws: Workspace):
     """Add (M + J_m)⁻¹ b to vdot, see :func:`sweep_accelerations`."""
     sweep_accelerations(model, ws, True)
+
+
+@internal_kernel
+def accelerate_by_impulses(model: ModelArrays, ws: Workspace, f):
+    """Set vdot to the change of rates by impulses f along the active rows, M⁻¹ Jᵀ f."""
+    for i in range(ws.joints.shape[0]):
+        ws.column[i, 0] = 0.0
+        for r in range(ws.counts[ka.ROWS]):
+            ws.column[i, 0] += f[r] * ws.column[i, 1 + 2 * r]
+    accelerate(model, ws)
 
 
 @kernel

@@ -49,6 +49,7 @@ from dynsim.dynamics.tree.spatial import (
     transform,
     turn_z,
     vector,
+    wrench_at,
 )
 from dynsim.jit.kernel import internal_kernel, kernel, noinline_kernel
 
@@ -132,19 +133,9 @@ def row_motion(model: ModelArrays, ws: Workspace, i, B, p):
     elif kind == ka.RIGHT_WHEEL:
         rate, ahead = model.body[i - 1, ka.PARAMETER], model.body[i, ka.PARAMETER]
         s, l = times_number(third_axis(B), rate), times_number(first_axis(B), ahead)
-    # As a motion at the world origin.
-    return (
-        B,
-        p,
-        (
-            s[0],
-            s[1],
-            s[2],
-            l[0] + p[1] * s[2] - p[2] * s[1],
-            l[1] + p[2] * s[0] - p[0] * s[2],
-            l[2] + p[0] * s[1] - p[1] * s[0],
-        ),
-    )
+    # As a motion at the world origin: its linear part is l + p × s, as the moment of a wrench.
+    moment = wrench_at(p, s, l)
+    return B, p, (s[0], s[1], s[2], moment[0], moment[1], moment[2])
 
 
 @internal_kernel
@@ -217,33 +208,6 @@ def quaternion_turn(w, x, y, z, dw, dx, dy, dz):
     return w * dx - x * dw - y * dz + z * dy, w * dy - y * dw - z * dx + x * dz, w * dz - z * dw - x * dy + y * dx
 
 
-@noinline_kernel
-def position_rates(model: ModelArrays, ws: Workspace, dy, start):
-    """Write q̇ = N(q) v to dy[start:]. Ball: ½ q ∘ (0, ω) with ω in the body; rolling: V (cos ψ, sin ψ), ω.
-
-    Wheels: their own rates, and V = (r/2)(left + right) along the heading as for a rolling base.
-    """
-    tree, joints = model.tree, ws.joints
-    for i in range(tree.shape[0]):
-        k, kind = start + tree[i, ka.POSITION_INDEX], tree[i, ka.KIND]
-        if kind == ka.BALL_X:
-            w, x, y, z = joints[i, ka.Q], joints[i, ka.EXTRA], joints[i + 1, ka.Q], joints[i + 2, ka.Q]
-            rate = quaternion_rate(w, x, y, z, joints[i, ka.QD], joints[i + 1, ka.QD], joints[i + 2, ka.QD])
-            for s in range(4):
-                dy[k + s] = rate[s]
-        elif kind == ka.ROLL:
-            dy[k] = joints[i, ka.QD] * ws.trig[1, i + 1]
-            dy[k + 1] = joints[i, ka.QD] * ws.trig[0, i + 1]
-        elif kind == ka.LEFT_WHEEL:
-            heading = model.body[i, ka.PARAMETER] * (joints[i + 1, ka.Q] - joints[i, ka.Q])
-            speed = model.body[i + 1, ka.PARAMETER] * (joints[i, ka.QD] + joints[i + 1, ka.QD])
-            dy[k], dy[k + 1] = joints[i, ka.QD], joints[i + 1, ka.QD]
-            s, c = sine_cosine_of(heading)
-            dy[k + 2], dy[k + 3] = speed * c, speed * s
-        elif kind != ka.BALL_Y and kind != ka.BALL_Z and kind != ka.RIGHT_WHEEL:
-            dy[k] = joints[i, ka.QD]
-
-
 @internal_kernel
 def displace(model: ModelArrays, ws: Workspace, y, start):
     """Move the positions y[start:] by the small displacement in the QDD column, taken as velocities for a unit time."""
@@ -310,9 +274,13 @@ def position_error(model: ModelArrays, y, y_new, error, start, rtol, atol):
     return total, count
 
 
-@internal_kernel
+@noinline_kernel
 def positions_along(model: ModelArrays, y, start, u, out):
-    """Add N(q) u to out[start:], with positions y[start:] and rates u (n,); both may be complex."""
+    """Add q̇ = N(q) u to out[start:], with positions y[start:] and rates u (n,); both may be complex.
+
+    Ball: ½ q ∘ (0, ω) with ω in the body; rolling: V (cos ψ, sin ψ), ω. Wheels: their own rates, and
+    V = (r/2)(left + right) along the heading as for a rolling base.
+    """
     tree = model.tree
     for i in range(tree.shape[0]):
         k, kind = start + tree[i, ka.POSITION_INDEX], tree[i, ka.KIND]

@@ -8,7 +8,7 @@ import numpy as np
 
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.tables import ModelArrays, Workspace
-from dynsim.dynamics.tree.spatial import dot, rotate, rotation, six, transform, vector, wrench_at
+from dynsim.dynamics.tree.spatial import along, dot, rotate, rotation, six, transform, vector, wrench_at
 from dynsim.jit.kernel import internal_kernel, noinline_kernel
 
 # LoadArrays.table, int
@@ -63,16 +63,7 @@ def load_wrench(loads: LoadArrays, k, t, ws: Workspace):
     segment, at = segment_start(loads, k, t)
     if segment >= 0:
         x, c = at - data[segment], segment + 1
-        force = (
-            force[0] + cubic(data, c, x),
-            force[1] + cubic(data, c + 4, x),
-            force[2] + cubic(data, c + 8, x),
-        )
-        moment = (
-            moment[0] + cubic(data, c + 12, x),
-            moment[1] + cubic(data, c + 16, x),
-            moment[2] + cubic(data, c + 20, x),
-        )
+        force, moment = along(force, cubics(data, c, x), 1.0), along(moment, cubics(data, c + 12, x), 1.0)
     R = rotation(links, i, ka.R)
     if table[k, IN_BODY] != 0:
         force, moment = rotate(R, force), rotate(R, moment)
@@ -83,6 +74,12 @@ def load_wrench(loads: LoadArrays, k, t, ws: Workspace):
 def segment_vector(data, c):
     """Return three numbers of the data from index c on."""
     return data[c], data[c + 1], data[c + 2]
+
+
+@internal_kernel
+def cubics(data, c, x):
+    """Evaluate three cubic polynomials in x with coefficients from index c on."""
+    return cubic(data, c, x), cubic(data, c + 4, x), cubic(data, c + 8, x)
 
 
 @internal_kernel

@@ -23,6 +23,7 @@ from dynsim.dynamics.tree.loads import LINK as LOAD_LINK
 from dynsim.dynamics.tree.loads import LoadArrays, load_wrench
 from dynsim.dynamics.tree.spatial import (
     ZERO_SIX,
+    along,
     cross,
     minus_scaled,
     plus,
@@ -116,14 +117,8 @@ def ground_reaction(model: ModelArrays, loads: LoadArrays, t, ws: Workspace, sup
     turning, force = cross(w, axle), (W[3], W[4], W[5])
     at_base = cross(p, force)
     # About the base, in its frame.
-    mx, my, mz = rotate_back(
-        R,
-        (
-            W[0] + rate * axle[0] + spin * turning[0] - at_base[0],
-            W[1] + rate * axle[1] + spin * turning[1] - at_base[1],
-            W[2] + rate * axle[2] + spin * turning[2] - at_base[2],
-        ),
-    )
+    moment = along(along(along((W[0], W[1], W[2]), axle, rate), turning, spin), at_base, -1.0)
+    mx, my, mz = rotate_back(R, moment)
     fx, fy, fz = rotate_back(R, force)
 
     caster = -my / base[CASTER_X]

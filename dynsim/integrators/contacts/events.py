@@ -25,7 +25,7 @@ from dynsim.dynamics.contact.delassus import (
     point_shares,
     stops_that_share,
 )
-from dynsim.dynamics.contact.rows import row_errors, set_modes
+from dynsim.dynamics.contact.rows import largest_of_rows, row_errors, set_modes, slip_speed
 from dynsim.dynamics.contact.shares import keep_shares
 from dynsim.dynamics.contact.unilateral import (
     UnilateralArrays,
@@ -37,16 +37,15 @@ from dynsim.dynamics.contact.unilateral import (
 )
 from dynsim.dynamics.derivative import System
 from dynsim.dynamics.tables import ContactArrays, ModelArrays, Workspace
-from dynsim.dynamics.tree.spatial import dot_vector, plus_scaled, point_acceleration, six, vector
+from dynsim.dynamics.tree.spatial import dot_vector, plus_scaled, point_acceleration, put_vector, six, vector
 from dynsim.integrators import run as ki
 from dynsim.integrators.contacts.impacts import (
     IMMOBILE,
     approach_without_force,
     evaluate,
-    largest_right_side,
     restore_modes,
     save_modes,
-    slip_speed,
+    take_modes,
     watch_unpressed,
 )
 from dynsim.integrators.contacts.modes import (
@@ -172,8 +171,7 @@ def release_joint(system: System, ws: Workspace, run: Run):
     unilateral.dry_table[k, ku.DRY_HOLDS] = 0
     for j in range(mode.shape[0]):
         mode[j, ku.WANTED] = ws.active[j, ka.MODE]
-    set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, ku.WANTED])
-    evaluate(system, ws, run)
+    take_modes(system, ws, run)
     project_level(system, ws, y, 0)
     y[layout.loss + kst.IMPACT_LOSS] += project_level(system, ws, y, 1)
     unilateral.dry[k, ku.DRY_SIDE] = 1.0 if y[layout.v + unilateral.dry_table[k, ku.DRY_JOINT]] > 0.0 else -1.0
@@ -185,6 +183,8 @@ NORMAL_GUARD, SLIP_GUARD, STOP_GUARD, DRY_GUARD = 10, 11, 12, 13
 # Log entries of a candidate, of a stop, and (slip only) of a joint with dry friction.
 LANDING, LIFT_OFF, SLIP_START, SLIP_STOP, BOUNCE, CHATTERS, STOP_HIT, STOP_LEFT = 0, 1, 2, 3, 4, 5, 6, 7
 LOG_KINDS = 8
+# Columns of the tally that count landings, lift-offs, starts of slip and bounces.
+COUNTERS = (ku.LANDINGS, ku.LIFT_OFFS, ku.SLIP_STARTS, -1, ku.BOUNCES)
 
 # Run.gaps: gap, its rate, normal and position of a candidate at the start of the step, its slip along REFERENCE and the
 # rate of that slip.
@@ -214,10 +214,9 @@ def contact_guard(contacts: ContactArrays, unilateral: UnilateralArrays | None, 
     """Return the value of a guard of the unilateral law, right after ``derivative``."""
     if unilateral is None:  # resolved at compile time
         return 1.0
-    best, split = unilateral.number[ku.BEST_MARGIN], unilateral.number[ku.SPLIT] == 1.0
     if kind == STOP_GUARD:
         if unilateral.stop_table[k, ku.STOP_CLOSED] == 1:
-            return best if split and best > 0.0 else unilateral.stop[k, ku.STOP_FORCE]
+            return best_margin_or(unilateral, unilateral.stop[k, ku.STOP_FORCE])
         return stop_gap(unilateral, ws, k) + unilateral.stop[k, ku.HIT_AT]
     if kind == DRY_GUARD:
         if unilateral.dry_table[k, ku.DRY_HOLDS] == 0:
@@ -225,7 +224,8 @@ def contact_guard(contacts: ContactArrays, unilateral: UnilateralArrays | None, 
             if dry_rests(unilateral, k):
                 return unilateral.number[ku.CREEP] - abs(rate)
             return unilateral.dry[k, ku.DRY_SIDE] * rate + unilateral.dry[k, ku.DRY_HEADWAY] + BACKWARD
-        return min(force_margin(unilateral, ws, k), dry_bound(unilateral, k) * rest_margin(unilateral, ws, k))
+        force_margin = best_margin_or(unilateral, dry_margin(unilateral, ws, k))
+        return min(force_margin, dry_bound(unilateral, k) * rest_margin(unilateral, ws, k))
     mode = ws.active[k, ka.MODE]
     if kind == NORMAL_GUARD:
         if mode == ka.STICKING and unilateral.number[ku.SPLIT] == 1.0 and normal_is_open(unilateral, ws, k):
@@ -241,9 +241,7 @@ def contact_guard(contacts: ContactArrays, unilateral: UnilateralArrays | None, 
     if mode == ka.STICKING:
         # Dependent rows whose split of least norm is outside the cones: the forces are the smallest inside, lie on a
         # cone, and do not show the remaining margin. If no split fits, the best one shows the contacts at the limit.
-        if split and best > 0.0:
-            return best
-        return margin(contacts, unilateral, ws, k)
+        return best_margin_or(unilateral, margin(contacts, unilateral, ws, k))
     return 1.0
 
 
@@ -259,21 +257,22 @@ def rest_margin(unilateral: UnilateralArrays, ws: Workspace, k):
     """
     if unilateral.number[ku.REDUNDANT] == 0.0:
         return 1.0
-    limit = max(SLIP_TOLERANCE * max(largest_right_side(ws), IMMOBILE), 2.0 * unilateral.dry[k, ku.DRY_LEFT])
+    limit = max(SLIP_TOLERANCE * max(largest_of_rows(ws, ka.RHS), IMMOBILE), 2.0 * unilateral.dry[k, ku.DRY_LEFT])
     return min(1.0 - acceleration_left(unilateral, ws, k) / limit, agreement_margin(unilateral, ws, k))
 
 
 @internal_kernel
-def force_margin(unilateral: UnilateralArrays, ws: Workspace, k):
-    """Return the force margin of held dry-friction joint k, or of the best split of dependent rows [N m or N]."""
+def best_margin_or(unilateral: UnilateralArrays, own):
+    """Return the margin of the best split of dependent rows, or a row's ``own`` margin without such a split."""
     best = unilateral.number[ku.BEST_MARGIN]
-    return best if unilateral.number[ku.SPLIT] == 1.0 and best > 0.0 else dry_margin(unilateral, ws, k)
+    return best if unilateral.number[ku.SPLIT] == 1.0 and best > 0.0 else own
 
 
 @internal_kernel
 def held_joint_accelerates(unilateral: UnilateralArrays, ws: Workspace, k):
     """True if the event of held dry-friction joint k is that it accelerates, not that its force is at the bound."""
-    return dry_bound(unilateral, k) * rest_margin(unilateral, ws, k) < force_margin(unilateral, ws, k)
+    force_margin = best_margin_or(unilateral, dry_margin(unilateral, ws, k))
+    return dry_bound(unilateral, k) * rest_margin(unilateral, ws, k) < force_margin
 
 
 @internal_kernel
@@ -408,11 +407,8 @@ def note_gaps(model: ModelArrays, contacts: ContactArrays, unilateral: Unilatera
         unilateral.stop[k, ku.STOP_RATE_THEN] = stop_rate(unilateral, ws, k)
     for k in range(gaps.shape[0]):
         gaps[k, GAP_THEN], gaps[k, RATE_THEN] = ws.contacts[k, ka.GAP], ws.contacts[k, ka.GAP_RATE]
-        for s in range(3):
-            gaps[k, NORMAL_THEN + s], gaps[k, POSITION_THEN + s] = (
-                ws.contacts[k, ka.NORMAL + s],
-                ws.contacts[k, ka.POSITION + s],
-            )
+        put_vector(gaps, k, NORMAL_THEN, vector(ws.contacts, k, ka.NORMAL))
+        put_vector(gaps, k, POSITION_THEN, vector(ws.contacts, k, ka.POSITION))
         if slips_along(contacts, ws, k):
             gaps[k, SLIP_THEN] = unilateral.slide[k, ku.SPEED]
             gaps[k, SLIP_RATE_THEN] = slip_rate(model, contacts, unilateral, ws, k)
@@ -464,8 +460,7 @@ def take_directions(unilateral: UnilateralArrays | None, ws: Workspace, run: Run
         along = speed * dot_vector(slide[k, ku.REFERENCE :], slide[k, ku.NEXT :]) if frozen else speed
         fast = along >= slow
         if fast or not frozen:
-            for s in range(3):
-                slide[k, ku.REFERENCE + s] = slide[k, ku.NEXT + s]
+            put_vector(slide, k, ku.REFERENCE, vector(slide, k, ku.NEXT))
         elif speed * speed > along * along + (TURNED * slow) ** 2:
             # Start from the direction of friction, see slide_direction. Slip across it relaxes: the method restarts.
             for s in range(3):
@@ -509,10 +504,7 @@ def at_limit(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Workspac
 @internal_kernel
 def split_slack(ws: Workspace):
     """Return the difference below which margins of a split count as equal [N or N m]."""
-    largest = 0.0
-    for r in range(ws.counts[ka.ROWS]):
-        largest = max(largest, abs(ws.rows[r, ka.FORCE]))
-    return SPLIT_SLACK * (1.0 + largest)
+    return SPLIT_SLACK * (1.0 + largest_of_rows(ws, ka.FORCE))
 
 
 @internal_kernel
@@ -644,17 +636,26 @@ def log(run: Run, code):
 @internal_kernel
 def log_contact(system: System, run: Run, k, kind):
     """Log and count an event of candidate k, and check for chatter."""
-    tally = system.unilateral.tally
+    log_and_count(system.unilateral, run, k, kind)
+    watch_chatter(run, system.unilateral.tally, k, ku.SETTLE, ki.CONTACT_LOG)
+
+
+@internal_kernel
+def log_and_count(unilateral: UnilateralArrays, run: Run, k, kind):
+    """Log and count an event of candidate k."""
     log(run, ki.CONTACT_LOG + LOG_KINDS * k + kind)
-    if kind == LANDING:
-        tally[k, ku.LANDINGS] += 1.0
-    elif kind == LIFT_OFF:
-        tally[k, ku.LIFT_OFFS] += 1.0
-    elif kind == SLIP_START:
-        tally[k, ku.SLIP_STARTS] += 1.0
-    elif kind == BOUNCE:
-        tally[k, ku.BOUNCES] += 1.0
-    watch_chatter(run, tally, k, ku.SETTLE, ki.CONTACT_LOG)
+    if kind != SLIP_STOP:
+        unilateral.tally[k, COUNTERS[kind]] += 1.0
+
+
+@internal_kernel
+def kind_of_change(before, now):
+    """Return the kind of event that changes one mode of a candidate to another."""
+    if before == ka.OPEN:
+        return LANDING
+    if now == ka.OPEN:
+        return LIFT_OFF
+    return SLIP_START if now == ka.SLIDING else SLIP_STOP
 
 
 @internal_kernel
@@ -694,19 +695,12 @@ def log_changes(system: System, ws: Workspace, run: Run):
     unilateral, table = system.unilateral, system.unilateral.stop_table
     for k in range(ws.contacts.shape[0]):
         before, now = unilateral.mode[k, ku.BEFORE], ws.active[k, ka.MODE]
-        if before == ka.OPEN:
-            if now != ka.OPEN:
-                log_contact(system, run, k, LANDING)
-            elif unilateral.mode[k, ku.STRUCK] == 1:
-                # It leaves from where it landed, below its surface: it must not land there again at once.
-                unilateral.slide[k, ku.LANDS_AT] = ku.AT_ROOT + max(0.0, -ws.contacts[k, ka.GAP])
-                log_contact(system, run, k, BOUNCE)
-        elif now == ka.OPEN:
-            log_contact(system, run, k, LIFT_OFF)
-        elif before == ka.STICKING and now == ka.SLIDING:
-            log_contact(system, run, k, SLIP_START)
-        elif before == ka.SLIDING and now == ka.STICKING:
-            log_contact(system, run, k, SLIP_STOP)
+        if before != now:
+            log_contact(system, run, k, kind_of_change(before, now))
+        elif now == ka.OPEN and unilateral.mode[k, ku.STRUCK] == 1:
+            # It leaves from where it landed, below its surface: it must not land there again at once.
+            unilateral.slide[k, ku.LANDS_AT] = ku.AT_ROOT + max(0.0, -ws.contacts[k, ka.GAP])
+            log_contact(system, run, k, BOUNCE)
     for k in range(table.shape[0]):
         before, closed = table[k, ku.STOP_BEFORE] == 1, table[k, ku.STOP_CLOSED] == 1
         # A joint may be driven away from its stop in the instant of its hit.

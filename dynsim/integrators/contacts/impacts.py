@@ -14,7 +14,7 @@ from dynsim.dynamics.contact.cone import steps as kc
 from dynsim.dynamics.contact.cone.steps import approach, approach_or_proximal_point, solve_cones
 from dynsim.dynamics.contact.delassus import find_splits, normal_is_open
 from dynsim.dynamics.contact.mobility import moves_along_normal
-from dynsim.dynamics.contact.rows import row_errors, set_modes
+from dynsim.dynamics.contact.rows import largest_of_rows, row_errors, set_modes, slip_speed
 from dynsim.dynamics.contact.unilateral import (
     UnilateralArrays,
     dry_rows_held,
@@ -25,8 +25,9 @@ from dynsim.dynamics.contact.unilateral import (
     stop_rate,
 )
 from dynsim.dynamics.derivative import System, derivative
+from dynsim.dynamics.linear import affine_row
 from dynsim.dynamics.tables import ContactArrays, Workspace
-from dynsim.dynamics.tree.articulated import accelerate
+from dynsim.dynamics.tree.articulated import accelerate_by_impulses
 from dynsim.integrators import run as ki
 from dynsim.integrators import run as kp
 from dynsim.integrators.run import Run, project_level
@@ -52,14 +53,6 @@ OTHER_START = 1e-6
 
 
 @internal_kernel
-def slip_speed(ws: Workspace, k):
-    """Return |v_t| of candidate k [m/s]."""
-    state = ws.contacts
-    x, y, z = state[k, ka.SLIP_VELOCITY], state[k, ka.SLIP_VELOCITY + 1], state[k, ka.SLIP_VELOCITY + 2]
-    return math.sqrt(x * x + y * y + z * z)
-
-
-@internal_kernel
 def evaluate(system: System, ws: Workspace, run: Run):
     """Evaluate the right-hand side at the present state with the present modes, and the errors of its rows."""
     derivative(system, run.clock[ki.TIME], run.y, ws, run.stage[0])
@@ -68,12 +61,10 @@ def evaluate(system: System, ws: Workspace, run: Run):
 
 
 @internal_kernel
-def largest_right_side(ws: Workspace):
-    """Return the largest right-hand side of all rows [m/s² or rad/s²]."""
-    largest = 0.0
-    for r in range(ws.counts[ka.ROWS]):
-        largest = max(largest, abs(ws.rows[r, ka.RHS]))
-    return largest
+def take_modes(system: System, ws: Workspace, run: Run):
+    """Take the modes WANTED, and evaluate the right-hand side with them."""
+    set_modes(system.contacts, system.couplings, system.unilateral, ws, system.unilateral.mode[:, ku.WANTED])
+    evaluate(system, ws, run)
 
 
 @internal_kernel
@@ -175,9 +166,7 @@ def project_down(system: System, ws: Workspace, run: Run):
     before = worst = math.inf
     for trial in range(1 + kp.PROJECTION_LIMIT):
         evaluate(system, ws, run)
-        worst = 0.0
-        for r in range(ws.counts[ka.ROWS]):
-            worst = max(worst, abs(ws.rows[r, ka.ROW_GAP]))
+        worst = largest_of_rows(ws, ka.ROW_GAP)
         # If a point is nearly immobile along its normal, steps only halve the distance to where it is fully immobile.
         if worst <= FOOT_TOLERANCE or SLOWLY * before < worst <= kp.GAP_TOLERANCE or trial == kp.PROJECTION_LIMIT:
             break
@@ -187,23 +176,44 @@ def project_down(system: System, ws: Workspace, run: Run):
 
 
 @internal_kernel
-def kind_of_joint_row(unilateral: UnilateralArrays, couplings, r):
-    """Return the kind of row r of the contact problem: coupling, dry friction or, after these, joint stop."""
-    if r < couplings:
-        return kc.BOTH_WAYS
-    return kc.BOX if r < couplings + dry_rows_held(unilateral) else kc.ONE_WAY
-
-
-@internal_kernel
 def begin_problem(unilateral: UnilateralArrays, couplings, count):
     """Write ``count`` joint rows, the first ``couplings`` of them couplings, as the first of a contact problem."""
-    index, vector = unilateral.index, unilateral.vector
+    index, vector, bounded = unilateral.index, unilateral.vector, couplings + dry_rows_held(unilateral)
     for r in range(count):
-        index[ku.KINDS, r], index[ku.TABLE_ROW, r] = kind_of_joint_row(unilateral, couplings, r), r
+        index[ku.KINDS, r] = kc.BOTH_WAYS if r < couplings else kc.BOX if r < bounded else kc.ONE_WAY
+        index[ku.TABLE_ROW, r] = r
         vector[ku.CONE_FRICTION, r], vector[ku.FIRST_PART, r], vector[ku.SECOND_PART, r] = 0.0, 0.0, 0.0
     for k in range(unilateral.dry_table.shape[0]):
         if unilateral.dry_table[k, ku.DRY_HOLDS] == 1:
             vector[ku.CONE_FRICTION, unilateral.dry_table[k, ku.DRY_ROW]] = holding_bound(unilateral, k)
+
+
+@internal_kernel
+def add_candidate(unilateral: UnilateralArrays, ws: Workspace, size, k, slides, friction):
+    """Add the rows of candidate k, without parts, to a contact problem of this size; return its new size."""
+    index, vector = unilateral.index, unilateral.vector
+    vector[ku.CONE_FRICTION, size] = friction
+    for s in range(1 if slides else ka.MOST_ROWS):
+        index[ku.KINDS, size] = kc.ONE_WAY if slides else kc.CONE if s == 0 else kc.TANGENT
+        index[ku.TABLE_ROW, size] = ws.active[k, ka.FIRST_ROW] + s
+        vector[ku.FIRST_PART, size], vector[ku.SECOND_PART, size] = 0.0, 0.0
+        size += 1
+    return size
+
+
+@internal_kernel
+def fill_problem(unilateral: UnilateralArrays, ws: Workspace, size):
+    """Write the matrix and the accelerations without forces of a contact problem; the forces start at zero."""
+    index, vector, W = unilateral.index, unilateral.vector, ws.small[0]
+    for i in range(size):
+        a = index[ku.TABLE_ROW, i]
+        vector[ku.OFFSET, i], vector[ku.SOLUTION, i] = -ws.rows[a, ka.RHS], 0.0
+        for j in range(size):
+            b = index[ku.TABLE_ROW, j]
+            value = W[a, b]
+            if vector[ku.FIRST_PART, j] != 0.0 or vector[ku.SECOND_PART, j] != 0.0:
+                value += vector[ku.FIRST_PART, j] * W[a, b + 1] + vector[ku.SECOND_PART, j] * W[a, b + 2]
+            unilateral.room[ku.PROBLEM, i, j] = value
 
 
 @internal_kernel
@@ -212,21 +222,17 @@ def gather(system: System, ws: Workspace, run: Run):
 
     Writes kinds and table rows of the rows into ``unilateral.index``; returns the number of rows.
     """
-    unilateral = system.unilateral
-    mode, index = unilateral.mode, unilateral.index
+    unilateral, mode = system.unilateral, system.unilateral.mode
     close_touching(system, ws, run)
     for k in range(mode.shape[0]):
         mode[k, ku.WANTED] = ka.STICKING if mode[k, ku.TOUCHING] == 1 else ka.OPEN
-    set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, ku.WANTED])
-    evaluate(system, ws, run)
-    p = ws.counts[ka.ROWS]
-    for r in range(p):
-        index[ku.KINDS, r] = kind_of_joint_row(unilateral, system.couplings.joint.shape[0], r)
+    take_modes(system, ws, run)
+    size = ws.counts[ka.COUPLED]
+    begin_problem(unilateral, system.couplings.joint.shape[0], size)
     for k in range(mode.shape[0]):
         if mode[k, ku.WANTED] == ka.STICKING:
-            r = ws.active[k, ka.FIRST_ROW]
-            index[ku.KINDS, r], index[ku.KINDS, r + 1], index[ku.KINDS, r + 2] = kc.CONE, kc.TANGENT, kc.TANGENT
-    return p
+            size = add_candidate(unilateral, ws, size, k, False, friction_at_rest(system, k))
+    return size
 
 
 @internal_kernel
@@ -292,9 +298,7 @@ def impulses(system: System, ws: Workspace, p, largest, share):
         return False
     f, total, turnover = vector[ku.SOLUTION], 0.0, 0.0
     for r in range(p):
-        after = rows[r, ka.ROW_RATE]
-        for s in range(p):
-            after += ws.small[0, r, s] * f[s]
+        after = affine_row(ws.small[0], f, rows[:, ka.ROW_RATE], p, r)
         # FORCE is free until the next evaluation.
         rows[r, ka.FORCE] = -0.5 * f[r] * (rows[r, ka.ROW_RATE] + after)
         total += rows[r, ka.FORCE]
@@ -332,15 +336,6 @@ def stays_or_leaves(unilateral: UnilateralArrays, k):
 
 
 @internal_kernel
-def rate_after(ws: Workspace, b, f, p, r):
-    """Return the rate of row r after impulses f."""
-    rate = b[r]
-    for s in range(p):
-        rate += ws.small[0, r, s] * f[s]
-    return rate
-
-
-@internal_kernel
 def look_for_other(system: System, ws: Workspace, run: Run, p, largest):
     """Count points that were closed and leave in the impact if another solution keeps them; SOLUTION is unchanged.
 
@@ -355,7 +350,7 @@ def look_for_other(system: System, ws: Workspace, run: Run, p, largest):
     for k in range(tally.shape[0]):
         if stays_or_leaves(unilateral, k):
             r = ws.active[k, ka.FIRST_ROW]
-            if mu[r] > 0.0 and rate_after(ws, b, first, p, r) > tally[k, ku.SETTLE]:
+            if mu[r] > 0.0 and affine_row(ws.small[0], first, b, p, r) > tally[k, ku.SETTLE]:
                 mobility = max(ws.small[0, r, r], ws.small[0, r + 1, r + 1], ws.small[0, r + 2, r + 2])
                 f[r], any_leaves = OTHER_START * largest / max(mobility, 1e-300), True
     if any_leaves:
@@ -365,8 +360,8 @@ def look_for_other(system: System, ws: Workspace, run: Run, p, largest):
             for k in range(tally.shape[0]):
                 if stays_or_leaves(unilateral, k):
                     r = ws.active[k, ka.FIRST_ROW]
-                    rate = rate_after(ws, b, first, p, r)
-                    if mu[r] > 0.0 and rate > tally[k, ku.SETTLE] and rate_after(ws, b, f, p, r) < 0.5 * rate:
+                    rate = affine_row(ws.small[0], first, b, p, r)
+                    if mu[r] > 0.0 and rate > tally[k, ku.SETTLE] and affine_row(ws.small[0], f, b, p, r) < 0.5 * rate:
                         if tally[k, ku.OPEN_IMPACTS] == 0.0:
                             tally[k, ku.OPEN_SINCE] = run.clock[ki.TIME]
                         tally[k, ku.OPEN_IMPACTS] += 1.0
@@ -381,11 +376,9 @@ def impact(system: System, ws: Workspace, run: Run):
     Then v += M⁻¹ Jᵀ P, and the energy −½ P·(J v₋ + J v₊) is booked as impact loss.
     """
     unilateral, y, layout = system.unilateral, run.y, system.layout
-    vector, mode, rows, column = unilateral.vector, unilateral.mode, ws.rows, ws.column
+    vector, mode, rows = unilateral.vector, unilateral.mode, ws.rows
     p = gather(system, ws, run)
-    largest = 0.0
-    for r in range(p):
-        largest = max(largest, abs(rows[r, ka.ROW_RATE]))
+    largest = largest_of_rows(ws, ka.ROW_RATE)
     # Newton's restitution may contradict friction: a wedged point cannot leave, and some impacts would gain energy.
     # Such impacts are solved without restitution: this problem always has a solution, and a loss. The same applies to
     # points that throw each other back and forth at one instant: impacts that accumulate end in contact.
@@ -395,11 +388,7 @@ def impact(system: System, ws: Workspace, run: Run):
         return
     look_for_other(system, ws, run, p, largest)
     f = vector[ku.SOLUTION]
-    for i in range(ws.joints.shape[0]):
-        column[i, 0] = 0.0
-        for r in range(p):
-            column[i, 0] += f[r] * column[i, 1 + 2 * r]
-    accelerate(system.model, ws)
+    accelerate_by_impulses(system.model, ws, f)
     for i in range(ws.joints.shape[0]):
         y[layout.v + i] += ws.joints[i, ka.QDD]
     for k in range(mode.shape[0]):
@@ -426,18 +415,9 @@ def impact(system: System, ws: Workspace, run: Run):
 @noinline_kernel
 def save_modes(unilateral: UnilateralArrays, ws: Workspace, run: Run):
     """Save modes, their tables and the state between two steps, when ``y_new`` is free."""
-    kept, mode = unilateral.kept, unilateral.mode
-    for k in range(mode.shape[0]):
-        mode[k, ku.WANTED] = ws.active[k, ka.MODE]
-    at = write(kept, 0, mode)
-    at = write(kept, at, unilateral.dry_table)
-    at = write(kept, at, unilateral.stop_table)
-    at = write(kept, at, unilateral.slide)
-    at = write(kept, at, unilateral.tally)
-    at = write(kept, at, unilateral.dry)
-    at = write(kept, at, unilateral.stop)
-    at = write_numbers(kept, at, unilateral.number)
-    write_numbers(kept, at, unilateral.shares)
+    for k in range(unilateral.mode.shape[0]):
+        unilateral.mode[k, ku.WANTED] = ws.active[k, ka.MODE]
+    transfer_tables(unilateral, True)
     for i in range(run.y.shape[0]):
         run.y_new[i] = run.y[i]
 
@@ -446,59 +426,38 @@ def save_modes(unilateral: UnilateralArrays, ws: Workspace, run: Run):
 def restore_modes(system: System, ws: Workspace, run: Run):
     """Restore modes, tables and state as saved by :func:`save_modes`, and evaluate the right-hand side there."""
     unilateral = system.unilateral
-    kept, mode = unilateral.kept, unilateral.mode
-    at = read(kept, 0, mode)
-    at = read(kept, at, unilateral.dry_table)
-    at = read(kept, at, unilateral.stop_table)
-    at = read(kept, at, unilateral.slide)
-    at = read(kept, at, unilateral.tally)
-    at = read(kept, at, unilateral.dry)
-    at = read(kept, at, unilateral.stop)
-    at = read_numbers(kept, at, unilateral.number)
-    read_numbers(kept, at, unilateral.shares)
+    transfer_tables(unilateral, False)
     for i in range(run.y.shape[0]):
         run.y[i] = run.y_new[i]
     # First with the present rows, for the positions of points, from which the earlier rows start.
     evaluate(system, ws, run)
-    set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, ku.WANTED])
-    evaluate(system, ws, run)
+    take_modes(system, ws, run)
     run.count[ki.STATUS] = ki.RUNNING
 
 
 @internal_kernel
-def write(kept, at, table):
-    """Write a table into ``kept`` from index ``at``; return the next index."""
+def transfer_tables(unilateral: UnilateralArrays, store):
+    """Copy all tables that a choice of modes writes to ``kept``, or back."""
+    kept, at, number, shares = unilateral.kept, 0, unilateral.number, unilateral.shares
+    for table in (unilateral.mode, unilateral.dry_table, unilateral.stop_table):
+        at = transfer(kept, at, table, store)
+    for numbers in (unilateral.slide, unilateral.tally, unilateral.dry, unilateral.stop):
+        at = transfer(kept, at, numbers, store)
+    at = transfer(kept, at, number.reshape((1, number.shape[0])), store)
+    transfer(kept, at, shares.reshape((1, shares.shape[0])), store)
+
+
+@internal_kernel
+def transfer(kept, at, table, store):
+    """Copy a table of floats or integers to ``kept`` from index ``at`` on, or back; return the next index."""
     for i in range(table.shape[0]):
         for j in range(table.shape[1]):
-            kept[at] = table[i, j]
+            if store:
+                kept[at] = table[i, j]
+            else:
+                table[i, j] = kept[at]
             at += 1
     return at
-
-
-@internal_kernel
-def read(kept, at, table):
-    """Read a table of floats or integers from ``kept``; return the next index."""
-    for i in range(table.shape[0]):
-        for j in range(table.shape[1]):
-            table[i, j] = kept[at]
-            at += 1
-    return at
-
-
-@internal_kernel
-def write_numbers(kept, at, numbers):
-    """Write numbers into ``kept`` from index ``at``; return the next index."""
-    for i in range(numbers.shape[0]):
-        kept[at + i] = numbers[i]
-    return at + numbers.shape[0]
-
-
-@internal_kernel
-def read_numbers(kept, at, numbers):
-    """Read numbers from ``kept``; return the next index."""
-    for i in range(numbers.shape[0]):
-        numbers[i] = kept[at + i]
-    return at + numbers.shape[0]
 
 
 # Acceleration of a sticking point without its own force: shows whether anything presses it against its surface.
@@ -522,21 +481,12 @@ def approach_without_force(contacts: ContactArrays, unilateral: UnilateralArrays
     size = ws.counts[ka.COUPLED]
     begin_problem(unilateral, rows_of_couplings(unilateral, ws), size)
     for j in range(ws.contacts.shape[0]):
-        mode, r = active[j, ka.MODE], active[j, ka.FIRST_ROW]
-        if j == k or mode == ka.OPEN:
-            continue
-        vector[ku.CONE_FRICTION, size] = unilateral.number[ku.HOLDING] * contacts.law[j, ka.STATIC]
-        for s in range(3 if mode == ka.STICKING else 1):
-            index[ku.KINDS, size] = kc.ONE_WAY if mode == ka.SLIDING else kc.CONE if s == 0 else kc.TANGENT
-            index[ku.TABLE_ROW, size] = r + s
-            size += 1
-    largest, first = largest_right_side(ws), active[k, ka.FIRST_ROW]
-    for i in range(size):
-        a = index[ku.TABLE_ROW, i]
-        vector[ku.OFFSET, i], vector[ku.SOLUTION, i] = -ws.rows[a, ka.RHS], 0.0
-        # Columns of sliding points already include their friction in W.
-        for j in range(size):
-            unilateral.room[ku.PROBLEM, i, j] = W[a, index[ku.TABLE_ROW, j]]
+        if j != k and active[j, ka.MODE] != ka.OPEN:
+            # Columns of sliding points already include their friction in W.
+            friction = unilateral.number[ku.HOLDING] * contacts.law[j, ka.STATIC]
+            size = add_candidate(unilateral, ws, size, j, active[j, ka.MODE] == ka.SLIDING, friction)
+    largest, first = largest_of_rows(ws, ka.RHS), active[k, ka.FIRST_ROW]
+    fill_problem(unilateral, ws, size)
     if size > 0 and not solve_problem(unilateral, unilateral.room[ku.PROBLEM], size, largest, STARTS):
         return 1.0
     away = -ws.rows[first, ka.RHS]
@@ -545,20 +495,15 @@ def approach_without_force(contacts: ContactArrays, unilateral: UnilateralArrays
     return NO_ACCELERATION * largest - away
 
 
-@internal_kernel
+@noinline_kernel
 def watch_unpressed(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Workspace, h):
     """Add an accepted step to the time of each point that sticks although nothing presses it.
 
     This applies only if the split of least norm lies in all cones: equally stiff supports have this split, and hold the
     point. Otherwise the guard of the normal force lets the point leave.
     """
-    if unilateral.number[ku.REDUNDANT] == 1.0 and unilateral.number[ku.SPLIT] == 0.0 and ws.counts[ka.STUCK] > 0:
-        add_unpressed(contacts, unilateral, ws, h)
-
-
-@noinline_kernel
-def add_unpressed(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Workspace, h):
-    """Do the work of :func:`watch_unpressed` for rows that depend on each other."""
+    if unilateral.number[ku.REDUNDANT] == 0.0 or unilateral.number[ku.SPLIT] == 1.0 or ws.counts[ka.STUCK] == 0:
+        return
     find_splits(unilateral, ws)
     for k in range(ws.contacts.shape[0]):
         is_open = ws.active[k, ka.MODE] == ka.STICKING and normal_is_open(unilateral, ws, k)

@@ -18,8 +18,8 @@ from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.cone import steps as kc
 from dynsim.dynamics.contact.delassus import dry_margin, find_splits, margin, point_shares
-from dynsim.dynamics.contact.rows import set_modes
-from dynsim.dynamics.contact.shares import even_out, share_slot, some_slide
+from dynsim.dynamics.contact.rows import largest_of_rows, set_modes, slip_speed
+from dynsim.dynamics.contact.shares import even_out, share_slot, some_slide, write_shares
 from dynsim.dynamics.contact.unilateral import (
     UnilateralArrays,
     dry_bound,
@@ -31,23 +31,25 @@ from dynsim.dynamics.contact.unilateral import (
     stop_rate,
 )
 from dynsim.dynamics.derivative import System
+from dynsim.dynamics.linear import affine_row
 from dynsim.dynamics.tables import Workspace
 from dynsim.dynamics.tree.spatial import vector
 from dynsim.integrators import run as ki
 from dynsim.integrators.contacts.impacts import (
     FORCE_TOLERANCE,
     STRIKE,
+    add_candidate,
     begin_problem,
     evaluate,
+    fill_problem,
     find_touching,
     friction_at_rest,
     gather,
     impact,
     keep_touching,
-    largest_right_side,
-    slip_speed,
     solve_problem,
     strike_limit,
+    take_modes,
 )
 from dynsim.integrators.contacts.resting import projection_residual, release_dependent_joints
 from dynsim.integrators.run import RATE_TOLERANCE, Run, project_level
@@ -256,12 +258,8 @@ def note_forces(system: System, ws: Workspace):
     """
     unilateral, rows, state = system.unilateral, ws.rows, ws.contacts
     shares, first = unilateral.shares, system.couplings.joint.shape[0] + unilateral.stop_table.shape[0]
-    for slot in range(shares.shape[0]):
-        shares[slot] = 0.0
-    for r in range(ws.counts[ka.ROWS]):
-        slot = share_slot(unilateral, ws, r)
-        if slot >= 0:
-            shares[slot] = rows[r, ka.FORCE]
+    shares[:] = 0.0
+    write_shares(unilateral, ws)
     for k in range(unilateral.dry_table.shape[0]):
         if unilateral.dry_table[k, ku.DRY_HOLDS] == 0:
             shares[first + k] = -unilateral.dry[k, ku.DRY_SIDE] * dry_bound(unilateral, k)
@@ -309,20 +307,19 @@ def choose_modes(system: System, ws: Workspace, run: Run, rule):
     hold_slow_joints(unilateral, ws, rule)
     if rule == HOLD_RESTING:
         release_moving_joints(unilateral, ws)
-    p = gather(system, ws, run)
-    largest = largest_right_side(ws)
+    gather(system, ws, run)
+    largest = largest_of_rows(ws, ka.RHS)
     least = 2.0 * unilateral.number[ku.SLOW]
-    solved, size = solve_accelerations(system, ws, run, p, largest, least, True)
+    solved, size = solve_accelerations(system, ws, run, largest, least, True)
     if not solved:
         least, run.count[ki.STATUS] = max(least, NEARLY_AT_REST), ki.RUNNING
-        solved, size = solve_accelerations(system, ws, run, p, largest, least, False)
+        solved, size = solve_accelerations(system, ws, run, largest, least, False)
     if not solved:
         if run.count[ki.STATUS] != ki.FORCES_REVERSED:
             run.count[ki.STATUS] = ki.NO_CONTACT_FORCES
         run.clock[ki.NOT_UNIQUE] = run.clock[ki.TIME]
         # Leave the rows that contradict the law in the workspace, for diagnosis.
-        set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, ku.WANTED])
-        evaluate(system, ws, run)
+        take_modes(system, ws, run)
         return True
     take_solution(system, ws, size, largest)
     margin = release_dependent_joints(system, ws, size)
@@ -393,7 +390,7 @@ def choose_modes(system: System, ws: Workspace, run: Run, rule):
 
 
 @noinline_kernel
-def solve_accelerations(system: System, ws: Workspace, run: Run, p, largest, least, slides_on):
+def solve_accelerations(system: System, ws: Workspace, run: Run, largest, least, slides_on):
     """Solve for forces that agree with the law; a point that slips slower than ``least`` [m/s] counts as at rest.
 
     With ``slides_on``, a point that already slides does not count as at rest, see :func:`keeps_sliding`.
@@ -413,7 +410,7 @@ def solve_accelerations(system: System, ws: Workspace, run: Run, p, largest, lea
             mode[k, ku.KINETIC_ONLY] = 1 if mode[k, ku.KINETIC_ONLY] == 1 and friction_drops(system, k) else 0
     # If static friction drops to a smaller kinetic value, the forces of the other contacts change.
     for _ in range(1 + mode.shape[0]):
-        size = reduce_rows(system, ws, run, p)
+        size = reduce_rows(system, ws, run)
         if run.count[ki.STATUS] == ki.FORCES_REVERSED:
             return False, size
         if not solve_problem(unilateral, unilateral.room[ku.PROBLEM], size, largest, 0):
@@ -580,45 +577,27 @@ def slip_on(unilateral: UnilateralArrays, ws: Workspace, k, least):
 
 
 @internal_kernel
-def reduce_rows(system: System, ws: Workspace, run: Run, p):
+def reduce_rows(system: System, ws: Workspace, run: Run):
     """Write the problem of accelerations into ``unilateral``, with only normal rows of sliding points; return its size.
 
     Column of such a row: W (n − μ t). Sets STATUS if a row's own force would accelerate it against itself (Painlevé).
     """
     unilateral, W = system.unilateral, ws.small[0]
     index, vector, mode = unilateral.index, unilateral.vector, unilateral.mode
-    size, first = 0, p
-    for k in range(mode.shape[0] - 1, -1, -1):
-        if mode[k, ku.TOUCHING] == 1:
-            first = ws.active[k, ka.FIRST_ROW]
-    begin_problem(unilateral, system.couplings.joint.shape[0], first)
-    size = first
+    size = ws.counts[ka.COUPLED]
+    begin_problem(unilateral, system.couplings.joint.shape[0], size)
     for k in range(mode.shape[0]):
         if mode[k, ku.TOUCHING] == 0:
             continue
-        r = ws.active[k, ka.FIRST_ROW]
-        index[ku.TABLE_ROW, size], vector[ku.FIRST_PART, size], vector[ku.SECOND_PART, size] = r, 0.0, 0.0
-        if mode[k, ku.WANTED] == ka.SLIDING:
-            vector[ku.FIRST_PART, size], vector[ku.SECOND_PART, size] = sliding_parts(system, ws, k)
-            index[ku.KINDS, size] = kc.ONE_WAY
-            size += 1
-        else:
-            vector[ku.CONE_FRICTION, size] = friction_at_rest(system, k)
-            for s in range(3):
-                index[ku.KINDS, size] = kc.CONE if s == 0 else kc.TANGENT
-                index[ku.TABLE_ROW, size], vector[ku.FIRST_PART, size], vector[ku.SECOND_PART, size] = r + s, 0.0, 0.0
-                size += 1
+        slides, row = mode[k, ku.WANTED] == ka.SLIDING, size
+        size = add_candidate(unilateral, ws, size, k, slides, friction_at_rest(system, k))
+        if slides:
+            vector[ku.FIRST_PART, row], vector[ku.SECOND_PART, row] = sliding_parts(system, ws, k)
+    fill_problem(unilateral, ws, size)
     for i in range(size):
         a = index[ku.TABLE_ROW, i]
-        vector[ku.OFFSET, i], vector[ku.SOLUTION, i] = -ws.rows[a, ka.RHS], 0.0
         if unilateral.number[ku.SEARCH] == ku.NEAR:
             vector[ku.SOLUTION, i] = unilateral.shares[share_slot(unilateral, ws, a)]
-        for j in range(size):
-            b = index[ku.TABLE_ROW, j]
-            value = W[a, b]
-            if vector[ku.FIRST_PART, j] != 0.0 or vector[ku.SECOND_PART, j] != 0.0:
-                value += vector[ku.FIRST_PART, j] * W[a, b + 1] + vector[ku.SECOND_PART, j] * W[a, b + 2]
-            unilateral.room[ku.PROBLEM, i, j] = value
         if index[ku.KINDS, i] == kc.ONE_WAY and W[a, a] > 0.0 and unilateral.room[ku.PROBLEM, i, i] <= 1e-12 * W[a, a]:
             run.count[ki.STATUS] = ki.FORCES_REVERSED
     return size
@@ -627,10 +606,8 @@ def reduce_rows(system: System, ws: Workspace, run: Run, p):
 @internal_kernel
 def acceleration(unilateral: UnilateralArrays, i, size):
     """Return the acceleration along row i of the reduced problem."""
-    total = unilateral.vector[ku.OFFSET, i]
-    for j in range(size):
-        total += unilateral.room[ku.PROBLEM, i, j] * unilateral.vector[ku.SOLUTION, j]
-    return total
+    vector = unilateral.vector
+    return affine_row(unilateral.room[ku.PROBLEM], vector[ku.SOLUTION], vector[ku.OFFSET], size, i)
 
 
 @internal_kernel

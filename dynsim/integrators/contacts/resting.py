@@ -14,12 +14,14 @@ from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.cone import steps as kc
 from dynsim.dynamics.contact.cone.program import best_split, split_room_in
-from dynsim.dynamics.contact.delassus import ONE_WAY, RANK_TOLERANCE, change_of_coupling, null_space, solve_small
-from dynsim.dynamics.contact.rows import set_modes
+from dynsim.dynamics.contact.delassus import ONE_WAY, change_of_coupling, solve_small
+from dynsim.dynamics.contact.shares import some_slide
 from dynsim.dynamics.contact.unilateral import UnilateralArrays, dry_bound, dry_rests, dry_rows_held
 from dynsim.dynamics.derivative import System
+from dynsim.dynamics.linear import RANK_TOLERANCE, null_space
 from dynsim.dynamics.tables import Workspace
-from dynsim.integrators.contacts.impacts import FORCE_TOLERANCE, evaluate
+from dynsim.dynamics.tree.articulated import row_mobilities
+from dynsim.integrators.contacts.impacts import FORCE_TOLERANCE, take_modes
 from dynsim.integrators.run import Run, project_level
 from dynsim.jit.kernel import internal_kernel, noinline_kernel
 
@@ -58,9 +60,7 @@ def release_dependent_joints(system: System, ws: Workspace, size):
     table, mode, bare, whole = unilateral.dry_table, unilateral.mode, 0, 0
     bare_factor, whole_factor = unilateral.room[ku.SPLIT_MATRIX], unilateral.room[ku.NULL_SPACE]
     bare_row, whole_row = unilateral.index[0], unilateral.index[1]
-    blocked, released = False, 0
-    for k in range(mode.shape[0]):
-        blocked = blocked or mode[k, ku.WANTED] == ka.SLIDING
+    blocked, released = some_slide(mode[:, ku.WANTED]), 0
     for k in range(unilateral.stop_table.shape[0]):
         blocked = blocked or unilateral.stop_table[k, ku.STOP_CLOSED] == 1
     if table.shape[0] == 0:
@@ -139,12 +139,12 @@ def take_widest_split(system: System, ws: Workspace, size):
     for i in range(whole):
         for j in range(whole):
             unilateral.room[ku.SPLIT_MATRIX, i, j] = mobility_along_forces(unilateral, ws, row[i], row[j])
-    width = null_space(unilateral.room[ku.SPLIT_MATRIX], whole, N, unilateral.index[2], p)
+    width = null_space(unilateral.room[ku.SPLIT_MATRIX], whole, N, p)
     largest = 0.0
     for i in range(p):
         force[i] = f[row[i]]
         largest = max(largest, abs(force[i]))
-    programs = split_room_in(unilateral.split_room, unilateral.index[3], width, count)
+    programs = split_room_in(unilateral.split_room, unilateral.index[2], width, count)
     worst = best_split(force[:p], N, width, first, mu, points, count - points, out[:p], programs, False)
     for i in range(p, whole):
         f[row[i]] += change_of_coupling(N, width, i, force, out, p)
@@ -199,7 +199,7 @@ def hold_free_joints(system: System, ws: Workspace, run: Run, begins):
     friction bound moves with the contact or stop that held it: with a row it would stick and break loose at once.
     """
     unilateral, y = system.unilateral, run.y
-    table, dry, mode = unilateral.dry_table, unilateral.dry, unilateral.mode
+    table, dry = unilateral.dry_table, unilateral.dry
     W, factor, row = ws.small[0], unilateral.room[ku.SPLIT_MATRIX], unilateral.index[0]
     for k in range(table.shape[0]):
         rests = abs(ws.joints[table[k, ku.DRY_JOINT], ka.QD]) <= unilateral.number[ku.CREEP]
@@ -208,12 +208,9 @@ def hold_free_joints(system: System, ws: Workspace, run: Run, begins):
         table[k, ku.DRY_NEXT] = 1 if free else 0
         if free:
             table[k, ku.DRY_HOLDS], dry[k, ku.DRY_AT] = 1, ws.joints[table[k, ku.DRY_JOINT], ka.Q]
-    set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, ku.WANTED])
-    evaluate(system, ws, run)
+    take_modes(system, ws, run)
     p, count = ws.counts[ka.ROWS], 0
-    for r in range(p):
-        for s in range(p):
-            W[r, s] = mobility(ws, r, s)
+    row_mobilities(ws, W)
     # Rows of the joints in question come last.
     for r in range(p):
         index = -1
@@ -229,8 +226,7 @@ def hold_free_joints(system: System, ws: Workspace, run: Run, begins):
             free = mobility_left(factor, W, row, count, r) > NEARLY_DEPENDENT * W[r, r]
             table[k, ku.DRY_HOLDS] = 1 if free else 0
             count = extended(factor, W, row, count, r) if free else count
-    set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, ku.WANTED])
-    evaluate(system, ws, run)
+    take_modes(system, ws, run)
     y[system.layout.loss + kst.IMPACT_LOSS] += project_level(system, ws, y, 1)
 
 
@@ -292,15 +288,6 @@ def rounding_left(factor, W, row, count, r):
 
 
 @internal_kernel
-def mobility(ws: Workspace, r, s):
-    """Return the change of the rate along row r by a unit impulse along row s."""
-    total = 0.0
-    for i in range(ws.joints.shape[0]):
-        total += ws.column[i, 1 + 2 * r] * ws.column[i, 1 + 2 * s] * ws.links[i, ka.INVERSE_D]
-    return total
-
-
-@internal_kernel
 def projection_residual(ws: Workspace, small, column, errors):
     """Write the residual that projection leaves in a column of the rows (gaps or rates), right after ``derivative``.
 
@@ -309,9 +296,8 @@ def projection_residual(ws: Workspace, small, column, errors):
     rows, p = ws.rows, ws.counts[ka.ROWS]
     for r in range(p):
         rows[r, ka.RHS] = rows[r, column]
-        for s in range(p):
-            small[0, r, s] = mobility(ws, r, s)
-    solve_small(small, rows, ws.active, p)
+    row_mobilities(ws, small[0])
+    solve_small(small, rows, p)
     for r in range(p):
         errors[r] = rows[r, column]
         for s in range(p):

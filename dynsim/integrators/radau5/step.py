@@ -22,13 +22,13 @@ from dynsim.dynamics import state as kst
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.delassus import clearly_unique
+from dynsim.dynamics.contact.rows import slip_speed
 from dynsim.dynamics.contact.unilateral import UnilateralArrays
 from dynsim.dynamics.derivative import System, derivative
-from dynsim.dynamics.drive.law import drive_block
+from dynsim.dynamics.drive.law import drive_block, segment_of
 from dynsim.dynamics.tables import Workspace
 from dynsim.dynamics.tree.joints import displace, positions_along, rates_across
 from dynsim.integrators import run as ki
-from dynsim.integrators.contacts.impacts import slip_speed
 from dynsim.integrators.events import note_inside
 from dynsim.integrators.radau5 import tables as kn
 from dynsim.integrators.radau5.tables import (
@@ -157,33 +157,20 @@ def solve_newton(system: System, y, r: NewtonArrays, g, A, x, room):
 
 @internal_kernel
 def evaluate_end(newton: NewtonArrays, system: System, ws: Workspace, run: Run):
-    """Evaluate the derivatives at the three stages into ``f``, and the last one, at y_new, into stage[6] too."""
-    evaluate_two(newton, system, ws, run)
-    evaluate_end_alone(newton, system, ws, run)
+    """Evaluate the derivatives at the three stages into ``f``, and copy the last one, at y_new, into stage[6].
 
-
-@internal_kernel
-def evaluate_two(newton: NewtonArrays, system: System, ws: Workspace, run: Run):
-    """Evaluate the derivatives at the first two stages into ``f``."""
+    Not the other way round: entries that no derivative writes are zero in ``f`` but scratch in stage[6].
+    """
     for s in range(2):
         for j in range(newton.kept.shape[1]):
             run.stage[7, j] = run.y[j] + newton.z[s, j]
         derivative(system, run.clock[ki.TIME] + kn.NODE_RADAU[s] * run.clock[ki.STEP], run.stage[7], ws, newton.f[s])
         if run.event.shape[0] > 0:
             note_inside(system, ws, run, s, kn.NODE_RADAU[s])
-    run.count[ki.EVALUATIONS] += 2
-
-
-@internal_kernel
-def evaluate_end_alone(newton: NewtonArrays, system: System, ws: Workspace, run: Run):
-    """Evaluate the derivative at y_new into the third row of ``f``, then copy it into stage[6].
-
-    Not the other way round: entries that no derivative writes are zero in ``f`` but scratch in stage[6].
-    """
     derivative(system, run.clock[ki.TIME] + run.clock[ki.STEP], run.y_new, ws, newton.f[2])
     for j in range(run.y.shape[0]):
         run.stage[6, j] = newton.f[2, j]
-    run.count[ki.EVALUATIONS] += 1
+    run.count[ki.EVALUATIONS] += 3
 
 
 @internal_kernel
@@ -238,7 +225,7 @@ def differentiate(system: System, ws: Workspace, run: Run):
     # The workspace may still hold a sample or a rejected step.
     derivative(system, t, y, ws, base)
     for a in range(ws.motors.shape[0]):
-        drive_block(system.drives, ws, a, r.linear[a])
+        drive_block(system.drives, ws, a, segment_of(system.drives, system.reference, t, ws, a), r.linear[a])
     r.clock[kn.CHANGE] = largest_change(system.unilateral, ws)
     columns(r.lanes, system, ws, t, y, x, base, r)
     run.count[ki.EVALUATIONS] += r.along.shape[0] + 1

@@ -15,25 +15,23 @@ from numba.extending import intrinsic
 from numba.np.arrayobj import make_array, populate_array
 
 from dynsim.dynamics import tables as ka
-from dynsim.dynamics.contact import delassus as kq
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.delassus import (
-    admissible_forces,
     check_forces,
-    clearly_unique,
     solve_dependent,
+    solve_many,
     solve_small,
 )
 from dynsim.dynamics.contact.rows import sign_changed, surface_distance
-from dynsim.dynamics.contact.shares import solve_near_shares, solve_nearest
+from dynsim.dynamics.contact.shares import solve_near_shares
 from dynsim.dynamics.contact.unilateral import slide_direction, sliding_friction
 from dynsim.dynamics.derivative import System, derivative
 from dynsim.dynamics.drive.law import clipped, evaluate_reference, fed_forward, servo_circuit
 from dynsim.dynamics.tables import Workspace
 from dynsim.dynamics.tree.loads import add_loads
 from dynsim.jit.compiler import Tables, build_tuple, form_of, parts_of
-from dynsim.jit.kernel import internal_kernel, noinline_kernel
-from dynsim.jit.simd import INT32, Lanes, every, lanes_of, select
+from dynsim.jit.kernel import every, internal_kernel, noinline_kernel
+from dynsim.jit.simd import INT32, Lanes, all_lanes, lanes_of, select
 
 # Tables for SIMD: float tables whose last axis is the lanes, as tables of Lanes, and single lanes of them.
 
@@ -206,32 +204,27 @@ def surface_distance_lanes(value, slope, curvature):
     return select(inner <= 0.0, value / slope, 2.0 * value / (slope * (1.0 + math.sqrt(inner))))
 
 
-@form_of(solve_small, any_lanes)
-def solve_small_lanes(small, state, active, p):
-    """Use the closed forms if they hold for all lanes, otherwise the kernel lane by lane; return the sum of results."""
-    if p == 1 and every(abs(small[0, 0, 0]) > state[0, ka.ROW_FLOOR]):
-        state[0, ka.FORCE] = state[0, ka.RHS] / small[0, 0, 0]
-        return 0
-    if p == 2:
-        a, b, c, d = small[0, 0, 0], small[0, 0, 1], small[0, 1, 0], small[0, 1, 1]
-        determinant = a * d - b * c
-        floors = state[0, ka.ROW_FLOOR] * state[1, ka.ROW_FLOOR]
-        if every(abs(determinant) > 1e-3 * (abs(a * d) + abs(b * c)) + floors):
-            x, y = state[0, ka.RHS] / determinant, state[1, ka.RHS] / determinant
-            state[0, ka.FORCE], state[1, ka.FORCE] = d * x - b * y, a * y - c * x
-            return 0
+@form_of(every, any_lanes)
+def every_lane(mask):
+    """Return whether the mask is true for all lanes."""
+    return all_lanes(mask)
+
+
+@form_of(solve_many, any_lanes)
+def solve_many_lanes(small, state, p):
+    """Solve lane by lane, in closed form where it holds for this lane alone; return the sum of results."""
     dependent = 0
     for k in range(lane_count(small)):
-        dependent += solve_small(lane(small, k), lane(state, k), active, p)
+        dependent += solve_small(lane(small, k), lane(state, k), p)
     return dependent
 
 
 @form_of(solve_dependent, any_lanes)
-def solve_dependent_lanes(small, state, active, p):
+def solve_dependent_lanes(small, state, p):
     """Solve lane by lane."""
     dependent = 0
     for k in range(lane_count(small)):
-        dependent += solve_dependent(lane(small, k), lane(state, k), active, p)
+        dependent += solve_dependent(lane(small, k), lane(state, k), p)
     return dependent
 
 
@@ -240,23 +233,8 @@ def solve_near_shares_lanes(unilateral, ws, p):
     """Solve lane by lane."""
     dependent = 0
     for k in range(lane_count(ws)):
-        dependent += solve_nearest(unilateral, lane(ws, k), p)
+        dependent += solve_near_shares(unilateral, lane(ws, k), p)
     return dependent
-
-
-@form_of(clearly_unique, any_lanes)
-def all_clearly_unique(ws):
-    """True if every lane is clearly unique."""
-    small, p = ws.small, ws.counts[ka.ROWS]
-    if p == 0 or p > 2:
-        return p == 0
-    for k in range(p):
-        if ws.active[k, ka.LAW] == ka.FRICTION_DISSIPATIVE or not every(small[0, k, k] > 0.0):
-            return False
-    if p == 1:
-        return True
-    straight, crossed = small[0, 0, 0] * small[0, 1, 1], small[0, 0, 1] * small[0, 1, 0]
-    return every(straight - crossed > kq.CLEAR * (straight + abs(crossed)))
 
 
 @form_of(slide_direction, any_lanes)
@@ -283,14 +261,11 @@ def slide_direction_lanes(unilateral, contacts, k, slip, n):
     return a, b, c, sliding_friction(contacts.law, k, speed)
 
 
-@form_of(admissible_forces, any_lanes)
-def admissible_forces_lanes(model, contacts, unilateral, ws):
-    """Check lane by lane, if there is anything to check."""
-    if unilateral is None:  # resolved at compile time
-        return
-    if unilateral.number[ku.REDUNDANT] == 1.0 or unilateral.stop.shape[0] + unilateral.dry.shape[0] > 0:
-        for k in range(lane_count(ws)):
-            check_forces(model, contacts, unilateral, lane(ws, k))
+@form_of(check_forces, any_lanes)
+def check_forces_lanes(model, contacts, unilateral, ws):
+    """Check lane by lane."""
+    for k in range(lane_count(ws)):
+        check_forces(model, contacts, unilateral, lane(ws, k))
 
 
 @form_of(sign_changed, any_lanes)

@@ -38,17 +38,16 @@ from dynsim.jit.kernel import internal_kernel
 from dynsim.jit.simd import four, swap_middle
 
 
-def _has_lanes(newton: Any) -> bool:
-    """True, from the type of a table of RADAU5, if right-hand sides are evaluated on lanes."""
-    return bool(newton != types.none and newton[newton.fields.index("lanes")] != types.none)
+def has_lanes(*kinds: Any) -> bool:
+    """True if right-hand sides are evaluated on lanes, from the types of arguments with the tables of RADAU5."""
+    tables = (kind for kind in kinds if "lanes" in getattr(kind, "fields", ()))
+    return any(kind[kind.fields.index("lanes")] != types.none for kind in tables)
 
 
-def _factors_on_lanes(system: Any, r: Any, h: Any) -> bool:
-    return _has_lanes(r)
-
-
-def _solves_on_lanes(system: Any, ws: Any, y: Any, r: Any, h: Any) -> bool:
-    return _has_lanes(r)
+def _on_lanes(*kinds: Any) -> bool:
+    """True if samples are taken on lanes and the law is bilateral, so that only samples use the forces at the end."""
+    _, system, *_ = kinds
+    return has_lanes(*kinds) and bool(system[system.fields.index("unilateral")] == types.none)
 
 
 @internal_kernel
@@ -57,7 +56,7 @@ def pair(real, z):
     return four(real, z.real, z.real, real), four(0.0, -z.imag, z.imag, 0.0)
 
 
-@form_of(factor_both, _factors_on_lanes)
+@form_of(factor_both, has_lanes)
 def invert_on_lanes(system, r, h):
     """Invert both by Gauss–Jordan elimination, with pivots that are large in both."""
     along, block, table = r.along, r.linear, system.drives.table
@@ -116,7 +115,7 @@ def invert_on_lanes(system, r, h):
                 m[i, k], m[i, best] = m[i, best], m[i, k]
 
 
-@form_of(solve_both, _solves_on_lanes)
+@form_of(solve_both, has_lanes)
 def multiply_on_lanes(system, ws, y, r, h):
     """Multiply by the inverses of :func:`invert_on_lanes`."""
     along, block, table, layout = r.along, r.linear, system.drives.table, system.layout
@@ -175,11 +174,6 @@ def multiply_on_lanes(system, ws, y, r, h):
         r.one[j], r.two[j] = lane(e, 0), complex(lane(e, 1), lane(e, 2))
 
 
-def samples_on_lanes(newton: Any, *_: Any) -> bool:
-    """True if samples are evaluated on lanes."""
-    return _has_lanes(newton)
-
-
 @internal_kernel
 def may_wait(unilateral: UnilateralArrays | None, run: Run):
     """True if only steps happen between two samples, so that modes, commands and loads do not change."""
@@ -196,7 +190,7 @@ def has_stops(unilateral: UnilateralArrays | None):
     return unilateral.stop.shape[0] + unilateral.dry.shape[0] > 0
 
 
-@form_of(write_samples, samples_on_lanes)
+@form_of(write_samples, has_lanes)
 def write_samples_on_lanes(newton, system, ws, run, more):
     """Record four samples at a time, fewer if they cannot wait; a single sample is cheaper without lanes."""
     newton.count[kn.WAITING] += more
@@ -211,7 +205,7 @@ def write_samples_on_lanes(newton, system, ws, run, more):
             write_together(newton, system, ws, run, 0)
 
 
-@form_of(write_waiting, samples_on_lanes)
+@form_of(write_waiting, has_lanes)
 def write_waiting_on_lanes(newton, system, ws, run):
     """Write even a single sample from lanes: its value must not depend on when control returns to a caller.
 
@@ -270,11 +264,6 @@ def take_samples(newton: NewtonArrays, system: System, ws: Workspace, run: Run, 
             run.count[ki.SAMPLE] += 1
 
 
-def _on_lanes(newton: Any, system: Any, ws: Any, run: Any, *_: Any) -> bool:
-    """True if samples are taken on lanes and the law is bilateral, so that only samples use the forces at the end."""
-    return _has_lanes(newton) and bool(system[system.fields.index("unilateral")] == types.none)
-
-
 @form_of(evaluate_end, _on_lanes)
 def evaluate_end_on_lanes(newton, system, ws, run):
     """Evaluate y_new on the first lane, the two inner stages on the next, and a waiting sample on the last."""
@@ -314,11 +303,7 @@ def end_workspace_on_lanes(newton, system, ws, run):
     return lane(tables_as_lanes(newton.lanes.ws), 0)
 
 
-def _given(lanes: Any, *_: Any) -> bool:
-    return bool(lanes != types.none)
-
-
-@form_of(columns, _given)
+@form_of(columns, has_lanes)
 def columns_on_lanes(lanes, system, ws, t, y, x, base, r):
     """Compute four columns at a time; if their number is not a multiple of four, the last one is repeated."""
     v, last = system.layout.v, r.along.shape[0] - 1
@@ -335,7 +320,7 @@ def columns_on_lanes(lanes, system, ws, t, y, x, base, r):
                 r.along[s, i] = (lanes.f[v + i, k] - base[v + i]) / lanes.delta[k]
 
 
-@form_of(evaluate_stages, _given)
+@form_of(evaluate_stages, has_lanes)
 def stages_on_lanes(lanes, system, ws, t, h, y, x, r):
     """Evaluate three lanes, and the last of them again."""
     for j in range(r.kept.shape[1]):

@@ -52,7 +52,7 @@ from dynsim.dynamics.tree.spatial import (
     wrench_at,
 )
 from dynsim.integrators.stepping import tables as kt
-from dynsim.integrators.stepping.tables import SteppingArrays, geometry, place_joints
+from dynsim.integrators.stepping.tables import SteppingArrays, geometry, place_state
 from dynsim.jit.kernel import internal_kernel
 
 # Compliant rows in time stepping: springs and dampers of contacts, and ties between bodies.
@@ -166,9 +166,8 @@ def list_ties(unilateral: UnilateralArrays, ws: Workspace):
                 begin_tie(unilateral, ws, k)
                 tie[k, ku.TIE_TURNED] = tie_deflection(unilateral, ws, k)
                 x = tie[k, ku.TIE_TURNED] - tie[k, ku.TIE_REST]
+                x = min(x, 0.0) if table[k, ku.TIE_KIND] == kc.ONE_WAY else x
                 tie[k, ku.TIE_STORED], tie[k, ku.TIE_GIVEN] = 0.5 * tie[k, ku.TIE_STIFFNESS] * x * x, 0.0
-                if table[k, ku.TIE_KIND] == kc.ONE_WAY:
-                    tie[k, ku.TIE_STORED] = spring_energy(tie[k, ku.TIE_STIFFNESS], x)
     return changed
 
 
@@ -186,25 +185,17 @@ def begin_tie(unilateral: UnilateralArrays, ws: Workspace, k):
 
 
 @internal_kernel
-def axes_of(ws: Workspace, b):
-    """Return the rotation of body b, or of the world, −1."""
+def pose_of(ws: Workspace, b):
+    """Return origin and rotation of body b, or of the world, −1."""
     if b < 0:
-        return 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0
-    return rotation(ws.links, b, ka.R)
-
-
-@internal_kernel
-def origin_of(ws: Workspace, b):
-    """Return the origin of body b, or of the world, −1."""
-    if b < 0:
-        return ZERO_VECTOR
-    return vector(ws.links, b, ka.P)
+        return ZERO_VECTOR, (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+    return vector(ws.links, b, ka.P), rotation(ws.links, b, ka.R)
 
 
 @internal_kernel
 def relative_attitude(ws: Workspace, a, b):
     """Return the rotation of body b in the axes of body a."""
-    A, B = rotation(ws.links, a, ka.R), axes_of(ws, b)
+    A, (_, B) = rotation(ws.links, a, ka.R), pose_of(ws, b)
     x, y, z = rotate_back(A, first_axis(B)), rotate_back(A, second_axis(B)), rotate_back(A, third_axis(B))
     return x[0], y[0], z[0], x[1], y[1], z[1], x[2], y[2], z[2]
 
@@ -218,7 +209,8 @@ def tie_deflection(unilateral: UnilateralArrays, ws: Workspace, k):
         return -dot_vector(axis, tie_turn(unilateral, ws, k))
     A = rotation(ws.links, a, ka.R)
     at = transform(vector(ws.links, a, ka.P), A, vector(tie, k, ku.TIE_POINT))
-    other = transform(origin_of(ws, b), axes_of(ws, b), vector(tie, k, ku.TIE_OTHER_POINT))
+    origin, axes = pose_of(ws, b)
+    other = transform(origin, axes, vector(tie, k, ku.TIE_OTHER_POINT))
     return dot_vector(rotate(A, axis), (at[0] - other[0], at[1] - other[1], at[2] - other[2]))
 
 
@@ -278,11 +270,11 @@ def place_ties(unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace):
                 tie[k, ku.TIE_REST] += math.copysign(2.0 * math.pi, x - tie[k, ku.TIE_TURNED])
             tie[k, ku.TIE_TURNED] = x
         else:
-            at = transform(origin_of(ws, b), axes_of(ws, b), vector(tie, k, ku.TIE_OTHER_POINT))
+            origin, axes = pose_of(ws, b)
+            at = transform(origin, axes, vector(tie, k, ku.TIE_OTHER_POINT))
             put_six(rows, r, ka.ROW, wrench_at(at, rotate(A, axis), ZERO_VECTOR))
             x = tie_deflection(unilateral, ws, k)
-        for j in range(6):
-            rows[r, ka.DIRECTION + j] = rows[r, ka.ROW + j]
+        put_six(rows, r, ka.DIRECTION, six(rows, r, ka.ROW))
         rows[r, ka.TARGET], s.kind[r] = 0.0, table[k, ku.TIE_KIND]
         tie[k, ku.TIE_AT] = x - tie[k, ku.TIE_REST]
 
@@ -375,16 +367,15 @@ def restart_memory(system, s: SteppingArrays, ws: Workspace, y):
     if s.grid[kt.LENGTH_LAST] > 0.0 and not rates_jumped(s, y, layout.v):
         return
     s.grid[kt.LENGTH_LAST], s.grid[kt.HELD_STEPS], s.grid[kt.IMPACT_LAST] = 0.0, 0.0, 0.0
-    place_joints(system, ws, y)
+    place_state(system, ws, y)
     for i in range(s.before.shape[1]):
-        ws.joints[i, ka.QD], ws.joints[i, ka.QDD] = y[layout.v + i], 0.0
+        ws.joints[i, ka.QDD] = 0.0
     for a in range(s.torque.shape[0]):
         s.torque[a] = math.nan
     geometry(system, system.model, ws)
     for k in range(ws.contacts.shape[0]):
         last, state = s.memory[kt.LAST, k], ws.contacts[k]
-        for m in range(kt.MEMORY_SIZE):
-            last[m] = 0.0
+        last[:] = 0.0
         if state[ka.GAP] > TOUCHES:
             continue
         note_place(system, state, k, last)
@@ -484,19 +475,15 @@ def is_same_contact(system, last, ws: Workspace, k, h):
         turned += state[ka.NORMAL + m] * last[kt.NORMAL_THEN + m]
     if turned <= SAME_ROW:
         return False
-    return is_same_point(system.shapes, last, state, six(ws.links, system.contacts.link[k, ka.LINK], ka.V), k, h)
-
-
-@internal_kernel
-def is_same_point(shapes, last, state, V, k, h):
-    """True unless the contact point of candidate k has jumped, e.g. from one end of a capsule to the other."""
+    shapes = system.shapes
     if shapes is None:  # resolved at compile time
         return True
     if shapes.kind[k, kd.MOVES] == 0:
         return True
+    # Its contact point may have jumped, e.g. from one end of a capsule to the other.
     at = centre(shapes, state, k)
     square = (at[0] - last[kt.CENTRE]) ** 2 + (at[1] - last[kt.CENTRE + 1]) ** 2 + (at[2] - last[kt.CENTRE + 2]) ** 2
-    v = point_velocity(V, at)
+    v = point_velocity(six(ws.links, system.contacts.link[k, ka.LINK], ka.V), at)
     return math.sqrt(square) <= SAME_PLACE * h * math.sqrt(dot_vector(v, v)) + SHORT_WAY
 
 
@@ -553,8 +540,7 @@ def tangent_rows(system, s: SteppingArrays, ws: Workspace):
             scale = system.contacts.law[k, ka.GRIP] if m == 1 else 1.0
             point_row(rows, r, at, times_number(vector(state, k, d), scale))
             rows[r, ka.TARGET] = 0.0
-            for j in range(6):
-                rows[r, ka.DIRECTION + j] = rows[r, ka.ROW + j]
+            put_six(rows, r, ka.DIRECTION, six(rows, r, ka.ROW))
             s.kind[r] = kc.CONE if m == 0 else kc.TANGENT
 
 
@@ -895,8 +881,7 @@ def note_contacts(system, s: SteppingArrays, ws: Workspace):
     """
     for k in range(ws.contacts.shape[0]):
         now, last, state = s.memory[kt.NOW, k], s.memory[kt.LAST, k], ws.contacts[k]
-        for m in range(kt.MEMORY_SIZE):
-            now[m] = 0.0
+        now[:] = 0.0
         s.motion[k] = ka.OPEN
         if ws.active[k, ka.MODE] != ka.STICKING:
             continue

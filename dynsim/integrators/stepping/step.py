@@ -8,12 +8,12 @@ from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.unilateral import UnilateralArrays, note_stop_forces
 from dynsim.dynamics.derivative import System
 from dynsim.dynamics.drive.law import drive, drive_on_segments, segment_of, take_commands
-from dynsim.dynamics.ledger import drive_powers, kinetic_energy, potential_energy
+from dynsim.dynamics.ledger import damping_powers, drive_powers, kinetic_energy, potential_energy
 from dynsim.dynamics.tables import ModelArrays, Workspace
 from dynsim.dynamics.tree.articulated import accelerate, add_row_forces, factor, row_system
 from dynsim.dynamics.tree.joints import normalise, sine_cosine
 from dynsim.dynamics.tree.loads import add_loads
-from dynsim.dynamics.tree.spatial import dot, point_velocity, six, times_inertia
+from dynsim.dynamics.tree.spatial import dot, point_velocity, put_six, six, times_inertia
 from dynsim.dynamics.tree.sweep import body_inertia, forward_sweep, inertial_wrench
 from dynsim.integrators import run as ki
 from dynsim.integrators.contacts import events as ke
@@ -33,7 +33,14 @@ from dynsim.integrators.stepping.contacts import (
     strikes,
     tangent_rows,
 )
-from dynsim.integrators.stepping.tables import SteppingArrays, constraint_rates, geometry, moved, place_joints
+from dynsim.integrators.stepping.tables import (
+    SteppingArrays,
+    constraint_rates,
+    geometry,
+    moved,
+    place_joints,
+    place_state,
+)
 from dynsim.integrators.steps import choose_step, finished, finite, stalled
 from dynsim.jit.kernel import free_kernel, internal_kernel
 
@@ -116,9 +123,7 @@ def limits_agree(system: System, ws: Workspace, run: Run, tries):
 def stored_energy(system: System, ws: Workspace, y, out):
     """Write the energy of bodies and rotors, and of coils, at y [J] to out, (2,). Sweeps there."""
     layout, motor = system.layout, system.drives.motor
-    place_joints(system, ws, y)
-    for i in range(ws.joints.shape[0]):
-        ws.joints[i, ka.QD] = y[layout.v + i]
+    place_state(system, ws, y)
     forward_sweep(system.model, ws, 1.0, 0.0, 1.0)
     out[kt.MECHANICAL] = kinetic_energy(system.model, ws) + potential_energy(system.model, ws)
     out[kt.MAGNETIC] = 0.0
@@ -297,17 +302,14 @@ def solve_step(system: System, model: ModelArrays, ws: Workspace, run: Run):
 def book(system: System, ws: Workspace, run: Run):
     """Book the ledger of the step into y_new, after :func:`drive_at_theta`: power at x_θ, and work of contacts."""
     s, t, h, y_new, layout = run.stepping, run.clock[ki.TIME], run.clock[ki.STEP], run.y_new, system.layout
-    joints, body, start = ws.joints, system.model.body, system.layout.ledger
+    start = system.layout.ledger
     # From the sweep at the midpoint, before it is overwritten.
     stored = -midpoint_work(system.model, ws, s.before[kt.V_START], s.before[kt.ACCELERATION], h)
     stored += drive_work(system, ws, run)
     if system.loads.table.shape[0] > 0:
         # Again, for their powers at the mean velocities that the links have now.
         add_loads(system.model, system.loads, t + s.theta * h, ws, run.stage[1], layout.load)
-    gear, joint = 0.0, 0.0
-    for i in range(joints.shape[0]):
-        gear += body[i, ka.GEAR_DAMPING] * joints[i, ka.QD] ** 2
-        joint += body[i, ka.DAMPING] * joints[i, ka.QD] ** 2
+    gear, joint = damping_powers(system.model, ws)
     electrical, drawn, joule, mechanical, drag = drive_powers(system.drives, ws)
     for r in range(ws.counts[ka.ROWS]):
         y_new[start + kst.CONSTRAINT] += work_of_row(s, ws, r, h)
@@ -467,24 +469,12 @@ def log_step_changes(unilateral: UnilateralArrays, s: SteppingArrays, run: Run):
 
     The initial state of a contact is not an event.
     """
-    tally, table, stop = unilateral.tally, unilateral.stop_table, unilateral.stop
+    table, stop = unilateral.stop_table, unilateral.stop
     for k in range(s.logged_motion.shape[0]):
         before, now = s.logged_motion[k], s.motion[k]
         s.logged_motion[k] = now
-        if before < 0 or before == now:
-            continue
-        if now == ka.OPEN:
-            kind = ke.LIFT_OFF
-            tally[k, ku.LIFT_OFFS] += 1.0
-        elif before == ka.OPEN:
-            kind = ke.LANDING
-            tally[k, ku.LANDINGS] += 1.0
-        elif now == ka.SLIDING:
-            kind = ke.SLIP_START
-            tally[k, ku.SLIP_STARTS] += 1.0
-        else:
-            kind = ke.SLIP_STOP
-        ke.log(run, ki.CONTACT_LOG + ke.LOG_KINDS * k + kind)
+        if before >= 0 and before != now:
+            ke.log_and_count(unilateral, run, k, ke.kind_of_change(before, now))
     for k in range(table.shape[0]):
         closed = table[k, ku.STOP_CLOSED] == 1
         if run.count[ki.STEPS] > 1 and table[k, ku.STOP_CLOSED] != table[k, ku.STOP_BEFORE]:
@@ -502,8 +492,7 @@ def log_step_changes(unilateral: UnilateralArrays, s: SteppingArrays, run: Run):
 def save_directions(s: SteppingArrays, ws: Workspace):
     """Copy the wrenches of unit forces of all active rows, with which the step was solved."""
     for r in range(ws.counts[ka.ROWS]):
-        for j in range(6):
-            s.direction[r, j] = ws.rows[r, ka.DIRECTION + j]
+        put_six(s.direction, r, 0, six(ws.rows, r, ka.DIRECTION))
 
 
 @internal_kernel
@@ -513,8 +502,7 @@ def restore_directions(s: SteppingArrays, ws: Workspace):
     ``geometry`` gives the rows of sticking contacts different tangents, without the factor of the grip.
     """
     for r in range(ws.counts[ka.ROWS]):
-        for j in range(6):
-            ws.rows[r, ka.DIRECTION + j] = s.direction[r, j]
+        put_six(ws.rows, r, ka.DIRECTION, six(s.direction, r, 0))
 
 
 @internal_kernel
@@ -534,9 +522,7 @@ def sample_moreau(system: System, ws: Workspace, run: Run):
             row[j] = run.y[j] + x * (run.y_new[j] - run.y[j])
         if system.layout.extra > 0:
             normalise(system.model, row, system.layout.q)
-        place_joints(system, ws, row)
-        for i in range(ws.joints.shape[0]):
-            ws.joints[i, ka.QD], ws.joints[i, ka.APPLIED] = row[system.layout.v + i], 0.0
+        place_state(system, ws, row)
         drive(system.drives, system.reference, run.sample_time[last], row, system.layout, ws)
         save_directions(s, ws)
         geometry(system, system.model, ws)
@@ -560,17 +546,15 @@ def commands_due(system: System, ws: Workspace, run: Run):
     """Take sampled commands if due; True if control must return to the caller."""
     due = take_ticks(run)
     if due & ki.TAKE_COMMANDS:
-        place_joints(system, ws, run.y)
-        for i in range(ws.joints.shape[0]):
-            ws.joints[i, ka.QD] = run.y[system.layout.v + i]
+        place_state(system, ws, run.y)
         take_commands(system.drives, system.reference, run.clock[ki.TIME], ws)
     run.count[ki.TICKED] = due & ~ki.TAKE_COMMANDS
     if due & ki.TAKE_COMMANDS or run.count[ki.STARTED] == 0:
         rewrite_sample(system, ws, run)
     if run.count[ki.STARTED] == 0:
         run.count[ki.STARTED] = 1
-        for i in range(ws.joints.shape[0]):
-            run.stepping.before[kt.ACCELERATION, i] = run.stepping.before[kt.SMOOTH, i] = 0.0
+        run.stepping.before[kt.ACCELERATION] = 0.0
+        run.stepping.before[kt.SMOOTH] = 0.0
     return run.count[ki.TICKED] != 0
 
 
@@ -585,9 +569,7 @@ def rewrite_sample(system: System, ws: Workspace, run: Run):
         return
     last, columns = run.count[ki.SAMPLE] - 1, run.columns
     row, out = run.sample[last], run.output[last]
-    place_joints(system, ws, run.y)
-    for i in range(ws.joints.shape[0]):
-        ws.joints[i, ka.QD], ws.joints[i, ka.APPLIED] = run.y[system.layout.v + i], 0.0
+    place_state(system, ws, run.y)
     drive(system.drives, system.reference, run.clock[ki.TIME], run.y, system.layout, ws)
     fill_drives(system, ws, run, out)
     if not rates_jumped(run.stepping, run.y, system.layout.v):

@@ -184,6 +184,14 @@ def place_joints(system, ws: Workspace, y):
 
 
 @internal_kernel
+def place_state(system, ws: Workspace, y):
+    """Copy positions and rates of y into ``ws.joints``, without applied forces."""
+    place_joints(system, ws, y)
+    for i in range(ws.joints.shape[0]):
+        ws.joints[i, ka.QD], ws.joints[i, ka.APPLIED] = y[system.layout.v + i], 0.0
+
+
+@internal_kernel
 def geometry(system, model: ModelArrays, ws: Workspace):
     """Compute poses, gaps and rows at the positions and rates in ``ws.joints``.
 

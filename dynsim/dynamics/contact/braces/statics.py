@@ -17,9 +17,16 @@ from typing import NamedTuple
 import numpy as np
 
 from dynsim.dynamics import tables as ka
-from dynsim.dynamics.contact.cone.program import ConeProgram, cone_program, solve_cone_program
+from dynsim.dynamics.contact.cone.program import (
+    ConeProgram,
+    clear_objective,
+    cone_program,
+    maximise_margin,
+    solve_cone_program,
+)
 from dynsim.dynamics.tables import ModelArrays, Workspace
 from dynsim.dynamics.tree.joints import point_jacobian, point_position, read_positions
+from dynsim.dynamics.tree.spatial import point_velocity, put_vector, six
 from dynsim.dynamics.tree.sweep import kinematics, newton_euler
 from dynsim.jit.kernel import integers, internal_kernel, kernel, reals
 
@@ -111,18 +118,13 @@ def brace_motion(model: ModelArrays, ws: Workspace, braces: BraceArrays, q, v, p
     positions, velocities : (T, c, 3) ndarray
         Results [m, m/s], overwritten; the points are in ``braces.table``.
     """
-    jacobian, n = braces.jacobian, braces.free.shape[0]
     for t in range(q.shape[0]):
         set_motion(model, ws, q[t], v[t], v[t])
         kinematics(model, ws)
         for k in range(braces.link.shape[0]):
-            point_position(ws, braces.link[k], braces.table[k], positions[t, k])
-            point_jacobian(model, ws, braces.link[k], positions[t, k], jacobian)
-            for e in range(3):
-                rate = 0.0
-                for j in range(n):
-                    rate += jacobian[e, j] * v[t, j]
-                velocities[t, k, e] = rate
+            link, at = braces.link[k], positions[t, k]
+            point_position(ws, link, braces.table[k], at)
+            put_vector(velocities[t], k, 0, point_velocity(six(ws.links, link, ka.V), at))
 
 
 @kernel
@@ -292,17 +294,9 @@ def middle_forces(braces: BraceArrays, scale):
 @internal_kernel
 def largest_margin(braces: BraceArrays, equations, cones, scale):
     """Find a point x inside all constraints; return the worst margin there, the largest possible, at most 1."""
-    program, unknowns = braces.program, braces.first[braces.link.shape[0]]
-    x, rows = program.x, program.first[cones]
-    clear_objective(program, unknowns + 1)
-    program.g[unknowns], program.H[unknowns, unknowns] = -1.0, 0.0
-    program.G[rows, unknowns], program.h[rows], program.first[cones + 1] = -1.0, 1.0, rows + 1
-    for k in range(unknowns):
-        program.G[rows, k] = 0.0
     middle_forces(braces, scale)
-    x[unknowns] = worst_margin(program, unknowns, cones) - 1.0
-    solve_cone_program(program, unknowns + 1, equations, cones + 1)
-    return x[unknowns]
+    unknowns = braces.first[braces.link.shape[0]]
+    return maximise_margin(braces.program, unknowns, equations, cones, 1.0, LEAST_WEIGHT)
 
 
 @internal_kernel
@@ -358,12 +352,9 @@ def constraints(braces: BraceArrays, scale, limits, relaxed):
     A, b, G, h, first = program.A, program.b, program.G, program.h, program.first
     c, n = braces.link.shape[0], braces.free.shape[0]
     unknowns, equations, cones, rows = braces.first[c], 0, 0, 0
-    for e in range(A.shape[0]):
-        A[e, unknowns] = 0.0
-    for i in range(4 * c):
-        for k in range(unknowns + 1):
-            G[i, k] = 0.0
-        h[i] = 0.0
+    A[:, unknowns] = 0.0
+    G[: 4 * c, : unknowns + 1] = 0.0
+    h[: 4 * c] = 0.0
     for j in range(c):
         k, mu, commanded = braces.first[j], table[j, FRICTION], table[j, COMMANDED] == table[j, COMMANDED]
         tangents = k + (0 if commanded else 1)
@@ -402,33 +393,6 @@ def constraints(braces: BraceArrays, scale, limits, relaxed):
 
 
 @internal_kernel
-def clear_objective(program: ConeProgram, unknowns):
-    """Reset the objective to a small weight on the unknowns."""
-    for k in range(unknowns):
-        program.g[k] = 0.0
-        for m in range(unknowns):
-            program.H[k, m] = LEAST_WEIGHT if m == k else 0.0
-
-
-@internal_kernel
-def worst_margin(program: ConeProgram, unknowns, cones):
-    """Return the smallest distance of x to the boundary of a cone; negative outside."""
-    worst = math.inf
-    for c in range(cones):
-        head, square = 0.0, 0.0
-        for i in range(program.first[c], program.first[c + 1]):
-            slack = program.h[i]
-            for k in range(unknowns):
-                slack += program.G[i, k] * program.x[k]
-            if i == program.first[c]:
-                head = slack
-            else:
-                square += slack * slack
-        worst = min(worst, head - math.sqrt(square))
-    return min(worst, 1.0)
-
-
-@internal_kernel
 def contradiction(braces: BraceArrays, equations, cones, relaxed):
     """Write multipliers of the torques, as joint rates, from the multipliers of a negative best margin."""
     program, motors = braces.program, braces.motors
@@ -456,7 +420,7 @@ def extreme_force(braces: BraceArrays, unknowns, equations, cones, j, end, scale
     if end == 0 and equations == 0 and possible_with_least(braces, j):
         return braces.table[j, LEAST]
     rows, first = program.first[cones], program.first
-    clear_objective(program, unknowns)
+    clear_objective(program, unknowns, LEAST_WEIGHT)
     sign = 1.0 if end == 0 else -1.0
     program.g[k] = sign
     for m in range(unknowns):
@@ -486,7 +450,7 @@ def possible_with_least(braces: BraceArrays, j):
 def least_heat(braces: BraceArrays, unknowns, equations, cones, scale):
     """Find the forces of least heat in units of ``scale`` (H = B w Bᵀ, g = −B w free), or forces nearest to targets."""
     program, B, motors, n = braces.program, braces.B, braces.motors, braces.free.shape[0]
-    clear_objective(program, unknowns)
+    clear_objective(program, unknowns, LEAST_WEIGHT)
     largest = 0.0
     for j in range(braces.link.shape[0]):
         compliance, k = braces.table[j, COMPLIANCE], braces.first[j]

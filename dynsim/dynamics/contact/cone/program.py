@@ -20,6 +20,7 @@ import numpy as np
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact.cone import steps as kc
 from dynsim.dynamics.contact.cone.steps import block_size
+from dynsim.dynamics.linear import affine_row, factor_symmetric, solve_symmetric
 from dynsim.jit.kernel import integers, internal_kernel, kernel, reals
 
 ITERATIONS = 60
@@ -31,10 +32,6 @@ GAP_MIN = 1e-16
 CLOSE, PATIENCE = 1e-9, 2
 # Regularisation of the Newton system along undetermined directions; the optimum is unchanged.
 REGULAR = 1e-13
-# Smallest pivot of an unknown, relative to its diagonal entry before elimination: smaller pivots have no digits left.
-PIVOT_MIN = 1e-14
-# An equation is dependent if its pivot is below this fraction of the sizes of its terms; −HUGE replaces that pivot.
-RANK_TOLERANCE, HUGE = 1e-10, 1e100
 # Fraction of the distance to the boundary of the cones that a step leaves. With a hundredth of it, steps end off the
 # central path, at the edge of a cone, and the next steps creep along that edge.
 ASIDE = 2e-2
@@ -88,42 +85,34 @@ def program_in(flat, first, n, m, cones, rows):
     first : (cones + 1,) ndarray of int
         Starts of the cones.
     """
-    a = n * n
-    b = a + n
-    c = b + m * n
-    d = c + m
-    e = d + rows * n
-    f = e + rows
-    g = f + n
-    h = g + m
-    i = h + rows
-    j = i + rows
-    k = j + (n + m) * (n + m)
-    o = k + n + m
-    p = o + rows * n
-    q = p + rows
-    r = q + cones
-    s = r + 7 * rows
+    H, at = piece(flat, 0, n, n)
+    A, at = piece(flat, at, m, n)
+    G, at = piece(flat, at, rows, n)
+    kkt, at = piece(flat, at, n + m, n + m)
+    scaled, at = piece(flat, at, rows, n)
+    work, at = piece(flat, at, 7, rows)
+    vectors, _ = piece(flat, at, 1, flat.shape[0] - at)
+    line, b = vectors[0], n
+    h = b + m
+    x = h + rows
+    y = x + n
+    s = y + m
+    z = s + rows
+    step = z + rows
+    scaling = step + n + m
+    size = scaling + rows
+    kept = size + cones
     return ConeProgram(
-        flat[:a].reshape((n, n)),
-        flat[a:b],
-        flat[b:c].reshape((m, n)),
-        flat[c:d],
-        flat[d:e].reshape((rows, n)),
-        flat[e:f],
-        first,
-        flat[f:g],
-        flat[g:h],
-        flat[h:i],
-        flat[i:j],
-        flat[j:k].reshape((n + m, n + m)),
-        flat[k:o],
-        flat[o:p].reshape((rows, n)),
-        flat[p:q],
-        flat[q:r],
-        flat[r:s].reshape((7, rows)),
-        flat[s : s + n + m + 2 * rows],
-    )
+        H, line[:b], A, line[b:h], G, line[h:x], first, line[x:y], line[y:s], line[s:z], line[z:step], kkt,
+        line[step:scaling], scaled, line[scaling:size], line[size:kept], work, line[kept : kept + n + m + 2 * rows],
+    )  # fmt: skip
+
+
+@internal_kernel
+def piece(flat, start, rows, columns):
+    """Return the matrix of this size in ``flat`` from ``start`` on, and the index behind it."""
+    end = start + rows * columns
+    return flat[start:end].reshape((rows, columns)), end
 
 
 @kernel
@@ -199,14 +188,11 @@ def keep(program: ConeProgram, n, m, cones, store):
 def start(program: ConeProgram, n, m, cones):
     """Set s to the slacks of x, y to zero, and z so that s and z are on the central path."""
     s, z, first = program.s, program.z, program.first
-    for e in range(m):
-        program.y[e] = 0.0
+    program.y[:m] = 0.0
     for c in range(cones):
         square = 0.0
         for i in range(first[c], first[c + 1]):
-            s[i] = program.h[i]
-            for k in range(n):
-                s[i] += program.G[i, k] * program.x[k]
+            s[i] = affine_row(program.G, program.x, program.h, n, i)
             square += s[i] * s[i] * (1.0 if i == first[c] else -1.0)
         for i in range(first[c], first[c + 1]):
             z[i] = s[i] / square * (1.0 if i == first[c] else -1.0)
@@ -327,28 +313,13 @@ def factor_kkt(program: ConeProgram, n, m, rows, cones):
                 kkt[k, j] += program.A[e, k] * program.A[e, j]
         for j in range(e + 1):
             kkt[n + e, n + j] = 0.0
-    for k in range(n + m):
-        for j in range(k):
-            for i in range(j):
-                kkt[k, j] -= kkt[k, i] * kkt[j, i]
-        # So far the entries are L D.
-        removed = 0.0
-        least = PIVOT_MIN * kkt[k, k]
-        for j in range(k):
-            whole = kkt[k, j]
-            kkt[k, j] = whole / kkt[j, j]
-            kkt[k, k] -= whole * kkt[k, j]
-            removed += abs(whole * kkt[k, j])
-        if k < n:
-            kkt[k, k] = max(kkt[k, k], least)
-        elif -kkt[k, k] <= RANK_TOLERANCE * removed:
-            kkt[k, k] = -HUGE
+    factor_symmetric(kkt, n + m, n)
 
 
 @internal_kernel
 def newton_step(program: ConeProgram, n, m, cones):
     """Compute the step of all unknowns for λ ∘ (W dz + W⁻¹ ds) = TARGET, which is overwritten."""
-    work, kkt, step, first = program.work, program.kkt, program.step, program.first
+    work, step, first = program.work, program.step, program.first
     z, rows = program.z, first[cones]
     target, ds, dz = work[TARGET], work[DS], work[DZ]
     scaled_ds, scaled_dz = work[SCALED_DS], work[SCALED_DZ]
@@ -367,19 +338,9 @@ def newton_step(program: ConeProgram, n, m, cones):
         step[n + e] = -left
         for k in range(n):
             step[k] -= program.A[e, k] * left
-    size = n + m
-    for k in range(size):
-        for j in range(k):
-            step[k] -= kkt[k, j] * step[j]
-    for k in range(size):
-        step[k] /= kkt[k, k]
-    for k in range(size - 1, -1, -1):
-        for j in range(k + 1, size):
-            step[k] -= kkt[j, k] * step[j]
+    solve_symmetric(program.kkt, step, n + m)
     for i in range(rows):
-        ds[i] = work[RESIDUAL, i]
-        for k in range(n):
-            ds[i] += program.G[i, k] * step[k]
+        ds[i] = affine_row(program.G, step, work[RESIDUAL], n, i)
         scaled_ds[i] = ds[i]
     for c in range(cones):
         unscale(program, c, scaled_ds)
@@ -413,6 +374,48 @@ def divide(work, u, out, a, end):
     for i in range(a + 1, end):
         work[out, i] = (work[out, i] - head * work[u, i]) / work[u, a]
     work[out, a] = head
+
+
+@internal_kernel
+def clear_objective(program: ConeProgram, unknowns, weight):
+    """Reset the objective to a small weight on the unknowns."""
+    for k in range(unknowns):
+        program.g[k] = 0.0
+        for m in range(unknowns):
+            program.H[k, m] = weight if m == k else 0.0
+
+
+@internal_kernel
+def worst_margin(program: ConeProgram, unknowns, cones):
+    """Return the smallest distance of x to the boundary of a cone; negative outside."""
+    worst = math.inf
+    for c in range(cones):
+        head, square = 0.0, 0.0
+        for i in range(program.first[c], program.first[c + 1]):
+            slack = affine_row(program.G, program.x, program.h, unknowns, i)
+            if i == program.first[c]:
+                head = slack
+            else:
+                square += slack * slack
+        worst = min(worst, head - math.sqrt(square))
+    return worst
+
+
+@internal_kernel
+def maximise_margin(program: ConeProgram, unknowns, equations, cones, most, weight):
+    """Find the point x with the largest margin to all cones, at most ``most``, from the present x; return this margin.
+
+    The margin is one more unknown, with its column of G; ``weight`` is the weight of the others in the objective.
+    """
+    rows, x = program.first[cones], program.x
+    clear_objective(program, unknowns + 1, weight)
+    program.g[unknowns], program.H[unknowns, unknowns] = -1.0, 0.0
+    program.G[rows, unknowns], program.h[rows], program.first[cones + 1] = -1.0, most, rows + 1
+    for k in range(unknowns):
+        program.G[rows, k] = 0.0
+    x[unknowns] = min(worst_margin(program, unknowns, cones), most) - 1.0
+    solve_cone_program(program, unknowns + 1, equations, cones + 1)
+    return x[unknowns]
 
 
 @internal_kernel
@@ -455,24 +458,19 @@ MARGIN_MAX = 10.0
 FORCE_TOLERANCE = 1e-9
 
 
-def split_room(r: int, count: int) -> ConeProgram:
-    """Allocate scratch for :func:`best_split`, for null spaces of up to r columns and ``count`` contacts."""
-    return cone_program(*split_sizes(r, count))
-
-
 def split_size(r: int, count: int) -> int:
-    """Return the number of floats in that scratch, see :func:`split_room_in`."""
+    """Return the number of floats in the scratch of :func:`best_split`, see :func:`split_room_in`."""
     return program_size(*split_sizes(r, count))
 
 
 def split_sizes(r: int, count: int) -> tuple[int, int, int, int]:
-    """Return unknowns, equations, cones and rows of the larger of its programs."""
+    """Return unknowns, equations, cones and rows for null spaces of up to r columns and ``count`` contacts."""
     return r + 1, 2 * count, count + 1, ka.MOST_ROWS * count + 1
 
 
 @internal_kernel
 def split_room_in(flat, first, r, count):
-    """Return :func:`split_room` in given arrays, (split_size(r, count),) and (count + 2,) int."""
+    """Return the scratch of :func:`best_split` in given arrays, (split_size(r, count),) and (count + 2,) int."""
     return program_in(flat, first, r + 1, 2 * count, count + 1, ka.MOST_ROWS * count + 1)
 
 
@@ -498,7 +496,7 @@ def best_split(f0, N, r, contact_first, mu, contacts, joints, out, room: ConePro
     out : (p or more,) ndarray
         Force of least norm in all cones; if no force is in all cones, the force of the best margin.
     room : ConeProgram
-        Scratch, see :func:`split_room`.
+        Scratch of :func:`split_sizes`.
     least : bool
         False: always the split of the best margin.
 
@@ -515,43 +513,26 @@ def best_split(f0, N, r, contact_first, mu, contacts, joints, out, room: ConePro
     if scale == 0.0 or count == 0:
         return 0.0
     x, equations = room.x, 0
-    worst = math.inf
-    for j in range(count):
-        i = contact_first[j]
-        if j >= contacts:
-            worst = min(worst, (mu[j] - abs(f0[i]) if mu[j] >= 0.0 else f0[i]) / scale)
-            continue
+    for j in range(contacts):
         if mu[j] > 0.0:
-            worst = min(worst, (mu[j] * f0[i] - math.hypot(f0[i + 1], f0[i + 2])) / scale)
             continue
-        worst = min(worst, f0[i] / scale)
         for e in range(1, ka.MOST_ROWS):
+            i = contact_first[j] + e
             for k in range(r):
-                room.A[equations, k] = N[i + e, k]
+                room.A[equations, k] = N[i, k]
             room.A[equations, r] = 0.0
-            room.b[equations] = -f0[i + e] / scale
+            room.b[equations] = -f0[i] / scale
             equations += 1
+    cone_rows(f0, N, r, contact_first, mu, contacts, joints, scale, room)
+    for k in range(r):
+        x[k] = 0.0
     if r == 0:
+        worst = worst_margin(room, r, count)
         for e in range(equations):
             if abs(room.b[e]) > FORCE_TOLERANCE:
                 worst = min(worst, -abs(room.b[e]))
         return worst * scale
-
-    # The margin t is the last unknown.
-    rows = cone_rows(f0, N, r, contact_first, mu, contacts, joints, scale, room)
-    for k in range(r + 1):
-        for m in range(r + 1):
-            room.H[k, m] = 0.0
-        room.H[k, k] = LEAST_WEIGHT
-        room.g[k], x[k] = 0.0, 0.0
-    room.H[r, r], room.g[r] = 0.0, -1.0
-    x[r] = min(worst, 0.0) - 1.0
-    room.first[count + 1] = rows + 1
-    for k in range(r):
-        room.G[rows, k] = 0.0
-    room.G[rows, r], room.h[rows] = -1.0, MARGIN_MAX
-    solve_cone_program(room, r + 1, equations, count + 1)
-    margin = x[r]
+    margin = maximise_margin(room, r, equations, count, MARGIN_MAX, LEAST_WEIGHT)
     error = 0.0
     for e in range(equations):
         off = -room.b[e]
@@ -580,39 +561,30 @@ def best_split(f0, N, r, contact_first, mu, contacts, joints, out, room: ConePro
 
 @internal_kernel
 def cone_rows(f0, N, r, contact_first, mu, contacts, joints, scale, room: ConeProgram):
-    """Write the cones in z and the margin t; return the number of rows.
-
-    (μ f_n − t, f_t) for contacts, (μ − t, f) for joints, f − t for stops.
-    """
+    """Write the cones in z and the margin t: (μ f_n − t, f_t) for contacts, (μ − t, f) for joints, f − t for stops."""
     row = 0
-    for j in range(contacts):
-        i, room.first[j] = contact_first[j], row
-        slope = mu[j] if mu[j] > 0.0 else 1.0
-        for k in range(r):
-            room.G[row, k] = slope * N[i, k]
-        room.G[row, r], room.h[row] = -1.0, slope * f0[i] / scale
-        row += 1
-        if mu[j] > 0.0:
-            for e in range(1, ka.MOST_ROWS):
-                for k in range(r):
-                    room.G[row, k] = N[i + e, k]
-                room.G[row, r], room.h[row] = 0.0, f0[i + e] / scale
-                row += 1
-    for j in range(contacts, contacts + joints):
-        i, room.first[j] = contact_first[j], row
-        if mu[j] < 0.0:
-            for k in range(r):
-                room.G[row, k] = N[i, k]
-            room.G[row, r], room.h[row] = -1.0, f0[i] / scale
-            row += 1
+    for j in range(contacts + joints):
+        i, room.first[j], slope = contact_first[j], row, mu[j] if mu[j] > 0.0 else 1.0
+        if j >= contacts and mu[j] >= 0.0:
+            force_row(f0, N, r, i, 0.0, scale, room, row, -1.0)
+            room.h[row] = mu[j] / scale
+            force_row(f0, N, r, i, 1.0, scale, room, row + 1, 0.0)
+            row += 2
             continue
-        for k in range(r):
-            room.G[row, k], room.G[row + 1, k] = 0.0, N[i, k]
-        room.G[row, r], room.h[row] = -1.0, mu[j] / scale
-        room.G[row + 1, r], room.h[row + 1] = 0.0, f0[i] / scale
-        row += 2
+        force_row(f0, N, r, i, slope if j < contacts else 1.0, scale, room, row, -1.0)
+        row += 1
+        for e in range(1, ka.MOST_ROWS if j < contacts and mu[j] > 0.0 else 1):
+            force_row(f0, N, r, i + e, 1.0, scale, room, row, 0.0)
+            row += 1
     room.first[contacts + joints] = row
-    return row
+
+
+@internal_kernel
+def force_row(f0, N, r, i, factor, scale, room: ConeProgram, row, by_margin):
+    """Write row ``row`` of the cones: ``factor`` times force i, and ``by_margin`` times the margin."""
+    for k in range(r):
+        room.G[row, k] = factor * N[i, k]
+    room.G[row, r], room.h[row] = by_margin, factor * f0[i] / scale
 
 
 # Selection of indeterminate contact forces: towards least norm, within the friction cones.
@@ -653,10 +625,9 @@ def select_least_norm(W, w, kind, mu, p, f, room):
                     total += S[i, k] * W[a + k, b + m] * S[j, m]
             G[i, j], G[j, i] = total, total
         trace += G[i, i]
-    if not trace > 0.0 or factored(G, L, room[PIVOT, 0], n, 0.0, SINGULAR * trace / n):
+    if not trace > 0.0 or factor_shifted(G, L, n, 0.0) > SINGULAR * trace / n:
         return
-    shift = SHIFT * trace / n
-    factored(G, L, room[PIVOT, 0], n, shift, 0.0)
+    factor_shifted(G, L, n, SHIFT * trace / n)
     # x = (G + ε)⁻¹ G x₀, refined: the error outside the range of G stays zero, inside it falls by ε each time.
     for i in range(n):
         goal[i] = 0.0
@@ -665,7 +636,7 @@ def select_least_norm(W, w, kind, mu, p, f, room):
             right[i] = 0.0
             for j in range(n):
                 right[i] += G[i, j] * (now[j] - goal[j])
-        substitute(L, room[PIVOT, 0], right, n)
+        solve_symmetric(L, right, n)
         for i in range(n):
             goal[i] += right[i]
     strongest = 0.0
@@ -735,33 +706,17 @@ def sliding_share(W, w, mu, f, k, slip):
 
 
 @internal_kernel
-def factored(G, L, pivot, n, shift, least):
-    """Factor G + ``shift`` = L D Lᵀ, (n, n), with D in ``pivot``; False if a pivot is not above ``least``."""
-    for j in range(n):
-        d = G[j, j] + shift
-        for k in range(j):
-            d -= L[j, k] * L[j, k] * pivot[k]
-        pivot[j] = d
-        if not d > least:
-            return False
-        for i in range(j + 1, n):
-            total = G[i, j]
-            for k in range(j):
-                total -= L[i, k] * L[j, k] * pivot[k]
-            L[i, j] = total / d
-    return True
-
-
-@internal_kernel
-def substitute(L, pivot, x, n):
-    """Overwrite x with (L D Lᵀ)⁻¹ x."""
+def factor_shifted(G, L, n, shift):
+    """Factor G + ``shift``, (n, n), into L, see :func:`factor_symmetric`; return the smallest pivot."""
+    least = math.inf
     for i in range(n):
-        for k in range(i):
-            x[i] -= L[i, k] * x[k]
-    for i in range(n - 1, -1, -1):
-        x[i] /= pivot[i]
-        for k in range(i + 1, n):
-            x[i] -= L[k, i] * x[k]
+        for j in range(i + 1):
+            L[i, j] = G[i, j]
+        L[i, i] += shift
+    factor_symmetric(L, n, n)
+    for i in range(n):
+        least = min(least, L[i, i])
+    return least
 
 
 @internal_kernel

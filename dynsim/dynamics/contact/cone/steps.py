@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 
+from dynsim.dynamics.linear import affine_row, eliminate
 from dynsim.jit.kernel import internal_kernel, kernel
 
 BOTH_WAYS, ONE_WAY, CONE, TANGENT, BOX = 0, 1, 2, 3, 4
@@ -29,6 +30,13 @@ ROOT_STEPS = 60
 def block_size(kind, k):
     """Return the number of rows of the block that begins at row k."""
     return 3 if kind[k] == CONE else 1
+
+
+@internal_kernel
+def copy(source, target, p):
+    """Copy the first p numbers."""
+    for k in range(p):
+        target[k] = source[k]
 
 
 @internal_kernel
@@ -55,10 +63,7 @@ def mobilities(W, kind, p, room):
 def motion(W, b, p, f, u):
     """Compute u = W f + b."""
     for k in range(p):
-        total = b[k]
-        for m in range(p):
-            total += W[k, m] * f[m]
-        u[k] = total
+        u[k] = affine_row(W, f, b, p, k)
 
 
 @internal_kernel
@@ -112,8 +117,7 @@ def newton_step(W, b, kind, mu, p, f, room, relative, most):
     near = min(max(PROXIMAL_FACTOR * most * relative, LEAST_PROXIMAL), most)
     find_statuses(kind, mu, p, f, room)
     known = room[KNOWN, 0]
-    for k in range(p):
-        known[k] = b[k]
+    copy(b, known, p)
     m = 0
     while m < p:
         # STATUS is written at the first row of a block only: tangents have values left by another problem.
@@ -142,7 +146,7 @@ def newton_step(W, b, kind, mu, p, f, room, relative, most):
                 x[r] = more * (ex * f[k + 1] + ey * f[k + 2]) - (ex * known[k + 1] + ey * known[k + 2])
                 r += 1
         k += block_size(kind, k)
-    eliminate(A, x, r)
+    eliminate(A, x, r, -1.0)
     r, k = 0, 0
     while k < p:
         if status[k] == SLIDES:
@@ -211,54 +215,20 @@ def fill_row(W, kind, mu, p, i, j, alpha, gamma, room, r):
 
 
 @internal_kernel
-def eliminate(A, x, size):
-    """Solve the leading ``size`` rows of A y = x in place, with partial pivoting."""
-    for k in range(size):
-        best, largest = k, abs(A[k, k])
-        for i in range(k + 1, size):
-            if abs(A[i, k]) > largest:
-                best, largest = i, abs(A[i, k])
-        if best != k:
-            x[k], x[best] = x[best], x[k]
-            for j in range(k, size):
-                A[k, j], A[best, j] = A[best, j], A[k, j]
-        inverse = 1.0 / A[k, k]
-        for i in range(k + 1, size):
-            factor = A[i, k] * inverse
-            if factor != 0.0:
-                # Slices that begin at index zero: only such loops are vectorised.
-                row, pivot = A[i, k + 1 : size], A[k, k + 1 : size]
-                for j in range(row.shape[0]):
-                    row[j] -= factor * pivot[j]
-                x[i] -= factor * x[k]
-    for i in range(size - 1, -1, -1):
-        total = x[i]
-        for j in range(i + 1, size):
-            total -= A[i, j] * x[j]
-        x[i] = total / A[i, i]
-
-
-@internal_kernel
 def sweep(W, b, kind, mu, p, f, room):
     """Do one sweep of block Gauss–Seidel: each block solved exactly with the other forces fixed."""
     mobility = room[MOBILITY, 0]
     k = 0
     while k < p:
         if kind[k] == CONE:
-            n, x, y = b[k], b[k + 1], b[k + 2]
-            for m in range(p):
-                n += W[k, m] * f[m]
-                x += W[k + 1, m] * f[m]
-                y += W[k + 2, m] * f[m]
+            n, x, y = affine_row(W, f, b, p, k), affine_row(W, f, b, p, k + 1), affine_row(W, f, b, p, k + 2)
             n -= W[k, k] * f[k] + W[k, k + 1] * f[k + 1] + W[k, k + 2] * f[k + 2]
             x -= W[k + 1, k] * f[k] + W[k + 1, k + 1] * f[k + 1] + W[k + 1, k + 2] * f[k + 2]
             y -= W[k + 2, k] * f[k] + W[k + 2, k + 1] * f[k + 1] + W[k + 2, k + 2] * f[k + 2]
             solve_block(W, k, n, x, y, mu[k], f, 1e-12 * mobility[k])
             k += 3
             continue
-        total = b[k]
-        for m in range(p):
-            total += W[k, m] * f[m]
+        total = affine_row(W, f, b, p, k)
         new = f[k] - total / max(W[k, k], 1e-12 * mobility[k]) if W[k, k] > 0.0 else 0.0
         f[k] = new if kind[k] == BOTH_WAYS else max(new, 0.0)
         if kind[k] == BOX:
@@ -329,20 +299,6 @@ def sliding_force(a, c, d, gx, gy, wx, wy, n, mu, alpha):
 
 # Solver of the contact problem.
 
-
-__all__ = [
-    "BOTH_WAYS",
-    "BOX",
-    "CONE",
-    "CONE_ROOM",
-    "NO_SOLUTION",
-    "ONE_WAY",
-    "TANGENT",
-    "approach",
-    "approach_or_proximal_point",
-    "proximal_point",
-    "solve_cones",
-]
 
 # Return value of ``solve_cones`` instead of a residual if there is provably no solution.
 NO_SOLUTION = -1.0
@@ -424,13 +380,11 @@ def approach(W, b, kind, mu, p, f, room, tolerance, rounds):
                     largest = max(largest, abs(best[k]) * mobility[k])
                 scatter(mobility, p, f, largest, attempt)
             else:
-                for k in range(p):
-                    f[k] = swept[k]
+                copy(swept, f, p)
             for _ in range(SWEEPS * (attempt if attempt <= SWEPT_ROUNDS else attempt % SWEEPS)):
                 sweep(W, b, kind, mu, p, f, room)
             if not scattered:
-                for k in range(p):
-                    swept[k] = f[k]
+                copy(f, swept, p)
             residual, merit = measure(W, b, kind, mu, p, f, room)
         # A value too small for some problems is too large for others.
         most = 1e-6 if attempt % 6 < 2 else 1e-3 if attempt % 6 < 4 else 1e-9
@@ -438,16 +392,14 @@ def approach(W, b, kind, mu, p, f, room, tolerance, rounds):
             # Written so that NaN is never the best.
             if residual < least:
                 least = residual
-                for k in range(p):
-                    best[k] = f[k]
+                copy(f, best, p)
             if not residual > tolerance or step == NEWTON_STEPS:
                 break
             relative = residual / scale if scale > 0.0 else 1.0
             residual, merit = damped_step(W, b, kind, mu, p, f, room, relative, most, merit, step >= FULL_STEPS)
         if least <= tolerance:
             break
-    for k in range(p):
-        f[k] = best[k]
+    copy(best, f, p)
     return least
 
 
@@ -455,14 +407,12 @@ def approach(W, b, kind, mu, p, f, room, tolerance, rounds):
 def damped_step(W, b, kind, mu, p, f, room, relative, most, before, damped):
     """Take one Newton step, halved until the merit falls if ``damped``; return residual and merit there."""
     start, goal = room[START, 0], room[GOAL, 0]
-    for k in range(p):
-        start[k] = f[k]
+    copy(f, start, p)
     newton_step(W, b, kind, mu, p, f, room, relative, most)
     residual, merit = measure(W, b, kind, mu, p, f, room)
     if not damped or merit < before:
         return residual, merit
-    for k in range(p):
-        goal[k] = f[k]
+    copy(f, goal, p)
     t, at, least = 1.0, 1.0, merit
     for _ in range(HALVINGS):
         t *= 0.5
@@ -523,19 +473,16 @@ def proximal_point(W, b, kind, mu, p, f, room, tolerance):
         residual, _ = measure(W, b, kind, mu, p, f, room)
         if residual < least:
             least = residual
-            for k in range(p):
-                kept[k] = f[k]
+            copy(f, kept, p)
         if least <= tolerance:
             break
         solved = left <= 0.1 * residual + inner
-        for k in range(p):
-            if solved:
-                anchor[k] = f[k]
-            else:
-                f[k] = anchor[k]
+        if solved:
+            copy(f, anchor, p)
+        else:
+            copy(anchor, f, p)
         epsilon = max(0.3 * epsilon, LEAST_EPSILON) if solved else min(10.0 * epsilon, 1.0)
-    for k in range(p):
-        f[k] = kept[k]
+    copy(kept, f, p)
     return least
 
 
