@@ -360,7 +360,7 @@ class _OwnCallees(JITCodeLibrary):
         ll_module.data_layout = self._codegen._data_layout
 
     def finalize(self) -> None:
-        self._linking_libraries = list(_with_callees(self._linking_libraries))
+        self._linking_libraries = _with_callees(self._linking_libraries)
         super().finalize()
 
     def _optimize_final_module(self) -> None:
@@ -511,15 +511,25 @@ class _ToLink(JITCodeLibrary):
         self._finalized = True
 
 
-def _with_callees(libraries: Iterable[Any], seen: set[Any] | None = None) -> Iterator[Any]:
-    """Yield the libraries, and those called by parts among them, each once."""
-    seen = set() if seen is None else seen
+def _with_callees(libraries: Iterable[Any]) -> list[Any]:
+    """Return the libraries, and those called by parts among them, each once and after all of its callers.
+
+    LLVM drops a function if nothing linked before refers to it, and later calls of it would have no address.
+    """
+    seen, callees_first = set[Any](), list[Any]()
+
+    def visit(library: Any) -> None:
+        if library in seen:
+            return
+        seen.add(library)
+        if isinstance(library, _ToLink):
+            for callee in library._linking_libraries:
+                visit(callee)
+        callees_first.append(library)
+
     for library in libraries:
-        if library not in seen:
-            seen.add(library)
-            yield library
-            if isinstance(library, _ToLink):
-                yield from _with_callees(library._linking_libraries, seen)
+        visit(library)
+    return callees_first[::-1]
 
 
 class _ToCall(_ToLink):

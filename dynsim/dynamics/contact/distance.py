@@ -12,15 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dynsim.dynamics.tree.spatial import (
-    first_axis,
-    rotate,
-    rotate_back,
-    rotation,
-    second_axis,
-    third_axis,
-    vector,
-)
+from dynsim.dynamics.tree.spatial import first_axis, rotate, rotate_back, rotation, second_axis, third_axis, vector
 from dynsim.jit.kernel import internal_kernel, kernel
 
 # ShapeArrays.kind, int

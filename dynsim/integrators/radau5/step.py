@@ -42,13 +42,7 @@ from dynsim.integrators.radau5.tables import (
     T_RADAU,
     NewtonArrays,
 )
-from dynsim.integrators.run import (
-    Run,
-    forces_unique,
-    off_surface,
-    settle,
-    watch,
-)
+from dynsim.integrators.run import Run, forces_unique, off_surface, settle, watch
 from dynsim.integrators.simd.forms import StageLanes
 from dynsim.integrators.steps import energy_norm, error_norm
 from dynsim.jit.kernel import internal_kernel, noinline_kernel

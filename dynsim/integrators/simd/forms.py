@@ -16,12 +16,7 @@ from numba.np.arrayobj import make_array, populate_array
 
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
-from dynsim.dynamics.contact.delassus import (
-    check_forces,
-    solve_dependent,
-    solve_many,
-    solve_small,
-)
+from dynsim.dynamics.contact.delassus import check_forces, solve_dependent, solve_many, solve_small
 from dynsim.dynamics.contact.rows import sign_changed, surface_distance
 from dynsim.dynamics.contact.shares import solve_near_shares
 from dynsim.dynamics.contact.unilateral import slide_direction, sliding_friction

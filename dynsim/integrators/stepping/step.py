@@ -141,10 +141,8 @@ def begin_energy(system: System, ws: Workspace, run: Run):
         same = same and run.y[j] == run.y_new[j]
     # NaN before the first step.
     if same and energy[kt.STOP, kt.MECHANICAL] == energy[kt.STOP, kt.MECHANICAL]:
-        energy[kt.START, kt.MECHANICAL], energy[kt.START, kt.MAGNETIC] = (
-            energy[kt.STOP, kt.MECHANICAL],
-            energy[kt.STOP, kt.MAGNETIC],
-        )
+        for m in range(energy.shape[1]):
+            energy[kt.START, m] = energy[kt.STOP, m]
     else:
         stored_energy(system, ws, run.y, energy[kt.START])
 
