@@ -105,7 +105,7 @@ def solve_symmetric(A, x, size):
 def orthonormalise(V, size, leading, least):
     """Replace the rows of V, (size, size), by an orthonormal basis of them, the largest row first; return its size.
 
-    Rows of which no more than ``least`` is left count as dependent. Products are those of the ``leading`` entries.
+    Rows of which no more than ``least`` is left count as dependent. Products include only the ``leading`` entries.
     """
     for k in range(size):
         best, largest = k, -1.0
