@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import reduce
-from typing import TypeGuard
 
 import numpy as np
 
@@ -43,64 +41,26 @@ class Sinking:
     sample: int
 
 
-def poses(
-    robot: Robot, q: Array, bodies: Collection[str] | None = None, directions: Array | None = None
-) -> Iterator[tuple[Link, Array, Array]]:
+def poses(robot: Robot, q: Array) -> Iterator[tuple[Link, Array, Array]]:
     """Yield each body with R_WB, (3, 3, T), and p_WB, (3, T) [m], at joint positions q, (T, nq).
 
     Vectorized over the samples, which are contiguous in memory: thousands of samples cost a millisecond.
-
-    Parameters
-    ----------
-    robot : Robot
-        Description of the robot.
-    q : (T, nq) ndarray
-        Joint positions [rad or m].
-    bodies : collection of str, optional
-        Only these bodies and the bodies that carry them; default: all.
-    directions : (k, 3) ndarray, optional
-        Directions d in W: yield d·R_WB, (k, 3, T), and d·p_WB, (k, T), instead.
     """
-    view = np.eye(3) if directions is None else directions
     q = np.ascontiguousarray(q.T)
-    links = {link.name: link for link in robot.links}
-    wanted = set(links if bodies is None else bodies)
-    for link in reversed(robot.links):
-        if link.name in wanted and link.parent is not None:
-            wanted.add(link.parent)
-    waiting = dict.fromkeys(wanted, 0)
-    for name in wanted:
-        if (parent := links[name].parent) is not None:
-            waiting[parent] += 1
-    count = q.shape[1]
-    known: dict[str, tuple[Array, Array]] = {}
-    index = robot.position_index
-    for i, link in enumerate(robot.links):
-        if link.name not in wanted:
-            continue
-        if link.parent is None:
-            R, p = (np.repeat((view @ part)[..., None], count, axis=-1) for part in (link.R_PJ, link.p_PJ))
-        else:
-            R_WP, p_WP = known[link.parent]
-            R, p = link.R_PJ.T @ R_WP, p_WP + link.p_PJ @ R_WP
-            waiting[link.parent] -= 1
-            if not waiting[link.parent]:
-                del known[link.parent]
-        k, row = index[i], link.row
-        if link.kind == "prismatic":
-            p = p + q[k] * (link.axis @ R)
-        elif link.kind != "revolute":
-            # Only the first row of a joint moves the body.
-            if row.motion is not None:
-                turn, shift = row.motion(link, q[k : k + len(row.neutral)])
-                p = p + np.einsum("ijt,jt->it", R, shift)
-                R = np.einsum("ijt,jkt->ikt", R, turn)
-        else:
-            x, y, z = link.axis
-            K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-            # R (1 + sin q K + (1 − cos q) K²); a product from the right is K'ᵀ from the left on the middle axis.
-            R = R + np.sin(q[k]) * (K.T @ R) + (1.0 - np.cos(q[k])) * ((K @ K).T @ R)
-        if waiting[link.name]:
+    last_child = {link.parent: link.name for link in robot.links}
+    world = np.repeat(np.eye(3)[..., None], q.shape[1], axis=-1), np.zeros((3, q.shape[1]))
+    known: dict[str | None, tuple[Array, Array]] = {None: world}
+    for k, link in zip(robot.position_index, robot.links, strict=True):
+        R_WP, p_WP = known[link.parent]
+        # A product from the right is the transposed matrix from the left on the middle axis.
+        R, p = link.R_PJ.T @ R_WP, p_WP + link.p_PJ @ R_WP
+        if link.row.motion is not None:  # only the first row of a joint moves the body
+            turn, shift = link.row.motion(link, q[k : k + len(link.row.neutral)])
+            p = p + np.einsum("ijt,jt->it", R, shift)
+            R = np.einsum("ijt,jkt->ikt", R, turn)
+        if last_child[link.parent] == link.name:
+            del known[link.parent]
+        if link.name in last_child:
             known[link.name] = R, p
         yield link, R, p
 
@@ -125,32 +85,11 @@ def gaps(
 ) -> Iterator[tuple[Link, list[Array]]]:
     """Yield each body with the signed distances, (T,) [m], of its points from surfaces, at joint positions q, (T, nq).
 
-    ``points`` contains surface and point, (3,) in the body's frame [m], for each body. If all surfaces are planes, only
-    components along their normals are computed, which takes a third of the time.
+    ``points`` contains surface and point, (3,) in the body's frame [m], for each body.
     """
-    surfaces = {id(surface): surface for pairs in points.values() for surface, _ in pairs}
-    planes = {key: surface for key, surface in surfaces.items() if is_plane(surface)}
-    flat = len(planes) == len(surfaces)
-    # Index among the normals, and distance from the origin, for each plane.
-    rows = {key: (k, surface.c / np.linalg.norm(surface.b)) for k, (key, surface) in enumerate(planes.items())}
-    normals = np.array([surface.b / np.linalg.norm(surface.b) for surface in planes.values()])
-    for link, R, p in poses(robot, q, points, normals if flat else None):
-        if link.name not in points:
-            continue
-        distances = []
-        for surface, point in points[link.name]:
-            position = p + point @ R if point.any() else p
-            if flat:
-                k, offset = rows[id(surface)]
-                distances.append(position[k] + offset)
-            else:
-                distances.append(surface.gaps(position.T))
-        yield link, distances
-
-
-def is_plane(surface: Surface) -> TypeGuard[Quadric]:
-    """Return True for a quadric without curvature."""
-    return isinstance(surface, Quadric) and not surface.Q.any()
+    for link, R, p in poses(robot, q):
+        if link.name in points:
+            yield link, [surface.gaps((p + point @ R).T) for surface, point in points[link.name]]
 
 
 def sinking(robot: Robot, surfaces: Mapping[str, Surface], q: Array) -> list[Sinking]:
@@ -179,23 +118,10 @@ def by_surface(sunk: Sequence[Sinking]) -> dict[str, list[Sinking]]:
 
 
 def _axis_gaps(robot: Robot, surfaces: Mapping[str, Surface], q: Array) -> Iterator[tuple[Link, str, Array]]:
-    """Yield the minimum distance of each body's axes from each surface, (T,) [m]; at their ends if all surfaces are
-    planes.
-    """
+    """Yield the minimum distance of each body's axes from each surface, (T,) [m]."""
     tips, carriers = axis_ends(robot), robot.carriers
-    bodies = [link.name for link in robot.links if link.name not in carriers]
-    if all(map(is_plane, surfaces.values())):
-        ends = {
-            body: [(surface, end) for surface in surfaces.values() for end in (np.zeros(3), *tips[body])]
-            for body in bodies
-        }
-        for link, each in gaps(robot, q, ends):
-            count = 1 + len(tips[link.name])
-            for k, name in enumerate(surfaces):
-                yield link, name, reduce(np.minimum, each[k * count : (k + 1) * count])
-        return
-    for link, R, p in poses(robot, q, bodies):
-        for name, surface in surfaces.items() if link.name in bodies else ():
+    for link, R, p in poses(robot, q):
+        for name, surface in surfaces.items() if link.name not in carriers else ():
             gap = surface.gaps(p.T)
             for tip in tips[link.name]:
                 gap = np.minimum(gap, _segment_gap(surface, p.T, (tip @ R).T))

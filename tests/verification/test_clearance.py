@@ -65,12 +65,6 @@ def test_rows_without_a_body_do_not_sink():
     assert sunk.depth == pytest.approx(0.2)
 
 
-def test_only_the_bodies_asked_for_and_what_carries_them():
-    robot = build.robot(load_scenario("elbow_comparison"))
-    named = [link.name for link, _, _ in poses(robot, np.zeros((1, 10)), ["link_3"])]
-    assert named == ["link_1", "link_2", "link_3"]
-
-
 def surface(kind: str, inside: bool = False, scale: float = 1.0) -> Quadric:
     shape = {
         "plane": {"point_m": [0, 0, 0.1], "normal": [1, 2, 3]},
