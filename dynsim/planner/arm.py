@@ -156,6 +156,16 @@ def axis_points(arm: MovingArm, shares: Sequence[float]) -> list[tuple[int, Arra
     ]
 
 
+def axis_lines(arm: MovingArm, q: Array) -> Array:
+    """Return both ends of the axes of all links, in the order of :func:`axis_points`, (m, 2, 3) [m], in a posture."""
+    whole = arm.coordinates(q[None])[0]
+    lines = []
+    for k, end, _, _ in axis_points(arm, (1.0,)):
+        R, p = arm.model.body_pose(arm.links[k], whole)
+        lines.append((p, p + R @ end))
+    return np.array(lines).reshape(-1, 2, 3)
+
+
 # Local solver: postures along the path and brace forces of least heat for one set of braces.
 
 
@@ -188,12 +198,12 @@ class Problem:
 
     def evaluate(self, Q: Array, F: Array) -> None:
         """Compute torques, geometry and derivatives in the workspace."""
-        compiled.evaluate(self.arm, self.points, self.course, self.work, Q, F, self.min_force, False)
+        compiled.statics(self.arm, self.points, self.course, self.work, Q, F, self.min_force, False)
 
     def forces(self, Q: Array) -> Array:
         """Return the normal forces of least heat, shape (E, c) [N]; the workspace has the corresponding torques."""
         F = np.zeros((len(self.course.knot), len(self.points.friction)))
-        compiled.evaluate(self.arm, self.points, self.course, self.work, Q, F, self.min_force, True)
+        compiled.statics(self.arm, self.points, self.course, self.work, Q, F, self.min_force, True)
         return F
 
     def heat(self) -> float:
@@ -202,8 +212,7 @@ class Problem:
 
     def retract(self, Q: Array, steps: int = 12, tolerance: float = compiled.ON) -> float:
         """Project postures onto hand path and braces, in place; return the residual [m]."""
-        reach = 2.0 * compiled.REACH / 3.0
-        return float(compiled.retract(self.arm, self.points, self.course, self.work, Q, steps, tolerance, reach))
+        return float(compiled.project(self.arm, self.points, self.course, self.work, Q, steps, tolerance))
 
 
 @dataclass(frozen=True)
@@ -248,16 +257,6 @@ def workspace(n: int, points: Points, course: Course) -> Work:
 def solve(problem: Problem, start: Array, turns: int = 40, tolerance: float = 1e-4) -> Local | None:
     """Minimise the cost from a start, shape (K, n); return None if it cannot be projected onto path and surfaces."""
     Q, F = reals(start), np.zeros((len(problem.course.knot), len(problem.points.friction)))
-    cost, heat, steps = compiled.solve(
-        problem.arm,
-        problem.points,
-        problem.course,
-        problem.work,
-        Q,
-        F,
-        problem.min_force,
-        problem.peak,
-        turns,
-        tolerance,
-    )
+    tables = problem.arm, problem.points, problem.course, problem.work
+    cost, heat, steps = compiled.solve(*tables, Q, F, problem.min_force, problem.peak, turns, tolerance)
     return None if np.isnan(cost) else Local(Q, F, heat, cost, steps)

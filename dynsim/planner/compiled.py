@@ -47,6 +47,8 @@ ON = 1e-9
 DAMPING, DAMPING_MIN, DAMPING_MAX = 1e-3, 1e-7, 1e6
 # Maximum step of a coordinate in one iteration [rad or m].
 REACH = 0.6
+# Maximum step of a coordinate in one iteration of a projection [rad or m].
+PROJECTION_REACH = 2.0 * REACH / 3.0
 # Points whose distance from a surface exceeds their margin by more than this are ignored in a step [m].
 NEARBY = 0.5
 # Number of projection steps within which the residual must halve, or the projection fails.
@@ -197,8 +199,7 @@ def body_point(work: Work, body, point, i):
 @internal_kernel
 def rates(arm: Arm, work: Work, body, at, out):
     """Compute the velocity of a body's material point at position ``at`` per unit joint rate, shape (n, 3)."""
-    for j in range(arm.parent.shape[0]):
-        put_vector(out, j, 0, ZERO_VECTOR)
+    out[:] = 0.0
     j = body
     while j >= 0:
         a = vector(work.a, j, 0)
@@ -209,11 +210,11 @@ def rates(arm: Arm, work: Work, body, at, out):
 
 
 @internal_kernel
-def put_rows(table, out, row):
-    """Write a table, shape (n, 3), to three rows of another table, starting at ``row``."""
-    for j in range(table.shape[0]):
-        for r in range(3):
-            out[row + r, j] = table[j, r]
+def copy(source, target):
+    """Copy the entries of a matrix to another matrix."""
+    for i in range(source.shape[0]):
+        for j in range(source.shape[1]):
+            target[i, j] = source[i, j]
 
 
 @internal_kernel
@@ -224,20 +225,19 @@ def geometry(arm: Arm, points: Points, work: Work, q, k, count):
     x = body_point(work, hand, arm.hand_point, 0)
     rates(arm, work, hand, x, jacobian)
     put_vector(work.hand, k, 0, x)
-    put_rows(jacobian, work.hand_rate[k], 0)
+    copy(jacobian.T, work.hand_rate[k, :3])
     # With an orientation: the z axis of the hand's body, then its x axis.
     for row in range(3, work.hand.shape[1], 3):
         R = rotation(work.R, hand, 0)
         axis = third_axis(R) if row == 3 else first_axis(R)
-        for j in range(n):
-            put_vector(jacobian, j, 0, ZERO_VECTOR)
+        jacobian[:] = 0.0
         j = hand
         while j >= 0:
             if not arm.prismatic[j]:
                 put_vector(jacobian, j, 0, cross(vector(work.a, j, 0), axis))
             j = arm.parent[j]
         put_vector(work.hand, k, row, axis)
-        put_rows(jacobian, work.hand_rate[k], row)
+        copy(jacobian.T, work.hand_rate[k, row : row + 3])
     for i in range(count):
         body, radius = points.body[i], points.radius[i]
         x = body_point(work, body, points.point, i)
@@ -262,7 +262,7 @@ def geometry(arm: Arm, points: Points, work: Work, q, k, count):
             put_vector(shift, j, 0, along(along(centre, dn, -radius), vector(touch, j, 0), -1.0))
 
 
-@internal_kernel
+@kernel
 def statics(arm: Arm, points: Points, course: Course, work: Work, Q, F, min_force, forces):
     """Compute the torques of the instants with their derivatives, and the geometry of all knots.
 
@@ -321,15 +321,12 @@ def statics(arm: Arm, points: Points, course: Course, work: Work, Q, F, min_forc
             least_heat(arm, work, min_force, F[e], e)
         for i in range(c):
             put_vector(work.force, i, 0, times_number(vector(work.force, i, 0), F[e, i]))
+        work.by_q[e], work.by_v[e] = 0.0, 0.0
         for j in range(n):
             moment = vector(work.moment, j, 0)
             for i in range(c):
                 work.torque[e, j] += work.by_f[e, j, i] * F[e, i]
                 moment = along(moment, cross(vector(work.touch[i], j, 0), vector(work.force, i, 0)), 1.0)
-            for i in range(n):
-                work.by_v[e, i, j] = 0.0
-                if i <= j:
-                    work.by_q[e, i, j], work.by_q[e, j, i] = 0.0, 0.0
             work.by_v[e, j, j] = arm.losses[j]
             i = j
             while i >= 0:
@@ -534,12 +531,6 @@ def least_heat(arm: Arm, work: Work, min_force, f, e):
         f[i] = min_force + x[i]
 
 
-@kernel
-def evaluate(arm: Arm, points: Points, course: Course, work: Work, Q, F, min_force, forces):
-    """Compiled entry point of :func:`statics`."""
-    statics(arm, points, course, work, Q, F, min_force, forces)
-
-
 @internal_kernel
 def costs(arm: Arm, course: Course, work: Work, Q, peak):
     """Compute cost and heat [W] of the torques in the workspace, and ``weight`` and ``pull`` of the quadratic model.
@@ -588,28 +579,16 @@ def costs(arm: Arm, course: Course, work: Work, Q, peak):
 
 
 @internal_kernel
-def copy(a, out):
-    """Copy the entries of a matrix to another matrix."""
-    for i in range(a.shape[0]):
-        for j in range(a.shape[1]):
-            out[i, j] = a[i, j]
-
-
-@internal_kernel
-def constraint_rows(course: Course, points: Points, work: Work, k):
+def constraint_rows(points: Points, work: Work, k):
     """Write the rates of hand and braces at knot k to ``work.rows``; return the number of rows."""
-    c, n, h = points.friction.shape[0], work.rows.shape[1], work.hand.shape[1]
-    for r in range(h):
-        for j in range(n):
-            work.rows[r, j] = work.hand_rate[k, r, j]
-    for i in range(c):
-        for j in range(n):
-            work.rows[h + i, j] = work.gap_rate[k, i, j]
+    c, h = points.friction.shape[0], work.hand.shape[1]
+    copy(work.hand_rate[k], work.rows)
+    copy(work.gap_rate[k, :c], work.rows[h:])
     return h + c
 
 
-@internal_kernel
-def project(arm: Arm, points: Points, course: Course, work: Work, Q, steps, tolerance, reach):
+@kernel
+def project(arm: Arm, points: Points, course: Course, work: Work, Q, steps, tolerance):
     """Project the postures of all knots onto hand path and braces, clear of surfaces and within joint limits.
 
     Damped Gauss–Newton steps on the violated constraints keep the change small. Returns the residual of the worst knot
@@ -625,8 +604,6 @@ def project(arm: Arm, points: Points, course: Course, work: Work, Q, steps, tole
         Maximum number of steps per knot.
     tolerance : float
         Tolerance of the residual [m].
-    reach : float
-        Maximum step of a coordinate [rad or m].
     """
     n, c, P, h = arm.parent.shape[0], points.friction.shape[0], points.body.shape[0], work.hand.shape[1]
     rows, A, right = work.rows, work.normal_matrix, work.right
@@ -635,7 +612,7 @@ def project(arm: Arm, points: Points, course: Course, work: Work, Q, steps, tole
         left, halved = math.inf, math.inf
         for attempt in range(steps + 1):
             geometry(arm, points, work, Q[k], k, P)
-            m = constraint_rows(course, points, work, k)
+            m = constraint_rows(points, work, k)
             left = 0.0
             for r in range(h):
                 right[r] = course.target[k, r] - work.hand[k, r]
@@ -655,8 +632,8 @@ def project(arm: Arm, points: Points, course: Course, work: Work, Q, steps, tole
             for j in range(n):
                 over = arm.lower[j] - Q[k, j] if Q[k, j] < arm.lower[j] else arm.upper[j] - Q[k, j]
                 if (Q[k, j] < arm.lower[j] or Q[k, j] > arm.upper[j]) and m < rows.shape[0]:
-                    for i in range(n):
-                        rows[m, i] = 1.0 if i == j else 0.0
+                    rows[m] = 0.0
+                    rows[m, j] = 1.0
                     right[m] = over
                     left = max(left, abs(over) - tolerance)
                     m += 1
@@ -689,17 +666,11 @@ def project(arm: Arm, points: Points, course: Course, work: Work, Q, steps, tole
                 work.x[j] = z
                 most = max(most, abs(z))
             for j in range(n):
-                Q[k, j] += work.x[j] * min(1.0, reach / most)
+                Q[k, j] += work.x[j] * min(1.0, PROJECTION_REACH / most)
         worst = max(worst, left)
         if worst > 2.0 * tolerance:
             break
     return worst
-
-
-@kernel
-def retract(arm: Arm, points: Points, course: Course, work: Work, Q, steps, tolerance, reach):
-    """Compiled entry point of :func:`project`."""
-    return project(arm, points, course, work, Q, steps, tolerance, reach)
 
 
 @internal_kernel
@@ -711,9 +682,9 @@ def null_space(work: Work, k, m):
     """
     rows, Z, u = work.rows, work.basis[k], work.g
     n = rows.shape[1]
+    Z[:] = 0.0
     for i in range(n):
-        for j in range(n):
-            Z[i, j] = 1.0 if i == j else 0.0
+        Z[i, i] = 1.0
     rank = 0
     for _ in range(m):
         if rank == n:
@@ -759,28 +730,16 @@ CLEAR, LOWER, UPPER, FORCE = 0, 1, 2, 3
 
 
 @internal_kernel
-def unknowns(work: Work):
-    """Return the number of unknowns of a step."""
-    last = work.start.shape[0] - 1
-    N = work.start[last] + work.free[last]
-    for e in range(work.pressed.shape[0]):
-        N = max(N, work.pressed[e] + work.by_f.shape[2])
-    return N
-
-
-@internal_kernel
-def add_violated(arm: Arm, points: Points, work: Work, m, before, kind, at, which, value, bound):
+def add_violated(arm: Arm, work: Work, m, before, kind, at, which, value, bound):
     """Add a violated constraint of the step as column m of ``work.normals``; return the new number of constraints."""
     if value >= bound - 1e-9 or m == work.bound.shape[0]:
         return m
     for i in range(before):
         if work.working[i, 0] == kind and work.working[i, 1] == at and work.working[i, 2] == which:
             return m
-    n, N = arm.parent.shape[0], unknowns(work)
-    normals = work.normals
+    n, normals = arm.parent.shape[0], work.normals
     work.working[m, 0], work.working[m, 1], work.working[m, 2], work.bound[m] = kind, at, which, bound
-    for i in range(N):
-        normals[i, m] = 0.0
+    normals[:, m] = 0.0
     if kind == FORCE:
         normals[work.pressed[at] + which, m] = 1.0
         return m + 1
@@ -797,15 +756,6 @@ def add_violated(arm: Arm, points: Points, work: Work, m, before, kind, at, whic
 
 
 @internal_kernel
-def coordinate_change(arm: Arm, work: Work, x, k, j):
-    """Return the change of coordinate j at knot k for a step x of the unknowns."""
-    first, z = arm.parent.shape[0] - work.free[k], 0.0
-    for d in range(work.free[k]):
-        z += work.basis[k, j, first + d] * x[work.start[k] + d]
-    return z
-
-
-@internal_kernel
 def prepare(arm: Arm, points: Points, course: Course, work: Work, Q, damping):
     """Compute matrix and gradient of the Gauss–Newton model in the null space of hand and braces, and in the forces.
 
@@ -818,17 +768,14 @@ def prepare(arm: Arm, points: Points, course: Course, work: Work, Q, damping):
     # Coupled unknowns are close to each other, so that the matrix is banded.
     N, behind = 0, 0
     for k in range(K):
-        work.free[k] = null_space(work, k, constraint_rows(course, points, work, k))
+        work.free[k] = null_space(work, k, constraint_rows(points, work, k))
         start[k] = N
         N += work.free[k]
         while behind < E and course.knot[behind] == k:
             work.pressed[behind] = N
             N += c
             behind += 1
-    for i in range(N):
-        g[i] = 0.0
-        for j in range(N):
-            H[i, j] = 0.0
+    g[:], H[:N, :N] = 0.0, 0.0
     for e in range(E):
         m = 0
         for k in range(K):
@@ -930,8 +877,7 @@ def step(arm: Arm, points: Points, course: Course, work: Work, Q, F, min_force, 
     for i in range(N):
         x[i] = -g[i]
     forward(H, skyline, x, N)
-    for a in range(work.multiplier.shape[0]):
-        work.multiplier[a] = 0.0
+    work.multiplier[:] = 0.0
     m = 0
     full = work.step
     for _ in range(12):
@@ -943,13 +889,17 @@ def step(arm: Arm, points: Points, course: Course, work: Work, Q, F, min_force, 
                     full[i] += work.multiplier[a] * work.normals[i, a]
         backward(H, skyline, full, N)
         for k in range(K):
+            first = n - work.free[k]
             for j in range(n):
-                work.change[k, j] = coordinate_change(arm, work, full, k, j)
+                z = 0.0
+                for d in range(work.free[k]):
+                    z += work.basis[k, j, first + d] * full[work.start[k] + d]
+                work.change[k, j] = z
         before = m
         for e in range(E):
             for i in range(c):
                 value, slack = full[work.pressed[e] + i], min_force - F[e, i]
-                m = add_violated(arm, points, work, m, before, FORCE, e, i, value, slack)
+                m = add_violated(arm, work, m, before, FORCE, e, i, value, slack)
         for k in range(K):
             for i in range(c, P):
                 slack = min(points.margin[i] - work.gap[k, i], 0.0)
@@ -958,11 +908,11 @@ def step(arm: Arm, points: Points, course: Course, work: Work, Q, F, min_force, 
                 z = 0.0
                 for j in range(n):
                     z += work.gap_rate[k, i, j] * work.change[k, j]
-                m = add_violated(arm, points, work, m, before, CLEAR, k, i, z, slack)
+                m = add_violated(arm, work, m, before, CLEAR, k, i, z, slack)
             for j in range(n):
                 z, low, high = work.change[k, j], arm.lower[j] - Q[k, j], arm.upper[j] - Q[k, j]
-                m = add_violated(arm, points, work, m, before, LOWER, k, j, z, min(low, 0.0))
-                m = add_violated(arm, points, work, m, before, UPPER, k, j, -z, -max(high, 0.0))
+                m = add_violated(arm, work, m, before, LOWER, k, j, z, min(low, 0.0))
+                m = add_violated(arm, work, m, before, UPPER, k, j, -z, -max(high, 0.0))
         if m == before:
             break
         add_dual_rows(work, N, before, m)
@@ -981,7 +931,7 @@ def solve(arm: Arm, points: Points, course: Course, work: Work, Q, F, min_force,
 
     Returns cost [W], heat [W] and number of steps; NaN if the start cannot be projected onto path and surfaces.
     """
-    if project(arm, points, course, work, Q, 60, ON, 2.0 * REACH / 3.0) > 2.0 * ON:
+    if project(arm, points, course, work, Q, 60, ON) > 2.0 * ON:
         return math.nan, math.nan, 0
     statics(arm, points, course, work, Q, F, min_force, True)
     cost, heat = costs(arm, course, work, Q, peak)
@@ -997,14 +947,13 @@ def solve(arm: Arm, points: Points, course: Course, work: Work, Q, F, min_force,
             if not fall > 0.0 or fall < tolerance * 0.1 * max(cost, 1e-3):
                 break
             longest = 1e-300
-            for k in range(Q.shape[0]):
-                for j in range(Q.shape[1]):
-                    longest = max(longest, abs(work.change[k, j]))
+            for change in work.change.flat:
+                longest = max(longest, abs(change))
             share = min(1.0, REACH / longest)
             for k in range(Q.shape[0]):
                 for j in range(Q.shape[1]):
                     trial[k, j] = Q[k, j] + share * work.change[k, j]
-            if project(arm, points, course, work, trial, 12, ON, 2.0 * REACH / 3.0) <= 2.0 * ON:
+            if project(arm, points, course, work, trial, 12, ON) <= 2.0 * ON:
                 statics(arm, points, course, work, trial, forces, min_force, True)
                 there, warmth = costs(arm, course, work, trial, peak)
                 if there < cost:

@@ -8,13 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from dynsim.compile.clearance import axis_ends, gaps
+from dynsim.compile.clearance import gaps
 from dynsim.compile.references.inverse_kinematics import pressing
 from dynsim.compile.references.splines import clamped_cubic, quintic_rates
 from dynsim.dynamics.contact.braces import statics as kb
 from dynsim.errors import ModelError
 from dynsim.jit.kernel import reals
 from dynsim.model.description import Array, Contact
+from dynsim.planner.arm import axis_lines, axis_points
 from dynsim.planner.compiled import ON
 from dynsim.planner.problem import FINAL_SLIP_SCALE, Candidate, Clear, Task, key
 from dynsim.scenario import build
@@ -223,23 +224,17 @@ def touching_links(task: Task, times: Array, q: Array) -> str:
     """
     chosen = np.unique(np.linspace(0, np.searchsorted(times, task.span), CHECKS).astype(int))
     arm, links = task.arm, task.arm.model.robot.links
-    ends = axis_ends(arm.model.robot)
-    segments = [(k, end) for k, i in enumerate(arm.links) for end in ends[links[i].name] if np.linalg.norm(end) > 1e-9]
+    segments = axis_points(arm, (1.0,))
     if len(segments) < 3:
         return ""
-    lines = np.zeros((len(chosen), len(segments), 2, 3))
-    for t, row in enumerate(arm.coordinates(q[chosen])):
-        for m, (k, end) in enumerate(segments):
-            R, p = arm.model.body_pose(arm.links[k], row)
-            lines[t, m] = p, p + R @ end
+    lines = np.array([axis_lines(arm, row) for row in q[chosen]])
     a, b = np.triu_indices(len(segments), 1)
     first, second = lines[:, a], lines[:, b]
     # Neighbours share a joint, also across a link of zero length.
     apart = np.linalg.norm(first[:, :, :, None] - second[:, :, None], axis=-1).min(axis=(0, 2, 3)) > 1e-9
-    joints = np.array([k for k, _ in segments])
+    joints, radii = (np.array([segment[i] for segment in segments]) for i in (0, 2))
     parents = arm.tables.parent[joints]
     apart &= (parents[b] != joints[a]) & (parents[a] != joints[b])
-    radii = np.array([links[arm.links[k]].radius for k in joints])
     touching = apart & (_segment_distances(first, second) < radii[a] + radii[b])
     if not touching.any():
         return ""

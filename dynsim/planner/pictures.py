@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from dynsim.compile.clearance import axis_ends
 from dynsim.draw.figures.plan import PlanPicture, Pose, draw_plan_figures
 from dynsim.errors import SimulationStopped
 from dynsim.model.description import Array
 from dynsim.planner.answer import BracePlan, Size
+from dynsim.planner.arm import axis_lines
 from dynsim.planner.problem import Task
 from dynsim.record import Record
 from dynsim.scenario import build
@@ -95,17 +95,12 @@ def _in_view(points: Array, heading: Array) -> Array:
 def _poses(task: Task, size: Size, heading: Array) -> list[Pose]:
     """Return the arm at some instants of the first pass."""
     arm, model, dense = task.arm, task.arm.model, size.dense
-    ends, surfaces = axis_ends(model.robot), build.surfaces(task.scenario)
+    surfaces = build.surfaces(task.scenario)
     poses = []
     last = int(np.searchsorted(dense.times, task.span))
     for t in np.linspace(0, min(last, len(dense.times) - 1), POSES).astype(int):
         q = arm.coordinates(dense.q[t : t + 1])[0]
-        lines = []
-        for link in arm.links:
-            R, p = model.body_pose(link, q)
-            for end in ends[model.robot.links[link].name]:
-                if np.linalg.norm(end) > 1e-9:
-                    lines.append(_in_view(np.array([p, p + R @ end]), heading))
+        lines = [_in_view(line, heading) for line in axis_lines(arm, dense.q[t])]
         points, forces = np.zeros((len(size.braces), 3)), np.zeros((len(size.braces), 3))
         now = min(round(dense.times[t] / dense.fine[1]), len(dense.fine) - 1)
         for k, brace in enumerate(size.braces):

@@ -55,7 +55,7 @@ def overturning(record: Record) -> Figure | None:
         _mark_tipping(axes, [record], [style.PULLING])
     for axes in rows[2]:
         _lines(axes, record, TRACTION, "max {}", np.nanmax)
-        _shade(axes, record.time, bare, "a wheel carries no load")
+        style.shade(axes, record.time, bare, "#EFEFEF", "a wheel carries no load")
         axes.axhline(1.0, color=style.PULLING, linewidth=0.8, label="slips above 1")
         axes.set_ylim(0.0, min(max(axes.get_ylim()[1], 1.15), TRACTION_TOP))
         _mark_tipping(axes, [record], [style.PULLING])
@@ -86,14 +86,13 @@ def margin_comparison(records: Mapping[str, Record]) -> Figure | None:
     series = [(record.time, np.maximum(record[MARGIN], MARGIN_LOW)) for record in some]
     (panels,) = style.time_rows(figure, [series], max(record.settle_time for record in some))
     styles = style.variant_styles(list(records))
-    colours = {name: str(look["color"]) for name, look in styles.items()}
     for axes in panels:
         for name, record in shown.items():
             style.line(axes, record.time, record[MARGIN], label=_margin_label(name, record), **styles[name])
         _frame_margin(axes)
-        _mark_tipping(axes, some, [colours[name] for name in shown])
+        _mark_tipping(axes, some, [styles[name]["color"] for name in shown])
     panels[0].set_ylabel("tip margin")
-    contacts.explain(panels[-1], contacts.mark_variants([panels], shown, colours))
+    contacts.mark_variants([panels], shown, styles)
     style.legend_below(figure, panels[-1:], 1)
     return figure
 
@@ -162,8 +161,14 @@ def base_error(record: Record) -> Array:
     """Return actual minus reference pose of a base, (T, 3): ahead and left of the reference [m], heading [rad]."""
     target = record["base_target"]
     error = record["base_pose"] - target
-    c, s = np.cos(target[:, 2]), np.sin(target[:, 2])
-    return np.stack([c * error[:, 0] + s * error[:, 1], c * error[:, 1] - s * error[:, 0], error[:, 2]], axis=1)
+    return np.column_stack([_ahead_and_left(error[:, :2], target[:, 2]), error[:, 2]])
+
+
+def _ahead_and_left(points: Array, heading: Array) -> Array:
+    """Return horizontal vectors, (T, 2), in the axes of a base with a heading, () or (T,) [rad]."""
+    x, y = points.T
+    c, s = np.cos(heading), np.sin(heading)
+    return np.stack([c * x + s * y, c * y - s * x], axis=1)
 
 
 def tipping_times(record: Record) -> list[float]:
@@ -197,16 +202,6 @@ def _lines(axes: Axes, record: Record, signal: str, note: str, extreme: Callable
         values = np.where(np.isfinite(values), values, np.nan)
         label = f"{name}: {note.format(style.number(float(extreme(values)), 3))}" if known else f"{name}: no values"
         style.line(axes, record.time, values, color=colour, linewidth=width, label=label)
-
-
-def _shade(axes: Axes, time: Array, where: NDArray[np.bool_], label: str) -> None:
-    """Shade the samples at which ``where`` is True, up to their neighbours, with one legend entry."""
-    edges = np.flatnonzero(np.diff(where, prepend=False, append=False)).reshape(-1, 2)
-    limits = axes.get_xlim()
-    for k, (first, end) in enumerate(edges.tolist()):
-        span = time[first], time[min(end, len(time) - 1)]
-        axes.axvspan(*span, color="#EFEFEF", linewidth=0, zorder=0.2, label=label if k == 0 else None)
-    axes.set_xlim(limits)
 
 
 def _pair(axes: Axes, time: Array, target: Array, actual: Array, name: str, colour: str, dashes: Any) -> None:
@@ -286,9 +281,8 @@ def support_corners(body: Skeleton, row: int) -> Array:
 
 def pressure_in_base(record: Record) -> Array:
     """Return the centre of pressure in the base frame, (T, 2) [m]."""
-    away = record["center_of_pressure"] - record["base_pose"][:, :2]
-    c, s = np.cos(record["base_pose"][:, 2]), np.sin(record["base_pose"][:, 2])
-    return np.stack([c * away[:, 0] + s * away[:, 1], c * away[:, 1] - s * away[:, 0]], axis=1)
+    pose = record["base_pose"]
+    return _ahead_and_left(record["center_of_pressure"] - pose[:, :2], pose[:, 2])
 
 
 def _extent(body: Skeleton, rows: Rows) -> tuple[Array, Array]:
@@ -348,12 +342,11 @@ def _draw_world(axes: Axes, body: Skeleton, rows: Rows) -> None:
 def _draw_base_frame(axes: Axes, body: Skeleton, rows: Rows) -> None:
     """Draw the base from above in its own frame, with its heading to the right."""
     record = body.record
-    x, y, heading = record["base_pose"][rows[-1]]
-    turn = np.array([[np.cos(heading), -np.sin(heading)], [np.sin(heading), np.cos(heading)]])
-    parts = [(solid[:, :2] - [x, y]) @ turn for solid, _ in body.solids(int(rows[-1]))]
+    pose = record["base_pose"][rows[-1]]
+    parts = [_ahead_and_left(solid[:, :2] - pose[:2], pose[2]) for solid, _ in body.solids(int(rows[-1]))]
     for part in parts:
         axes.add_patch(Polygon(outline(part), facecolor="#EEEEEE", edgecolor=style.GREY, lw=0.7, zorder=1))
-    corners = (support_corners(body, int(rows[-1])) - [x, y]) @ turn
+    corners = _ahead_and_left(support_corners(body, int(rows[-1])) - pose[:2], pose[2])
     axes.add_patch(Polygon(corners, facecolor=TRIANGLE, alpha=0.2, lw=0, zorder=2))
     axes.add_patch(Polygon(corners, facecolor="none", edgecolor=TRIANGLE, lw=1.0, zorder=3))
     middle = corners.mean(axis=0)

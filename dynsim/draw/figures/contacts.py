@@ -69,12 +69,10 @@ def mark(axes: Axes, events: Sequence[Event], colour: str = COLOUR, *, row: int 
     axes.set_xlim(low, high)
 
 
-def mark_all(rows: Iterable[Sequence[Axes]], record: Record) -> None:
+def mark_all(rows: Sequence[Sequence[Axes]], record: Record) -> None:
     """Mark all events of a run in every panel, with a legend below the last one."""
     events = marked(record)
-    if not events:
-        return
-    for panels in (rows := list(rows)):
+    for panels in rows:
         for axes in panels:
             mark(axes, events)
     explain(rows[-1][-1], events)
@@ -86,23 +84,21 @@ def height_of_variants(records: Mapping[str, Record]) -> float:
 
 
 def mark_variants(
-    rows: Iterable[Sequence[Axes]], records: Mapping[str, Record], colours: Mapping[str, str]
-) -> list[Event]:
-    """Mark the events of several runs above every panel, one coloured row per run; returns the events.
+    rows: Sequence[Sequence[Axes]], records: Mapping[str, Record], styles: Mapping[str, Mapping[str, Any]]
+) -> None:
+    """Mark the events of several runs above every panel, one coloured row per run, with a legend below the last panel.
 
     Inside the panel the marks would cover the curves of other variants.
     """
     having = {name: events for name, record in records.items() if (events := marked(record))}
     everything = [event for events in having.values() for event in events]
-    if not everything:
-        return []
-    for panels in rows:
+    for panels in rows if everything else ():
         for axes in panels:
             for row, (name, events) in enumerate(having.items()):
-                mark(axes, events, colours[name], row=-1 - row, lines=len(everything) <= LINES)
+                mark(axes, events, styles[name]["color"], row=-1 - row, lines=len(everything) <= LINES)
             # An empty title reserves the space.
             axes.set_title(" ", fontsize=1.0, y=1.0, pad=MARK_ROW * len(having))
-    return everything
+    explain(rows[-1][-1], everything)
 
 
 def explain(axes: Axes, events: Sequence[Event]) -> None:

@@ -101,8 +101,7 @@ def energy_comparison(records: Mapping[str, Record]) -> Figure | None:
     work.axhline(0.0, color=style.GREY, linewidth=0.6)
     work.set_ylabel("mechanical work [J]")
     work.set_xlabel("time [s]")
-    colours = {name: str(look["color"]) for name, look in styles.items()}
-    contacts.explain(work, contacts.mark_variants([(over_time,), (work,)], shown, colours))
+    contacts.mark_variants([(over_time,), (work,)], shown, styles)
     _totals(total, list(shown), finals, [str(styles[name]["color"]) for name in shown], logarithmic)
     style.legend_below(figure, [over_time], 5)
     return figure
@@ -374,8 +373,7 @@ def error_comparison(records: Mapping[str, Record]) -> Figure | None:
         _log_rows(rows[0], late[late > 0.0])
     rows[0][0].set_ylabel("distance from target [mm]")
     rows[1][0].set_ylabel("vertical error [mm]")
-    colours = {name: str(look["color"]) for name, look in styles.items()}
-    contacts.explain(rows[1][-1], contacts.mark_variants(rows, shown, colours))
+    contacts.mark_variants(rows, shown, styles)
     style.legend_below(figure, rows[0][-1:], 2)
     return figure
 

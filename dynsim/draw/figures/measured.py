@@ -132,14 +132,8 @@ def _cycles(axes: Axes, record: Record) -> None:
         axes.set_ylabel("late [ms]")
     if "missed" in record and (missed := record["missed"].any(axis=1)).any():
         axes.plot(record.time[missed], np.zeros(missed.sum()), "x", color=style.PULLING, markersize=4)
-        axes.annotate(
-            f"× {missed.sum()} cycles with a servo that did not answer",
-            (0.01, 0.9),
-            xycoords="axes fraction",
-            color=style.PULLING,
-            fontsize=7,
-            va="top",
-        )
+        text = f"× {missed.sum()} cycles with a servo that did not answer"
+        axes.text(0.01, 0.9, text, transform=axes.transAxes, color=style.PULLING, fontsize=7, va="top")
     _mark_replay(axes, record)
 
 

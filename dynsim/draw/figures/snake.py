@@ -36,15 +36,17 @@ from dynsim.draw.figures.snake_view import (
     mode_starts,
     mode_steps,
     moments,
+    overlay_margins,
     posture_grid,
     posture_strip,
 )
 from dynsim.record import Record
 from dynsim.snake.lifting import snake_geometry
-from dynsim.snake.published import used_limit
 
 # Numbers of postures: in an animation, in a row, and overlaid in one picture.
 FRAMES, IN_A_ROW, IN_A_PICTURE = 50, 6, 7
+# A logarithmic axis cannot show an error of exactly zero.
+TINY = 1e-16
 # Greys of postures over time, because the lines next to them are coloured.
 SHADES = LinearSegmentedColormap.from_list("shades", ["#CFCFCF", "#000000"])
 
@@ -86,20 +88,12 @@ def comparison(records: Mapping[str, Record]) -> Figure:
     title = style.comparison_title(list(records.values()), "cost, angles, margin and error")
     figure = style.new_figure(7.0, title)
     axes = figure.subplots(4, 1, sharex=True)
-    for name, record in records.items():
-        axes[0].plot(record.time, record["cost"], label=name)
-        axes[1].plot(record.time, used_limit(record), label=name)
-        axes[2].plot(record.time, 1e3 * record["support_margin"], label=name)
-        axes[3].semilogy(record.time, np.maximum(record["position_error"], 1e-16), label=name)
+    overlay_margins(axes[:3], records)
+    for record in records.values():
+        axes[3].semilogy(record.time, np.maximum(record["position_error"], TINY))
     error_axis(axes[3], *(record["position_error"] for record in records.values()))
-    axes[1].axhline(1.0, color="black", ls="-.", lw=0.8)
-    axes[2].axhline(0.0, color="black", ls="-.", lw=0.8)
-    axes[0].set_ylim(bottom=0)
-    for axis, label in zip(
-        axes, ("cost V", "largest |θ| / limit", "support margin [mm]", "position error [m]"), strict=True
-    ):
-        axis.set_ylabel(label)
-    axes[0].legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+    axes[3].set_ylabel("position error [m]")
+    style.legend_beside(axes[0])
     axes[-1].set_xlabel("t [s]")
     return figure
 
@@ -128,10 +122,9 @@ def overview(record: Record) -> Figure:
 
     A robot that stays in place and works with its head is only a thin strip, so a side view is added below.
     """
-    rows = moments(record, IN_A_PICTURE)
-    x0, x1, y0, y1 = limits([*record["posture"][rows][:, :, :2], record["w"][:, :2]], 0.06)
+    views = [View(record, row) for row in moments(record, IN_A_PICTURE)]
+    x0, x1, y0, y1 = limits([*(view.project(view.points, above=True) for view in views), record["w"][:, :2]], 0.06)
     flat = y1 - y0 < MIN_HEIGHT * (x1 - x0)
-    views = [View(record, row) for row in rows] if flat else []
     width = 6.4 if flat else 5.0
     high = width * (y1 - y0) / (x1 - x0)
     side = limits([view.project(view.points, above=False) for view in views], 0.06) if flat else (0.0, 1.0, 0.0, 0.0)
@@ -142,26 +135,21 @@ def overview(record: Record) -> Figure:
     axis = grid[0, 0]
     shades = ScalarMappable(Normalize(0.0, record.time[-1]), matplotlib.colormaps["viridis_r"] if flat else SHADES)
     body = {"lw": 1.6 if flat else 4.0, "solid_capstyle": "round"}
-    for row in rows:
-        points, shade = record["posture"][row], shades.to_rgba(record.time[row])
-        axis.plot(points[:, 0], points[:, 1], "-", color=shade, **body)
-        axis.plot(*points[0, :2], "o", color=shade, ms=4 if flat else 6)
-    for view in views:
-        shade = shades.to_rgba(record.time[view.row])
-        flat_points = view.project(view.points, above=False)
-        grid[1, 0].plot(*flat_points.T, "-", color=shade, **body)
-        grid[1, 0].plot(*flat_points[0], "o", color=shade, ms=4)
+    for panel, above in zip(grid[:, 0], (True, False), strict=False):
+        for view in views:
+            points, shade = view.project(view.points, above), shades.to_rgba(record.time[view.row])
+            panel.plot(*points.T, "-", color=shade, **body)
+            panel.plot(*points[0], "o", color=shade, ms=4 if flat else 6)
+        panel.set_aspect("equal", adjustable="box")
     axis.plot(*record["w"][:, :2].T, color=HEAD, lw=1.0, label="controlled point")
     axis.plot(*record["w_target"][:, :2].T, "--", color=TARGET, lw=1.0, label="target")
     axis.plot(*record["base_pose"][:, :2].T, color=GROUND, lw=0.8, label="wheel pair 1")
     axis.set(xlabel="x [m]", ylabel="y [m]", xlim=(x0, x1), ylim=(y0, y1))
-    axis.set_aspect("equal", adjustable="box")
     if flat:
         below = grid[1, 0]
         below.axhline(0.0, color="#BBBBBB", lw=0.8, zorder=0)
         below.set(xlabel="along the heading of the base part [m]", ylabel="height [m]")
         below.set(xlim=side[:2], ylim=(min(side[2], -0.02), side[3]))
-        below.set_aspect("equal", adjustable="box")
     figure.colorbar(shades, ax=grid.ravel().tolist(), label="posture at t [s]")
     figure.legend(loc="outside lower center", ncols=3)
     return figure
@@ -177,21 +165,14 @@ def tracking(record: Record) -> Figure:
         axis.plot(record.time, record["w_target"][:, i], "--", color=HEAD, lw=0.9, label="target")
         style.at_least(axis, 2e-3)
         axis.set_ylabel(f"{SYMBOLS.get(name, name)} [{'m' if i < 3 else 'rad'}]")
-        if record["gripper"].any():
-            closed = axis.get_xaxis_transform()
-            axis.fill_between(
-                record.time, 0, 1, where=record["gripper"] > 0, transform=closed, color="#EEEEEE", lw=0, zorder=0,
-                label="gripper closed",
-            )  # fmt: skip
+        style.shade(axis, record.time, record["gripper"] > 0, "#EEEEEE", "gripper closed")
     # White background, so that grey entries are visible on an entirely grey panel.
     axes[0, 0].legend(facecolor="white", edgecolor="none")
-    tiny = 1e-16  # a logarithmic axis cannot show an error of exactly zero
-    axes[3, 0].semilogy(record.time, np.maximum(record["position_error"], tiny), color=BODY)
-    axes[3, 0].set_ylabel("position error [m]")
-    axes[3, 1].semilogy(record.time, np.maximum(record["attitude_error"], tiny), color=BODY)
-    axes[3, 1].set_ylabel("attitude error [rad]")
-    for axis, name in zip(axes[3], ("position_error", "attitude_error"), strict=True):
-        error_axis(axis, record[name])
+    for axis, part, unit in zip(axes[3], ("position", "attitude"), ("m", "rad"), strict=True):
+        error = record[f"{part}_error"]
+        axis.semilogy(record.time, np.maximum(error, TINY), color=BODY)
+        axis.set_ylabel(f"{part} error [{unit}]")
+        error_axis(axis, error)
         axis.set_xlabel("t [s]")
     return figure
 
@@ -216,7 +197,7 @@ def joints(record: Record) -> Figure:
         for limit in {*upper[group], *lower[group]}:
             axis.axhline(limit, color="black", ls="-.", lw=0.8)
         axis.set_ylabel(f"{title} [rad]")
-        axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+        style.legend_beside(axis)
     axes[-1].set_xlabel("t [s]      (dash-dotted: limits; dots: joint out of the allocation at its limit)")
     return figure
 
@@ -255,7 +236,7 @@ def _over_time(axis: Axes, record: Record, values: NDArray[np.float64], many: bo
     time = np.append(record.time[starts], record.time[-1])
     axis.stairs(high, time, baseline=low, fill=True, color=GROUND, alpha=0.25, lw=0, label="range")
     axis.plot(record.time[starts], low, color=GROUND, lw=1.0, label="lowest")
-    axis.legend(frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    style.legend_beside(axis)
 
 
 def animate(record: Record, path: Path) -> Path:

@@ -28,7 +28,6 @@ EVENTS = {"captures": (0, (5, 2)), "slips": (0, (1, 1)), "loses": "-", "releases
 LEAST = 0.1
 # If the gripper is closer to the axis of a hinge, the hinge angle follows from its orientation [m].
 ON_AXIS = 0.01
-LEGEND: dict[str, Any] = {"loc": "center left", "bbox_to_anchor": (1.0, 0.5)}
 
 
 def makers(record: Record) -> dict[str, Callable[[Record], Figure]]:
@@ -72,7 +71,7 @@ def servos(record: Record) -> Figure:
             label = f"friction of the gear {friction:g} N m:\nheld without current"
             axis.axhspan(-friction, friction, color=style.SKY, alpha=0.25, lw=0, zorder=0, label=label)
         axis.set(xlim=(record.time[0], record.time[-1]), ylim=(-1.1 * stall, 1.1 * stall), ylabel="torque [N m]")
-        _legend(axis)
+        style.legend_beside(axis)
     axes[-1].set_xlabel("t [s]")
     return figure
 
@@ -238,18 +237,12 @@ def _finish(axes: Array, record: Record) -> None:
     for axis in axes:
         axis.set_xlim(record.time[0], record.time[-1])
         for state, (name, colour) in enumerate(STATES.items()):
-            if state > 0 and "gripper_state" in record and (where := record["gripper_state"] == state).any():
-                span: dict[str, Any] = {
-                    "transform": axis.get_xaxis_transform(),
-                    "color": colour,
-                    "lw": 0,
-                    "zorder": 0.2,
-                }
-                axis.fill_between(record.time, 0.0, 1.0, where=where, step="post", label=f"_{name}", **span)
+            if state > 0 and "gripper_state" in record:
+                style.shade(axis, record.time, record["gripper_state"] == state, colour, f"_{name}")
         for kind, times in happened.items():
             for time in times:
                 axis.axvline(time, color="#555555", ls=EVENTS[kind], lw=0.8, label=f"_{kind}")
-        _legend(axis)
+        style.legend_beside(axis)
     # One legend below all panels.
     named = {h.get_label(): h for h in (*axes[0].collections, *axes[0].lines) if str(h.get_label()).startswith("_")}
     texts = [*STATES, *EVENTS]
@@ -262,10 +255,3 @@ def _both(axis: Axes, value: float, label: str, **look: Any) -> None:
     """Draw lines at plus and minus a value."""
     axis.axhline(value, label=f"± {label}", **look)
     axis.axhline(-value, **look)
-
-
-def _legend(axis: Axes) -> None:
-    """Place a legend without repeated entries next to the axes."""
-    handles, labels = axis.get_legend_handles_labels()
-    unique = dict(zip(labels, handles, strict=True))
-    axis.legend(unique.values(), unique.keys(), **LEGEND)

@@ -21,6 +21,7 @@ from dynsim.errors import RecordError
 from dynsim.record import Record
 from dynsim.record.poses import POSITION
 from dynsim.snake.lifting import snake_geometry
+from dynsim.snake.published import used_limit
 
 BODY, HEAD, GROUND, LIFT, TARGET, SUPPORT = "#444444", style.PULLING, style.BLUE, "#FFFFFF", style.GREEN, style.SKY
 OBJECT = "#E9CFA6"
@@ -168,6 +169,19 @@ def posture_strip(title: str, line: Sequence[tuple[View, str]]) -> Figure:
         below.set_xlabel("along heading [m]")
     _explain(figure, views)
     return figure
+
+
+def overlay_margins(axes: Sequence[Axes], records: Mapping[str, Record]) -> None:
+    """Overlay cost, largest yaw angle relative to its limit, and support margin of labelled runs in three panels."""
+    for label, record in records.items():
+        axes[0].plot(record.time, record["cost"], label=label)
+        axes[1].plot(record.time, used_limit(record))
+        axes[2].plot(record.time, 1e3 * record["support_margin"])
+    for axis, limit, text in zip(axes[1:], (1.0, 0.0), ("largest |θ| / limit", "support margin [mm]"), strict=True):
+        axis.axhline(limit, color="black", ls="-.", lw=0.8)
+        axis.set_ylabel(text)
+    axes[0].set_ylabel("cost V")
+    axes[0].set_ylim(bottom=0)
 
 
 def mode_starts(record: Record) -> NDArray[np.int64]:

@@ -196,6 +196,21 @@ def shade_below_zero(axes: Axes, label: str) -> None:
         axes.set_ylim(low, high)
 
 
+def shade(axes: Axes, time: Array, where: NDArray[np.bool_], colour: str, label: str) -> None:
+    """Shade the times at which ``where`` is True, each up to the next sample, with one legend entry."""
+    if where.any():
+        until = where | np.append(False, where[:-1])
+        look: dict[str, Any] = {"color": colour, "linewidth": 0, "zorder": 0.2, "label": label}
+        axes.fill_between(time, 0.0, 1.0, where=until, transform=axes.get_xaxis_transform(), **look)
+
+
+def legend_beside(axes: Axes) -> None:
+    """Place a legend without repeated entries to the right of the axes."""
+    handles, labels = axes.get_legend_handles_labels()
+    unique = dict(zip(labels, handles, strict=True))
+    axes.legend(unique.values(), unique.keys(), loc="center left", bbox_to_anchor=(1.0, 0.5))
+
+
 def legend_above(axes: Axes, columns: int = 3) -> None:
     """Place the legend above the axes, where it hides nothing, with space for all its rows."""
     rows = -(-len(axes.get_legend_handles_labels()[1]) // columns)

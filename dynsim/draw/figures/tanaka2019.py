@@ -23,6 +23,7 @@ from dynsim.draw.figures.snake_view import (
     View,
     greek,
     mode_chart,
+    overlay_margins,
     posture_grid,
     posture_strip,
 )
@@ -40,7 +41,6 @@ from dynsim.snake.published import (
     mode_sequence,
     opening,
     tables,
-    used_limit,
 )
 from dynsim.system.files import write_text
 
@@ -117,7 +117,7 @@ def positioning(records: Mapping[str, Record]) -> Figure:
             axis.plot(positions, ours, "D", color="black", ms=3, label="simulated, no slip" if k == 2 else None)
         axis.axhline(0.0, color="black", lw=0.6)
         axis.set_ylabel(f"off target [{unit}]")
-        axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+        style.legend_beside(axis)
     axes[1].set_xticks(range(len(moved)), [f"moving {SYMBOLS.get(m, m)}" for m in moved])
     axes[1].set_xlim(-0.6, len(moved) - 0.4)
     return figure
@@ -143,8 +143,7 @@ def dynamic_positioning(records: Mapping[str, Record]) -> Figure:
         axis.axhline(0.0, color="black", lw=0.6)
         axis.set_ylabel(f"Δ{SYMBOLS.get(COORDINATES[i], COORDINATES[i])} [{unit}]")
     axes[-1].set_xlim(-0.6, len(moved) - 0.4)
-    handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=4)
+    style.legend_below(figure, [axes[0]], 4)
     axes[-1].set_xticks(range(len(moved)), [f"moving {SYMBOLS.get(m, m)}" for m in moved])
     return figure
 
@@ -157,14 +156,14 @@ def sag_and_feedback(records: Mapping[str, Record]) -> Figure:
     for column, (name, title) in zip(axes.T, shown.items(), strict=True):
         record = records[name]
         for i, axis in enumerate(column):
-            (actual,) = axis.plot(record.time, record["w"][:, i], color=GROUND)
-            (wanted,) = axis.plot(record.time, record["w_target"][:, i], ":", color="red", lw=1.4)
+            axis.plot(record.time, record["w"][:, i], color=GROUND, label="simulated")
+            axis.plot(record.time, record["w_target"][:, i], ":", color="red", lw=1.4, label="target")
             style.at_least(axis, 0.02)
         column[0].set_title(title, fontsize=8)
         column[-1].set_xlabel("t [s]")
     for i, axis in enumerate(axes[:, 0]):
         axis.set_ylabel(f"{SYMBOLS.get(COORDINATES[i], COORDINATES[i])}$_h$ [{'m' if i < 3 else 'rad'}]")
-    figure.legend([actual, wanted], ["simulated", "target"], loc="outside lower center", ncols=2)
+    style.legend_below(figure, [axes[0, 0]], 2)
     return figure
 
 
@@ -183,8 +182,7 @@ def wheel_loads(records: Mapping[str, Record]) -> Figure:
         axis.set_ylabel(f"moving {SYMBOLS.get(name, name)} [N]")
         axis.set_ylim(bottom=0.0)
     axes[-1].set_xlabel("t [s]")
-    handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=len(handles))
+    style.legend_below(figure, [axes[0]], len(axes[0].lines))
     return figure
 
 
@@ -212,11 +210,10 @@ def head_and_cost(record: Record) -> Figure:
     for i, axis in enumerate(axes[:3].T.ravel()):
         scale, error, unit = (1e3, HEAD_ERROR[0], "mm") if i < 3 else (1.0, HEAD_ERROR[1], "rad")
         target = scale * record["w_target"][:, i]
-        band = axis.fill_between(
-            time, target - scale * error, target + scale * error, color=VARIANT_COLOURS[4], alpha=0.25, lw=0
-        )
-        (actual,) = axis.plot(time, scale * record["w"][:, i], color=GROUND)
-        (wanted,) = axis.plot(time, target, ":", color="red", lw=1.4)
+        axis.plot(time, scale * record["w"][:, i], color=GROUND, label="simulated")
+        axis.plot(time, target, ":", color="red", lw=1.4, label="target")
+        low, high, label = target - scale * error, target + scale * error, "[T]: errors of about 30 mm and 0.1 rad"
+        axis.fill_between(time, low, high, color=VARIANT_COLOURS[4], alpha=0.25, lw=0, label=label)
         style.at_least(axis, 4 * scale * error)
         axis.set_ylabel(f"{SYMBOLS.get(COORDINATES[i], COORDINATES[i])}$_h$ [{unit}]")
         off = scale * np.abs(record["w"][:, i] - record["w_target"][:, i]).max()
@@ -227,12 +224,7 @@ def head_and_cost(record: Record) -> Figure:
     axes[3, 1].plot(time, record["cost"], color=GROUND)
     axes[3, 1].set(ylabel="V", xlabel="t [s]")
     axes[3, 1].set_ylim(bottom=0.0)
-    figure.legend(
-        [actual, wanted, band],
-        ["simulated", "target", "[T]: errors of about 30 mm and 0.1 rad"],
-        loc="outside lower center",
-        ncols=3,
-    )
+    style.legend_below(figure, [axes[0, 0]], 3)
     return figure
 
 
@@ -246,21 +238,18 @@ def joint_angles(record: Record) -> Figure:
     for axis in axes.ravel()[count:]:
         axis.set_visible(False)
     for j, axis in enumerate(axes.ravel()[:count]):
-        (actual,) = axis.plot(record.time, phi[:, j], color=GROUND)
-        if "phi_command" in record:
-            (commanded,) = axis.plot(record.time, record["phi_command"][:, j], ":", color="red", lw=1.2)
+        axis.plot(record.time, phi[:, j], color=GROUND, label="simulated")
         for bound in (geometry.lower[j], geometry.upper[j]):
-            limit = axis.axhline(bound, color="black", ls="-.", lw=0.8)
-        out = record["at_limit"][:, j] > 0
-        (stuck,) = axis.plot(record.time[out], phi[out, j], ".", color=HEAD, ms=3)
+            axis.axhline(bound, color="black", ls="-.", lw=0.8, label="joint limit")
+        out, label = record["at_limit"][:, j] > 0, "out of the allocation at its limit"
+        axis.plot(record.time[out], phi[out, j], ".", color=HEAD, ms=3, label=label)
+        if "phi_command" in record:
+            axis.plot(record.time, record["phi_command"][:, j], ":", color="red", lw=1.2, label="commanded")
         reach = 1.15 * geometry.upper[j]
         axis.set(ylim=(-reach, reach), ylabel=f"{greek(names[j])} [rad]")
     for axis in axes[-1]:
         axis.set_xlabel("t [s]")
-    lines, texts = [actual, limit, stuck], ["simulated", "joint limit", "out of the allocation at its limit"]
-    if "phi_command" in record:
-        lines, texts = [*lines, commanded], [*texts, "commanded"]
-    figure.legend(lines, texts, loc="outside lower center", ncols=len(lines))
+    style.legend_below(figure, [axes[0, 0]], 4)
     return figure
 
 
@@ -270,19 +259,11 @@ def policies(records: Mapping[str, Record]) -> Figure:
     axes = figure.subplots(6, 1, sharex=True, height_ratios=[1, 1, 1, 1.2, 1, 1])
     for axis, name in zip(axes, POLICIES, strict=False):
         mode_chart(axis, records[name], f"{name}: mode")
-    for name in POLICIES:
-        record = records[name]
-        label = f"{name}, V at the end {record['cost'][-1]:.2f}"
-        axes[3].plot(record.time, record["cost"], label=label)
-        axes[4].plot(record.time, used_limit(record))
-        axes[5].plot(record.time, 1e3 * record["support_margin"])
-    axes[3].set(ylabel="cost V")
-    axes[3].set_ylim(bottom=0)
+    overlay_margins(
+        axes[3:], {f"{name}, V at the end {records[name]['cost'][-1]:.2f}": records[name] for name in POLICIES}
+    )
     axes[3].legend()
-    axes[4].axhline(1.0, color="black", ls="-.", lw=0.8)
-    axes[4].set(ylabel="largest |θ| / limit")
-    axes[5].axhline(0.0, color="black", ls="-.", lw=0.8)
-    axes[5].set(ylabel="support margin [mm]", xlabel="t [s]      (margin below zero: the robot tips)")
+    axes[5].set_xlabel("t [s]      (margin below zero: the robot tips)")
     return figure
 
 
