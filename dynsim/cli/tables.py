@@ -622,7 +622,7 @@ def _cells(size: Size) -> tuple[str, ...]:
         escaped(size.label),
         f"{size.heat:.4g}",
         "–" if nominal is None else f"{nominal.heat_W:.4g}",
-        "–" if nominal is None else f"{nominal.electrical_J:.4g}",
+        "–" if nominal is None else f"{nominal.electrical_energy_J:.4g}",
         f"{size.k_p:g}",
         forces,
         f"{size.agreed}/{size.rounds}",
@@ -646,7 +646,7 @@ def _notes(size: Size) -> list[str]:
         notes.append(size.reason)
     if size.verdict is not None and not size.verdict.sound:
         notes.append(f"rejected as planned with k_p = {size.k_p:g} V/rad: errors were not tested")
-    for brace, share in ({} if size.nominal is None else size.nominal.closed).items():
+    for brace, share in ({} if size.nominal is None else size.nominal.closed_fraction).items():
         if share < LIFTED:
             notes.append(f"{brace} lifts off for {100.0 * (1.0 - share):.2g} % of the time in the run without errors")
     if size.tolerance is not None:

@@ -317,9 +317,9 @@ def _row(task: Task, size: Size) -> dict[str, Any]:
     row |= {
         "heat_W": dense.heat,
         "simulated_W": _number(nominal.heat_W),
-        "electrical_energy_J": _number(nominal.electrical_J),
-        "joint_rate_max": _number(nominal.rate_max),
-        "closed_least": min(nominal.closed.values(), default=None),
+        "electrical_energy_J": _number(nominal.electrical_energy_J),
+        "joint_rate_max": _number(nominal.joint_rate_max),
+        "closed_least": min(nominal.closed_fraction.values(), default=None),
         "peak_torque_N_m": dense.peak_torque,
         "peak_force_N": dense.peak_force,
         "torque_share": _torque_share(task, dense),
@@ -367,24 +367,13 @@ def _size_json(task: Task, size: Size) -> dict[str, Any]:
         "rounds": size.rounds,
         "rounds_that_found_it": size.agreed,
         "cheaper_refused": [{"braces": label, "reason": why} for label, why in size.cheaper],
-        "corners": [_corner_json(corner) for corner in corners],
+        "corners": [
+            {key: _number(value) if isinstance(value, float) else value for key, value in vars(corner).items()}
+            for corner in corners
+        ],
         **(
             {} if size.tolerance is None else {"holds": {"surface_m": size.tolerance[0], "friction": size.tolerance[1]}}
         ),
-    }
-
-
-def _corner_json(corner: Corner) -> dict[str, Any]:
-    return {
-        "friction_factor": corner.friction,
-        "surface_shift_m": corner.shift_m,
-        "heat_W": _number(corner.heat_W),
-        "hand_rms_m": _number(corner.hand_rms_m),
-        "electrical_energy_J": _number(corner.electrical_J),
-        "joint_rate_max": _number(corner.rate_max),
-        "hand_turn_rms_rad": _number(corner.turn_rms_rad),
-        "closed_fraction": corner.closed,
-        "reason": corner.reason,
     }
 
 
@@ -576,8 +565,9 @@ def _failure(search: Search, count: int) -> str:
     refused = [why for braces, why in tally.refused.items() if len(braces) == count]
     if refused:
         return refused[0]
-    if count > len({candidate.location for candidate in search.task.candidates}):
-        return f"only {len({candidate.location for candidate in search.task.candidates})} candidates exist"
+    points = len({candidate.location for candidate in search.task.candidates})
+    if count > points:
+        return f"only {points} candidates exist"
     missed = sum(len(braces) == count for braces in tally.missed)
     tried = missed + sum(len(braces) == count for braces in tally.reached)
     if tried == 0:

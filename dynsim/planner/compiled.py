@@ -218,6 +218,15 @@ def copy(source, target):
 
 
 @internal_kernel
+def dot(a, b):
+    """Return the scalar product of two vectors."""
+    s = 0.0
+    for i in range(a.shape[0]):
+        s += a[i] * b[i]
+    return s
+
+
+@internal_kernel
 def geometry(arm: Arm, points: Points, work: Work, q, k, count):
     """Compute row k of hand and gaps, with rates, for the first ``count`` points; for braces also force geometry."""
     n, c, hand, jacobian = arm.parent.shape[0], points.friction.shape[0], arm.hand[0], work.turn
@@ -650,21 +659,15 @@ def project(arm: Arm, points: Points, course: Course, work: Work, Q, steps, tole
             for r in range(m):
                 right[r] *= min(1.0, 0.25 / far)
                 for s in range(r + 1):
-                    z = 0.0
-                    for j in range(n):
-                        z += rows[r, j] * rows[s, j]
-                    A[r, s] = z
+                    A[r, s] = dot(rows[r], rows[s])
                 A[r, r] += damping
             factor(A, work.small_skyline, 0, m)
             forward(A, work.small_skyline, right, m)
             backward(A, work.small_skyline, right, m)
             most = 1e-300
             for j in range(n):
-                z = 0.0
-                for r in range(m):
-                    z += rows[r, j] * right[r]
-                work.x[j] = z
-                most = max(most, abs(z))
+                work.x[j] = dot(rows[:m, j], right)
+                most = max(most, abs(work.x[j]))
             for j in range(n):
                 Q[k, j] += work.x[j] * min(1.0, PROJECTION_REACH / most)
         worst = max(worst, left)
@@ -691,9 +694,7 @@ def null_space(work: Work, k, m):
             break
         best, most = -1, DEPENDENT * DEPENDENT
         for r in range(rank, m):
-            square = 0.0
-            for j in range(rank, n):
-                square += rows[r, j] * rows[r, j]
+            square = dot(rows[r, rank:], rows[r, rank:])
             if square > most:
                 best, most = r, square
         if best < 0:
@@ -708,17 +709,11 @@ def null_space(work: Work, k, m):
             u[j] = rows[rank, j] + (sign * size if j == rank else 0.0)
             square += u[j] * u[j]
         for r in range(rank, m):
-            s = 0.0
-            for j in range(rank, n):
-                s += rows[r, j] * u[j]
-            s *= 2.0 / square
+            s = 2.0 / square * dot(rows[r, rank:], u[rank:])
             for j in range(rank, n):
                 rows[r, j] -= s * u[j]
         for i in range(n):
-            s = 0.0
-            for j in range(rank, n):
-                s += Z[i, j] * u[j]
-            s *= 2.0 / square
+            s = 2.0 / square * dot(Z[i, rank:], u[rank:])
             for j in range(rank, n):
                 Z[i, j] -= s * u[j]
         rank += 1
@@ -745,10 +740,8 @@ def add_violated(arm: Arm, work: Work, m, before, kind, at, which, value, bound)
         return m + 1
     first = n - work.free[at]
     for d in range(work.free[at]):
-        z = 0.0
         if kind == CLEAR:
-            for j in range(n):
-                z += work.gap_rate[at, which, j] * work.basis[at, j, first + d]
+            z = dot(work.gap_rate[at, which], work.basis[at, :, first + d])
         else:
             z = work.basis[at, which, first + d] * (1.0 if kind == LOWER else -1.0)
         normals[work.start[at] + d, m] = z
@@ -820,10 +813,8 @@ def prepare(arm: Arm, points: Points, course: Course, work: Work, Q, damping):
                     g[start[k] + d] += course.smooth[k, l] * work.basis[k, j, first + d] * Q[l, j]
                 if l <= k:
                     for b in range(work.free[l]):
-                        z = 0.0
-                        for j in range(n):
-                            z += work.basis[k, j, first + d] * work.basis[l, j, other + b]
                         if start[k] + d >= start[l] + b:
+                            z = dot(work.basis[k, :, first + d], work.basis[l, :, other + b])
                             H[start[k] + d, start[l] + b] += course.smooth[k, l] * z
     for k in range(K):
         for d in range(work.free[k]):
@@ -889,12 +880,8 @@ def step(arm: Arm, points: Points, course: Course, work: Work, Q, F, min_force, 
                     full[i] += work.multiplier[a] * work.normals[i, a]
         backward(H, skyline, full, N)
         for k in range(K):
-            first = n - work.free[k]
             for j in range(n):
-                z = 0.0
-                for d in range(work.free[k]):
-                    z += work.basis[k, j, first + d] * full[work.start[k] + d]
-                work.change[k, j] = z
+                work.change[k, j] = dot(work.basis[k, j, n - work.free[k] :], full[work.start[k] :])
         before = m
         for e in range(E):
             for i in range(c):
@@ -905,9 +892,7 @@ def step(arm: Arm, points: Points, course: Course, work: Work, Q, F, min_force, 
                 slack = min(points.margin[i] - work.gap[k, i], 0.0)
                 if slack < -NEARBY:
                     continue
-                z = 0.0
-                for j in range(n):
-                    z += work.gap_rate[k, i, j] * work.change[k, j]
+                z = dot(work.gap_rate[k, i], work.change[k])
                 m = add_violated(arm, work, m, before, CLEAR, k, i, z, slack)
             for j in range(n):
                 z, low, high = work.change[k, j], arm.lower[j] - Q[k, j], arm.upper[j] - Q[k, j]

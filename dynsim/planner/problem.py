@@ -231,7 +231,7 @@ class Task:
             return bool(np.ptp(places, axis=0).max() > 1e-9)
 
         margin = self.options.clearance_m
-        ends = [(k, np.zeros(3), self._thickness(k), margin, robot.links[i].joint) for k, i in enumerate(arm.links)]
+        ends = [(k, np.zeros(3), _thickness(arm, k), margin, robot.links[i].joint) for k, i in enumerate(arm.links)]
         hand, hand_point = robot.attach(*robot.hand)
         ends.append((arm.links.index(hand), hand_point, robot.links[hand].radius, margin, "hand"))
         middles = [
@@ -246,12 +246,6 @@ class Task:
                 if moves(arm.links[k], point):
                     points[key(k, index, point)] = Clear(k, point, radius, least, f"{label} on {name}", index)
         return points
-
-    def _thickness(self, k: int) -> float:
-        """Return the radius at the start of a link: the larger radius of the two adjacent links [m]."""
-        links, parent = self.arm.model.robot.links, int(self.arm.tables.parent[k])
-        own = links[self.arm.links[k]].radius
-        return own if parent < 0 else max(own, links[self.arm.links[parent]].radius)
 
     def points(self, braces: Sequence[Candidate]) -> Points:
         """Return the tables of the braces, followed by the points that must stay clear."""
@@ -356,6 +350,13 @@ def _kind(path: HandPath, duration: float) -> Kind:
     return "closed" if np.abs(there[0] - there[-1]).max() <= SAME else "open"
 
 
+def _thickness(arm: MovingArm, k: int) -> float:
+    """Return the radius at the start of a link: the larger radius of the two adjacent links [m]."""
+    links, parent = arm.model.robot.links, int(arm.tables.parent[k])
+    own = links[arm.links[k]].radius
+    return own if parent < 0 else max(own, links[arm.links[parent]].radius)
+
+
 def _candidates(scenario: Scenario, arm: MovingArm, options: Options, surfaces: Sequence[str]) -> list[Candidate]:
     """Return the candidate points, each combined with each surface that it may use."""
     robot, declared = arm.model.robot, scenario.config.contacts.points
@@ -402,9 +403,7 @@ def _candidates(scenario: Scenario, arm: MovingArm, options: Options, surfaces: 
             raise ModelError(f"plan: unknown candidate {name!r} (contact points, links and frames: {known_names})")
         k = links.index(name)
         radius = robot.links[arm.links[k]].radius
-        parent = int(arm.tables.parent[k])
-        thick = radius if parent < 0 else max(radius, robot.links[arm.links[parent]].radius)
-        add(name, name, np.zeros(3), thick, surfaces)
+        add(name, name, np.zeros(3), _thickness(arm, k), surfaces)
         for share in options.along:
             if (k, share) in along:
                 add(f"{name}_at_{share:g}", name, along[k, share], radius, surfaces)

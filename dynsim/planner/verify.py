@@ -81,40 +81,40 @@ class Corner:
 
     Attributes
     ----------
-    friction : float
+    friction_factor : float
         Factor on μ.
-    shift_m : float
+    surface_shift_m : float
         Displacement of all surfaces upwards [m].
     heat_W : float
         Mean heat [W]; NaN if the run ended early.
     hand_rms_m : float
         Rms error of the hand [m]; NaN if the run ended early.
-    electrical_J : float
+    electrical_energy_J : float
         Electrical energy of the motors [J].
-    rate_max : float
+    joint_rate_max : float
         Maximum joint rate [rad/s or m/s].
-    turn_rms_rad : float
+    hand_turn_rms_rad : float
         Rms error of the hand's orientation [rad]; NaN without a reference orientation.
-    closed : dict
+    closed_fraction : dict
         Fraction of the time that each brace touches.
     reason : str
         Why the corner is rejected, with time and quantity; empty if it is accepted.
     """
 
-    friction: float
-    shift_m: float
+    friction_factor: float
+    surface_shift_m: float
     heat_W: float = float("nan")
     hand_rms_m: float = float("nan")
-    electrical_J: float = float("nan")
-    rate_max: float = float("nan")
-    turn_rms_rad: float = float("nan")
-    closed: dict[str, float] = field(default_factory=dict)
+    electrical_energy_J: float = float("nan")
+    joint_rate_max: float = float("nan")
+    hand_turn_rms_rad: float = float("nan")
+    closed_fraction: dict[str, float] = field(default_factory=dict)
     reason: str = ""
 
     @property
     def label(self) -> str:
         """Friction factor and displacement as text."""
-        return f"friction × {self.friction:g}, surfaces {1e3 * self.shift_m:+g} mm"
+        return f"friction × {self.friction_factor:g}, surfaces {1e3 * self.surface_shift_m:+g} mm"
 
 
 @dataclass(frozen=True)

@@ -251,7 +251,7 @@ def stiffness(scenario: Scenario, counts: Sequence[int], along: tuple[float, ...
                     "heat_W": _rounded(size.heat),
                     "k_p_V_per_rad": k_p,
                     "times_the_heat": {
-                        f"{1e3 * c.shift_m:+g} mm": _rounded(c.heat_W / size.heat) for c in verdict.corners
+                        f"{1e3 * c.surface_shift_m:+g} mm": _rounded(c.heat_W / size.heat) for c in verdict.corners
                     },
                     "survives": verdict.survives,
                     "reason": verdict.reason,

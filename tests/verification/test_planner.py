@@ -245,9 +245,9 @@ def test_plans_run_as_planned_and_bear_errors_of_the_scene(searched) -> None:  #
     assert verdict.survives, verdict.reason
     assert len(verdict.corners) == 9
     # All of the energy is at least the heat of the run, and braces that stick bear all the time.
-    assert nominal.electrical_J >= 0.99 * nominal.heat_W * search.task.span
-    assert 0.0 < nominal.rate_max < 2.0
-    assert min(nominal.closed.values()) == pytest.approx(1.0, abs=1e-6)
+    assert nominal.electrical_energy_J >= 0.99 * nominal.heat_W * search.task.span
+    assert 0.0 < nominal.joint_rate_max < 2.0
+    assert min(nominal.closed_fraction.values()) == pytest.approx(1.0, abs=1e-6)
 
 
 def test_both_treatments_of_contacts_see_the_same_run_of_a_plan(searched) -> None:  # type: ignore[no-untyped-def]
@@ -284,7 +284,7 @@ def test_the_hand_keeps_the_orientation_that_its_path_asks_for() -> None:
     for q in dense.q:
         assert np.abs(model.body_pose("link_10", q)[0] - wanted).max() < 1e-8
     corners = size.verdict.corners  # type: ignore[union-attr]
-    assert 0.0 < corners[0].turn_rms_rad < 1e-3 < max(corner.turn_rms_rad for corner in corners) < 0.05
+    assert 0.0 < corners[0].hand_turn_rms_rad < 1e-3 < max(corner.hand_turn_rms_rad for corner in corners) < 0.05
 
 
 def test_a_path_out_of_reach_is_answered_in_words() -> None:

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from dynsim.draw.figures import contacts, style
 from dynsim.draw.figures.energy import edge_on, target_name
-from dynsim.draw.figures.posture import ARM_COLOUR, Skeleton, skeleton
+from dynsim.draw.figures.posture import ARM_COLOUR, Skeleton, add_outlines, skeleton
 from dynsim.draw.figures.style import Array
-from dynsim.draw.geometry.shapes import box_about, outline
+from dynsim.draw.geometry.shapes import box_about
 from dynsim.record import Record
 from dynsim.record.measures import TIP_OVER, hand_target, overturns_settled, percent
 from dynsim.record.poses import point_positions
@@ -249,7 +249,7 @@ TRIANGLE, INSIDE, OUTSIDE = style.SKY, style.PURPLE, style.PULLING
 def top_view(record: Record) -> Figure | None:
     """Draw the run from above in the world, and the centre of pressure in the base frame; None without a base."""
     body, _ = skeleton(record)
-    if body is None or len(body.scene.supports) != 3 or not {"base_pose", "center_of_pressure"} <= set(record):
+    if len(body.scene.supports) != 3 or not {"base_pose", "center_of_pressure"} <= set(record):
         return None
     rows = np.flatnonzero(np.isfinite(record["base_pose"]).all(axis=1))
     if not len(rows):
@@ -304,24 +304,22 @@ def _track(body: Skeleton, point: Point, rows: Rows) -> Array:
 def _draw_world(axes: Axes, body: Skeleton, rows: Rows) -> None:
     record, scene = body.record, body.scene
     first, last = int(rows[0]), int(rows[-1])
-    _draw_outline(axes, body, first, facecolor="none", linestyle=(0, (3, 2)), label="base at the start")
-    _draw_outline(axes, body, last, facecolor="#DDDDDD", linestyle="-", label="base at the end")
+    for row, name, face, dashes in ((first, "start", "none", (0, (3, 2))), (last, "end", "#DDDDDD", "-")):
+        look: dict[str, Any] = {"facecolor": face, "linestyle": dashes, "label": f"base at the {name}"}
+        solids = (solid[:, :2] for solid, _ in body.solids(row))
+        add_outlines(axes, solids, edgecolor=ARM_COLOUR, lw=0.8, zorder=2, **look)
     arm = body.segments(last)[:, :, :2]
     for segment in arm:
         axes.plot(*segment.T, color=ARM_ABOVE, lw=1.6, zorder=3)
     axes.plot([], [], color=ARM_ABOVE, lw=1.6, label="arm at the end")
-    for row in _rows_along_path(
-        record["base_pose"], rows, APART * float(np.ptp(support_corners(body, first), axis=0).max())
-    ):
+    apart = APART * float(np.ptp(support_corners(body, first), axis=0).max())
+    for row in _rows_along_path(record["base_pose"], rows, apart):
         axes.add_patch(Polygon(support_corners(body, row), facecolor="none", edgecolor=TRIANGLE, lw=0.7, zorder=4))
     axes.plot([], [], color=TRIANGLE, lw=0.7, label="support triangle")
-    looks: tuple[dict[str, Any], ...] = (
-        {"color": style.BLACK, "lw": 0.9, "label": "wheel tracks"},
-        {"color": style.BLACK, "lw": 0.9},
-        {"color": style.BLACK, "lw": 0.9, "linestyle": (0, (1, 1)), "label": "caster track"},
-    )
-    for point, look in zip(scene.supports, looks, strict=True):
-        axes.plot(*style.sparse(_track(body, point, rows)).T, zorder=5, **look)
+    tracks: Any = (("-", "wheel tracks"), ("-", None), ((0, (1, 1)), "caster track"))
+    for point, (dashes, label) in zip(scene.supports, tracks, strict=True):
+        track = style.sparse(_track(body, point, rows))
+        axes.plot(*track.T, color=style.BLACK, lw=0.9, linestyle=dashes, label=label, zorder=5)
     for k, contact in enumerate(scene.contacts):
         path = style.sparse(_track(body, contact, rows))
         colour = ELBOW_COLOURS[k % len(ELBOW_COLOURS)]
@@ -344,8 +342,7 @@ def _draw_base_frame(axes: Axes, body: Skeleton, rows: Rows) -> None:
     record = body.record
     pose = record["base_pose"][rows[-1]]
     parts = [_ahead_and_left(solid[:, :2] - pose[:2], pose[2]) for solid, _ in body.solids(int(rows[-1]))]
-    for part in parts:
-        axes.add_patch(Polygon(outline(part), facecolor="#EEEEEE", edgecolor=style.GREY, lw=0.7, zorder=1))
+    add_outlines(axes, parts, facecolor="#EEEEEE", edgecolor=style.GREY, lw=0.7, zorder=1)
     corners = _ahead_and_left(support_corners(body, int(rows[-1])) - pose[:2], pose[2])
     axes.add_patch(Polygon(corners, facecolor=TRIANGLE, alpha=0.2, lw=0, zorder=2))
     axes.add_patch(Polygon(corners, facecolor="none", edgecolor=TRIANGLE, lw=1.0, zorder=3))
@@ -379,13 +376,6 @@ def _draw_base_frame(axes: Axes, body: Skeleton, rows: Rows) -> None:
     axes.set_title("in the base frame" + (f"; {100 * lost:.2g} % of the path is outside" if lost > 0.0 else ""))
     axes.set_xlabel("ahead [m]")
     axes.set_ylabel("to the left [m]")
-
-
-def _draw_outline(axes: Axes, body: Skeleton, row: int, *, label: str, **look: Any) -> None:
-    for k, (solid, _) in enumerate(body.solids(row)):
-        patch = Polygon(outline(solid[:, :2]), edgecolor=ARM_COLOUR, lw=0.8, zorder=2, **look)
-        patch.set_label(label if k == 0 else "_")
-        axes.add_patch(patch)
 
 
 def _draw_pressure(axes: Axes, body: Skeleton, path: Array) -> None:

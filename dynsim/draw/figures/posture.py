@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -75,6 +75,8 @@ class Skeleton:
 
     def rows_shown(self) -> list[int]:
         """Return the samples at which the robot is drawn, the last one last; empty if it never had a finite pose."""
+        if not self.scene.bodies:
+            return []
         rows = np.flatnonzero(np.isfinite(self.record[POSITION]).all(axis=(1, 2)))
         if not len(rows):
             return []
@@ -87,7 +89,7 @@ class Skeleton:
         returned.
         """
         record = self.record
-        if not np.isfinite(record[POSITION][-1]).all():
+        if not self.scene.bodies or not np.isfinite(record[POSITION][-1]).all():
             return []
         forces: dict[str, float] = {}
         if "contact_normal_force" in record:
@@ -115,10 +117,10 @@ def _is_translation_row(joint: Joint) -> bool:
     return bool(joint.part_of) and joint.kind in ("prismatic", "planar")
 
 
-def skeleton(record: Record) -> tuple[Skeleton | None, str]:
-    """Return the robot of a record, or None and the reason why it cannot be drawn."""
+def skeleton(record: Record) -> tuple[Skeleton, str]:
+    """Return the robot of a record, or one without bodies and the reason why it cannot be drawn."""
     scene, lacking = placed(record)
-    return (None, f"posture not drawn: {lacking}") if scene is None else (Skeleton(record, scene), "")
+    return Skeleton(record, scene or Scene()), f"posture not drawn: {lacking}" if lacking else ""
 
 
 @dataclass(frozen=True)
@@ -195,13 +197,13 @@ class Label:
         return bool((apart < self.half + other.half + [2.0, 0.0]).all())
 
 
-def contact_labels(body: Skeleton | None, plane: SidePlane, scale: float) -> list[Label]:
+def contact_labels(body: Skeleton, plane: SidePlane, scale: float) -> list[Label]:
     """Return labels with names and forces of the contacts, inside the surface and away from the arm.
 
     Labels that would overlap at ``scale`` [point/m] are moved away from the surface.
     """
     labels: list[Label] = []
-    points = [(*contact, plane.project(contact[2])) for contact in ([] if body is None else body.contacts())]
+    points = [(*contact, plane.project(contact[2])) for contact in body.contacts()]
     for contact, surface, position, force, at in sorted(points, key=lambda entry: float(entry[4][0])):
         along, up = plane.project(plane.origin + surface.gradient(position)) - plane.project(plane.origin)
         steep = abs(along) > abs(up)
@@ -264,9 +266,9 @@ def posture(record: Record) -> Figure | None:
     if "hand_position" not in record:
         return None
     body, note = skeleton(record)
-    drawn = [] if body is None else body.postures()
+    drawn = body.postures()
     plane = side_plane(record, drawn)
-    everything = drawn if body is None else [*drawn, *(solid for base in body.bases() for solid in base)]
+    everything = [*drawn, *(solid for base in body.bases() for solid in base)]
     low, high = bounds([record], everything)
     wide = np.hypot(high[0] - low[0], high[1] - low[1]) > 2.2 * (high[2] - low[2])
     extent = extent_of(plane, everything, [record])
@@ -275,16 +277,16 @@ def posture(record: Record) -> Figure | None:
     height = 5.6 if wide else 1.15 + float(np.clip(HALF / 72.0 * size[1] / size[0], 1.5, 3.4))
     room = np.array([FULL, np.inf]) if wide else np.array([HALF, 72.0 * (height - 1.15)])
     extent, scale = _with_labels(extent, [body], plane, room)
-    before = ", ".join(style.number(float(record.time[row]), 2) for row in body.rows_shown()[:-1]) if body else ""
+    before = ", ".join(style.number(float(record.time[row]), 2) for row in body.rows_shown()[:-1])
     faint = f"; faint, at {before} s" if before else ""
     figure = style.new_figure(height, style.title(record, f"posture at {record.time[-1]:.4g} s{faint}"))
     # Side by side, the labels of the 3D view need some space to their right.
     grid = figure.add_gridspec(2, 1, height_ratios=[1.25, 1.0]) if wide else figure.add_gridspec(1, 2, wspace=0.15)
     space: Any = figure.add_subplot(grid[0], projection="3d")
     side = figure.add_subplot(grid[1])
-    _space_view(space, record, body, drawn, (low, high), zoom=1.65 if wide else 1.15)
-    _side_view(side, record, body, drawn, plane, scale, colour=ARM_COLOUR)
-    _frame_side(side, plane, extent, () if body is None else body.scene.surfaces)
+    _space_view(space, body, (low, high), zoom=1.65 if wide else 1.15)
+    _side_view(side, body, plane, scale, colour=ARM_COLOUR)
+    _frame_side(side, plane, extent, body.scene.surfaces)
     if note:
         side.set_title(note, color=style.PULLING)
     style.legend_below(figure, [side], 5)
@@ -294,12 +296,11 @@ def posture(record: Record) -> Figure | None:
 def posture_comparison(records: Mapping[str, Record]) -> Figure | None:
     """Draw side views of all variants at one scale; None if no arm can be drawn."""
     bodies = {name: skeleton(record)[0] for name, record in records.items() if "hand_position" in record}
-    shown = {name: body for name, body in bodies.items() if body is not None}
+    shown = {name: body for name, body in bodies.items() if body.scene.bodies}
     if not shown:
         return None
     some = [records[name] for name in shown]
-    drawn = {name: body.postures() for name, body in shown.items()}
-    everything = [segments for postures in drawn.values() for segments in postures]
+    everything = [segments for body in shown.values() for segments in body.postures()]
     plane = side_plane(some[0], everything)
     everything += [solid for body in shown.values() for base in body.bases() for solid in base]
     low, high = extent_of(plane, everything, some)
@@ -317,8 +318,7 @@ def posture_comparison(records: Mapping[str, Record]) -> Figure | None:
     grid = figure.subplots(lines, columns, sharex=True, sharey="row", squeeze=False)
     styles = style.variant_styles(list(records))
     for axes, (name, body) in zip(grid.ravel(), shown.items(), strict=False):
-        colour = str(styles[name]["color"])
-        _side_view(axes, records[name], body, drawn[name], plane, scale, colour=colour, path=style.GREY, named=False)
+        _side_view(axes, body, plane, scale, colour=styles[name]["color"], path=style.GREY, named=False)
         _frame_side(axes, plane, framed, body.scene.surfaces)
         axes.set_title(name, color=styles[name]["color"], fontweight="bold")
         axes.label_outer()
@@ -332,7 +332,7 @@ def posture_comparison(records: Mapping[str, Record]) -> Figure | None:
 
 
 def _with_labels(
-    extent: tuple[Array, Array], bodies: Sequence[Skeleton | None], plane: SidePlane, room: Array
+    extent: tuple[Array, Array], bodies: Sequence[Skeleton], plane: SidePlane, room: Array
 ) -> tuple[tuple[Array, Array], float]:
     """Return the extent with space for contact labels, and the scale [point/m] at which it fits ``room`` [point]."""
     wide, scale = extent, float((room / (extent[1] - extent[0])).min())
@@ -362,9 +362,7 @@ def _frame_side(axes: Axes, plane: SidePlane, extent: tuple[Array, Array], surfa
 
 def _side_view(
     axes: Axes,
-    record: Record,
-    body: Skeleton | None,
-    drawn: Sequence[Array],
+    body: Skeleton,
     plane: SidePlane,
     scale: float,
     *,
@@ -373,14 +371,11 @@ def _side_view(
     named: bool = True,
 ) -> None:
     """Draw the side view; if ``named``, the legend states depth and surface of penetrations."""
-    for k, base in enumerate([] if body is None else body.bases()):
+    record, drawn = body.record, body.postures()
+    for k, base in enumerate(body.bases()):
         last = k == len(drawn) - 1
-        for solid in base:
-            corners = outline(plane.project(solid))
-            face = BASE_COLOUR if last else "none"
-            axes.add_patch(
-                Polygon(corners, facecolor=face, edgecolor=colour, lw=0.8, alpha=1.0 if last else 0.22, zorder=2.5)
-            )
+        look: dict[str, Any] = {"facecolor": BASE_COLOUR if last else "none", "alpha": 1.0 if last else 0.22}
+        add_outlines(axes, map(plane.project, base), edgecolor=colour, lw=0.8, zorder=2.5, **look)
     for k, segments in enumerate(drawn):
         last = k == len(drawn) - 1
         flat = plane.project(segments)
@@ -400,11 +395,11 @@ def _side_view(
         target = edge_on(plane.project(wanted))
         axes.plot(*target.T, color=style.BLACK, linestyle=(0, (3, 2)), lw=0.9, zorder=5, label=target_name(record))
     axes.plot(*plane.project(style.sparse(record["hand_position"])).T, color=path, lw=1.0, zorder=4, label="hand path")
-    for _, _, position, force in () if body is None else body.contacts():
+    for _, _, position, force in body.contacts():
         axes.plot(*plane.project(position), zorder=6, linestyle="none", **_contact_mark(force))
     labels = contact_labels(body, plane, scale)
-    rows = np.array([] if body is None else body.rows_shown(), dtype=np.intp)
-    if body is not None and (below := penetrations(record, body.scene, rows)):
+    rows = np.array(body.rows_shown(), dtype=np.intp)
+    if body.scene.bodies and (below := penetrations(record, body.scene, rows)):
         ring: dict[str, Any] = {"markersize": 9, "markerfacecolor": "none", "color": style.DEEP, "zorder": 5}
         for point_below in below:
             point = Point(point_below.name, "hand", point_below.body, point_below.position)
@@ -428,25 +423,25 @@ def _side_view(
         )
 
 
+def add_outlines(axes: Axes, solids: Iterable[Array], label: str = "", **look: Any) -> None:
+    """Draw the convex hulls of projected solids, (n, 2) each, with one legend entry."""
+    for solid in solids:
+        axes.add_patch(Polygon(outline(solid), label=label, **look))
+        label = ""
+
+
 def _opacity(k: int, count: int) -> float:
     """Return the opacity of the k-th posture, which increases with time up to 1."""
     return 1.0 if k == count - 1 else 0.12 + 0.2 * k / count
 
 
-def _space_view(
-    axes: Axes3D,
-    record: Record,
-    body: Skeleton | None,
-    drawn: Sequence[Array],
-    bounds: tuple[Array, Array],
-    zoom: float,
-) -> None:
-    low, high = bounds
+def _space_view(axes: Axes3D, body: Skeleton, bounds: tuple[Array, Array], zoom: float) -> None:
+    (low, high), record, drawn = bounds, body.record, body.postures()
     # Fixed drawing order: sorted by depth, the floor would hide the contacts on it.
     axes.computed_zorder = False
-    for surface in () if body is None else body.scene.surfaces:
+    for surface in body.scene.surfaces:
         _draw_surface(axes, surface, low, high)
-    base = [] if body is None or not drawn else body.solids(body.rows_shown()[-1])
+    base = body.solids(body.rows_shown()[-1]) if drawn else []
     if base:
         # One collection, because a collection sorts its faces by depth.
         shown = np.concatenate([corners[faces] for corners, faces in base])
@@ -468,7 +463,7 @@ def _space_view(
         target = style.sparse(wanted)
         axes.plot(*target.T, color=style.BLACK, linestyle=(0, (3, 2)), lw=0.9, zorder=6)
     axes.plot(*style.sparse(record["hand_position"]).T, color=style.BLUE, lw=1.0, zorder=5)
-    for _, _, position, force in () if body is None else body.contacts():
+    for _, _, position, force in body.contacts():
         axes.plot(*position[:, None], linestyle="none", zorder=7, **_contact_mark(force))
     axes.set_xlim(low[0], high[0])
     axes.set_ylim(low[1], high[1])

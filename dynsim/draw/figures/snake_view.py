@@ -10,13 +10,13 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch, Polygon
+from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from dynsim.draw.figures import style
-from dynsim.draw.figures.posture import SidePlane
+from dynsim.draw.figures.posture import SidePlane, add_outlines
 from dynsim.draw.figures.style import Array
-from dynsim.draw.geometry.shapes import corners_of, outline, wheel_groups
+from dynsim.draw.geometry.shapes import corners_of, wheel_groups
 from dynsim.errors import RecordError
 from dynsim.record import Record
 from dynsim.record.poses import POSITION
@@ -77,11 +77,11 @@ class View:
 
     def draw(self, axes: Axes, above: bool) -> None:
         """Draw objects, body, controlled point and wheels; from above also support polygon and centre of mass."""
-        for corners in self.objects:
-            axes.add_patch(Polygon(outline(self.project(corners, above)), fc=OBJECT, ec=BODY, lw=0.5, zorder=1.5))
+        objects = (self.project(corners, above) for corners in self.objects)
+        add_outlines(axes, objects, fc=OBJECT, ec=BODY, lw=0.5, zorder=1.5)
         if above:
             stands = [corners.mean(axis=0)[:2] for k in np.flatnonzero(self.grounded) for corners in self.wheels[k]]
-            axes.add_patch(Polygon(outline(np.array(stands)), color=SUPPORT, alpha=0.25, lw=0, zorder=1))
+            add_outlines(axes, [np.array(stands)], color=SUPPORT, alpha=0.25, lw=0, zorder=1)
             axes.plot(*self.centre[:2], "x", color="black", ms=4, mew=1.0, zorder=6)
         else:
             axes.axhline(0.0, color="#BBBBBB", lw=0.8, zorder=0)
@@ -92,10 +92,8 @@ class View:
             # In side view a lifted pair is drawn slightly above the ground; the model has no height for it ([T] II.A).
             raised = np.array([0.0, 0.0 if above or down else 0.35 * self.radius])
             look: dict[str, Any] = {"facecolor": GROUND if down else LIFT, "edgecolor": GROUND, "lw": 0.7}
-            for corners in pair:
-                axes.add_patch(
-                    Polygon(outline(self.project(corners, above)) + raised, zorder=4 if above else 2, **look)
-                )
+            wheels = (self.project(corners, above) + raised for corners in pair)
+            add_outlines(axes, wheels, zorder=4 if above else 2, **look)
 
 
 def posture_grid(title: str, lines: Mapping[str, Sequence[tuple[View, str]]], one_scale: bool = True) -> Figure:

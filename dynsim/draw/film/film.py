@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -186,17 +187,15 @@ NEARLY = 9
 QUALITY = 20
 
 
-def check_length(kind: str, count: int, size: tuple[int, int]) -> None:
-    """Raise if a film would have too many frames.
+def check_length(count: int, size: tuple[int, int]) -> None:
+    """Raise if a GIF, whose frames are all in memory, would be too large.
 
     Raises
     ------
     RecordError
-        If there are too many frames, or a GIF, whose frames are all in memory, would be too large.
+        If the frames have too many pixels.
     """
-    if count > FRAMES_MAX:
-        raise RecordError(f"too many frames ({count}, limit {FRAMES_MAX}); raise --speed or lower --fps")
-    if kind == "gif" and count * size[0] * size[1] > GIF_PIXELS_MAX:
+    if count * size[0] * size[1] > GIF_PIXELS_MAX:
         raise RecordError(
             f"a GIF of {count} frames of {size[0]}x{size[1]} pixels needs too much memory; write an .mp4, "
             "raise --speed, or lower --fps or --size"
@@ -265,7 +264,7 @@ def write_mp4(stream: BinaryIO, frames: Iterable[Image.Image], fps: int, last_s:
     """
     av = _av()
     frames = iter(frames)
-    first = last = next(frames)
+    first = next(frames)
     with av.open(stream, "w", format="mp4") as container:
         options = {"crf": str(QUALITY), "preset": "veryfast"}
         track = container.add_stream("libx264", rate=Fraction(fps), options=options)
@@ -275,12 +274,10 @@ def write_mp4(stream: BinaryIO, frames: Iterable[Image.Image], fps: int, last_s:
         def add(frame: Image.Image) -> None:
             container.mux(track.encode(av.VideoFrame.from_ndarray(np.asarray(frame), format="rgb24")))
 
-        add(first)
-        for frame in frames:
+        for frame in itertools.chain([first], frames):
             add(frame)
-            last = frame
         for _ in range(round(last_s * fps)):
-            add(last)
+            add(frame)
         container.mux(track.encode())
 
 
@@ -361,7 +358,6 @@ class Film:
         self.size, self.fps = size, fps
         shown = robots(records)
         self.times = _times(records, speed, fps)
-        check_length("", len(self.times), size)
         self._speed = speed
         kept = {name: records[name] for name in shown}
         width, height = size
@@ -519,7 +515,8 @@ def write(
     check(kind, fps)
     film = Film(records, view=view, size=size, speed=speed, fps=fps, plot=plot)
     total = len(film.times)
-    check_length(kind, total, size)
+    if kind == "gif":
+        check_length(total, size)
     frames = film.frames(lambda done: progress(done, total))
     with replacing(path) as stream:
         if kind == "gif":

@@ -316,15 +316,6 @@ class Painter:
             self.labels = labels(draw, [force for force in forces if force], self._font, image.size, PAPER)
         return image.reduce(FINER)
 
-    def hand(self, time: float) -> tuple[float, float] | None:
-        """Return the position of the hand mark in the image [pixel], or None for a robot without a hand."""
-        point = self.robot.scene.hand
-        if point is None:
-            return None
-        position, turn, _, _ = self._pose(time)
-        x, y, _ = self.camera.project(_on(point.body, np.array(point.position), position, turn))
-        return float(x) / FINER, float(y) / FINER
-
     def _pose(self, time: float) -> tuple[Array, Array, int, float]:
         """Return positions and orientations of all bodies at a time, the preceding sample and the fraction after it."""
         row, share = 0, 0.0

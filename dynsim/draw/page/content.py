@@ -63,7 +63,6 @@ class Blocks:
 
     def __init__(self) -> None:
         self._parts: list[bytes] = []
-        self._size = 0
 
     def add(self, columns: ArrayLike, error: float = np.inf) -> dict[str, Any]:
         """Add columns, (T,) or (T, …), quantised to 16 bits of their range, or to 32 bits if ``error`` requires it."""
@@ -82,19 +81,19 @@ class Blocks:
         codes = np.where(known, codes, float(_CODES[bits] + 1)).astype(kind)
         steps = np.diff(codes.T, axis=1, prepend=np.zeros((codes.shape[1], 1), dtype=kind))
         planes = np.ascontiguousarray(steps).view(np.uint8).reshape(-1, bits // 8).T
-        content = np.ascontiguousarray(planes).tobytes()
-        self._parts.append(content)
-        start, self._size = self._size, self._size + len(content)
+        start = self._append(np.ascontiguousarray(planes).tobytes())
         header = {"at": start, "rows": len(data), "columns": int(codes.shape[1]), "bits": bits}
         return header | {"offset": low.tolist(), "scale": scale.tolist()}
 
     def raw(self, data: NDArray[Any]) -> dict[str, Any]:
         """Add an array of integers ≥ 0 unchanged (for meshes), little endian, in 16 bits, or 32 if necessary."""
         bits = 16 if data.max(initial=0) < 2**16 else 32
-        content = data.astype(_TYPES[bits]).tobytes()
+        return {"at": self._append(data.astype(_TYPES[bits]).tobytes()), "count": int(data.size), "bits": bits}
+
+    def _append(self, content: bytes) -> int:
+        """Append a block; return its position."""
         self._parts.append(content)
-        start, self._size = self._size, self._size + len(content)
-        return {"at": start, "count": int(data.size), "bits": bits}
+        return sum(map(len, self._parts[:-1]))
 
     def packed(self, head: dict[str, Any]) -> str:
         """Return head and blocks as text: head length in 4 bytes, head as JSON, blocks; compressed, in base64."""
@@ -249,12 +248,9 @@ def _contacts(robot: DrawnRobot, blocks: Blocks) -> list[dict[str, Any]]:
             "normal": blocks.add(contact.normal),
             "force": blocks.add(contact.force),
         }
-        if contact.tangent is not None:
-            entry["tangent"] = blocks.add(contact.tangent)
-        if contact.mode is not None:
-            entry["mode"] = blocks.add(contact.mode)
-        if contact.at is not None:
-            entry["at"] = blocks.add(contact.at)
+        for name, values in (("tangent", contact.tangent), ("mode", contact.mode), ("at", contact.at)):
+            if values is not None:
+                entry[name] = blocks.add(values)
         entries.append(entry)
     return entries
 
