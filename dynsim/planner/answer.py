@@ -314,6 +314,8 @@ def _row(task: Task, size: Size) -> dict[str, Any]:
     dense = size.planned.dense
     nominal = size.nominal or Corner(1.0, 0.0)
     distance, part, _ = nearest(task, size.braces, dense.times, dense.q)
+    links = [task.arm.model.robot.links[i] for i in task.arm.links]
+    lower, upper = np.array([(link.lower, link.upper) for link in links]).T
     row |= {
         "heat_W": dense.heat,
         "simulated_W": _number(nominal.heat_W),
@@ -327,7 +329,7 @@ def _row(task: Task, size: Size) -> dict[str, Any]:
         "normal_force_max_N": float(dense.forces.max()) if size.count else None,
         "clearance_m": _number(distance),
         "clearance_of": part,
-        "joint_limit_distance": _number(_joint_room(task, dense)),
+        "joint_limit_distance": _number(min((dense.q - lower).min(), (upper - dense.q).min())),
         "k_p_V_per_rad": size.k_p,
         "found_in_rounds": f"{size.agreed}/{size.rounds}",
         "survives": size.survives,
@@ -386,13 +388,6 @@ def _torque_share(task: Task, dense: Dense) -> float | None:
     """Return the maximum torque as a fraction of the motor's limit at rest; None without limits."""
     share = np.abs(dense.torques) / task.arm.tables.greatest
     return _number(float(share.max())) if np.isfinite(task.arm.tables.greatest).any() else None
-
-
-def _joint_room(task: Task, dense: Dense) -> float:
-    """Return the minimum distance of a joint from its limits [rad or m]."""
-    links = [task.arm.model.robot.links[i] for i in task.arm.links]
-    lower, upper = np.array([link.lower for link in links]), np.array([link.upper for link in links])
-    return float(min((dense.q - lower).min(), (upper - dense.q).min()))
 
 
 def plan_braces(

@@ -31,7 +31,8 @@ REPLACED = (
     "k_p_V_per_rad",
     "k_d_V_s_per_rad",
 )
-BILATERAL_ONLY = ("slip_smoothing_m_s", "pulling_friction")
+# Keys of the contacts that a plan does not need, or that only the bilateral law has.
+DROPPED = ("slip_smoothing_m_s", "pulling_friction", "reference_tolerance_m")
 
 
 def method(task: Task) -> str:
@@ -70,16 +71,10 @@ def shared_sections(task: Task) -> dict[str, Any]:
     data = dict(task.scenario.resolved)
     data["name"] = f"{task.scenario.name}_plan"
     data.pop("variant", None)
-    controller = dict(data["controller"])
-    hand = {key: value for key, value in controller["hand"].items() if key in ("path", "orientation")}
-    for key in REPLACED:
-        controller.pop(key, None)
-    controller["hand"] = hand | {"joints": []}
-    data["controller"] = controller
-    contacts = dict(data["contacts"])
-    for key in BILATERAL_ONLY:
-        contacts.pop(key, None)
-    contacts.pop("reference_tolerance_m", None)
+    hand = {key: value for key, value in data["controller"]["hand"].items() if key in ("path", "orientation")}
+    controller = {key: value for key, value in data["controller"].items() if key not in REPLACED}
+    data["controller"] = controller | {"hand": hand | {"joints": []}}
+    contacts = {key: value for key, value in data["contacts"].items() if key not in DROPPED}
     data["contacts"] = contacts | {"law": "unilateral", "candidates": "points", "points": {}}
     data["integrator"] = {"method": method(task)}
     data.pop("initial", None)
@@ -125,17 +120,6 @@ def plan_sections(task: Task, braces: tuple[Candidate, ...], dense: Dense, k_p: 
     return {"controller": controller, "contacts": {"points": points}, "initial": initial}
 
 
-def merged(shared: dict[str, Any], own: dict[str, Any], variant: str = "") -> dict[str, Any]:
-    """Combine the shared part and the sections of one plan to a complete scenario."""
-    return {
-        **shared,
-        **({"variant": variant} if variant else {}),
-        "controller": shared["controller"] | own["controller"],
-        "contacts": shared["contacts"] | own["contacts"],
-        "initial": own["initial"],
-    }
-
-
 def scenario(
     task: Task,
     braces: tuple[Candidate, ...],
@@ -145,6 +129,14 @@ def scenario(
     more: Mapping[str, Any] | None = None,
 ) -> Scenario:
     """Return the plan as a scenario; ``more`` has additional sections."""
+    shared, own = shared_sections(task), plan_sections(task, braces, dense, k_p)
     return scenario_from_resolved(
-        merged(shared_sections(task), plan_sections(task, braces, dense, k_p), variant) | dict(more or {})
+        {
+            **shared,
+            **({"variant": variant} if variant else {}),
+            "controller": shared["controller"] | own["controller"],
+            "contacts": shared["contacts"] | own["contacts"],
+            "initial": own["initial"],
+            **(more or {}),
+        }
     )

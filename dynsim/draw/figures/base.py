@@ -31,6 +31,8 @@ LOOKS = ((style.BLUE, 2.0), (style.GREEN, 1.0), (style.ORANGE, 1.2))
 # Tracking: minimum range of the axes of positions and headings [m, °], so that rounding errors are not magnified.
 MIN_POSITION_RANGE, MIN_HEADING_RANGE = 1e-3, 0.1
 MILLI = 1e3
+# Values over time, and how they are drawn.
+Curve = tuple[Array, dict[str, Any]]
 
 
 def overturning(record: Record) -> Figure | None:
@@ -48,18 +50,17 @@ def overturning(record: Record) -> Figure | None:
     for axes in rows[0]:
         _lines(axes, record, LOADS, "min {} N", np.nanmin)
         style.shade_below_zero(axes, "wheel pulls on the ground")
-        _mark_tipping(axes, [record], [style.PULLING])
     for axes in rows[1]:
         style.line(axes, record.time, margin, color=style.BLACK, label=_margin_label("margin", record))
         _frame_margin(axes)
-        _mark_tipping(axes, [record], [style.PULLING])
     for axes in rows[2]:
         _lines(axes, record, TRACTION, "max {}", np.nanmax)
         style.shade(axes, record.time, bare, "#EFEFEF", "a wheel carries no load")
         axes.axhline(1.0, color=style.PULLING, linewidth=0.8, label="slips above 1")
         axes.set_ylim(0.0, min(max(axes.get_ylim()[1], 1.15), TRACTION_TOP))
-        _mark_tipping(axes, [record], [style.PULLING])
     for panels, label in zip(rows, ("load [N]", "tip margin", "traction demand\n|F| / (μ N)"), strict=True):
+        for axes in panels:
+            _mark_tipping(axes, [record], [style.PULLING])
         panels[0].set_ylabel(label)
         style.legend_above(panels[-1], columns=4)
     note = []
@@ -111,43 +112,39 @@ def tracking(record: Record) -> Figure | None:
         _spread(np.hstack([target[:, :2], pose[:, :2]])) < MIN_POSITION_RANGE and _spread(heading) < MIN_HEADING_RANGE
     )
     # Rounded to a nanometre, below which a stationary base shows rounding errors.
-    away, turned = np.round(MILLI * error[:, :2], 6), np.round(180.0 / np.pi * error[:, 2:], 6)
-    parts = {"error [mm]": away, "heading error [°]": turned}
+    away, turned = np.round(MILLI * error[:, :2], 6), np.round(180.0 / np.pi * error[:, 2], 6)
+    rms = [style.number(_rms(values), 3) for values in (*away.T, turned)]
+    curves: dict[str, list[Curve]] = {}
     if not is_stationary:
-        parts = {"position [m]": np.hstack([target[:, :2], pose[:, :2]]), "heading [°]": heading, **parts}
+        # One is dashed, because x and y may coincide.
+        x = _pair(target[:, 0], pose[:, 0], "x", style.AXIS_COLOURS["x"], "-")
+        curves["position [m]"] = x + _pair(target[:, 1], pose[:, 1], "y", style.AXIS_COLOURS["y"], (0, (5, 4)))
+        curves["heading [°]"] = _pair(heading[:, 0], heading[:, 1], "heading", style.BLACK, "-")
+    curves["error [mm]"] = [
+        (away[:, 0], {"color": style.BLUE, "label": f"ahead: rms {rms[0]} mm"}),
+        (away[:, 1], {"color": style.GREEN, "label": f"to the left: rms {rms[1]} mm"}),
+    ]
+    curves["heading error [°]"] = [(turned, {"color": style.BLACK, "label": f"rms {rms[2]}°"})]
     subject = "stationary base: actual − reference" if is_stationary else "base, reference and actual"
-    figure = style.new_figure(0.6 + 1.5 * len(parts), style.title(record, subject))
-    grid = style.time_rows(figure, [[(record.time, values)] for values in parts.values()], record.settle_time)
-    rows = dict(zip(parts, grid, strict=True))
-    for name, panels in rows.items():
+    figure = style.new_figure(0.6 + 1.5 * len(curves), style.title(record, subject))
+    series = [[(record.time, values) for values, _ in drawn] for drawn in curves.values()]
+    rows = style.time_rows(figure, series, record.settle_time)
+    for (name, drawn), panels in zip(curves.items(), rows, strict=True):
+        values = np.stack([values for values, _ in drawn], axis=1)
+        least = {"position [m]": MIN_POSITION_RANGE, "heading [°]": MIN_HEADING_RANGE}.get(name, 0.0)
         for axes in panels:
-            values = parts[name]
-            least = {"position [m]": MIN_POSITION_RANGE, "heading [°]": MIN_HEADING_RANGE}.get(name, 0.0)
             if _spread(values) < least:
                 middle = float(np.nanmean(values))
                 axes.set_ylim(middle - least, middle + least)
             axes.ticklabel_format(axis="y", useOffset=False)
-    # One is dashed, because x and y may coincide.
-    for k, (name, dashes) in enumerate((("x", "-"), ("y", (0, (5, 4))))):
-        for axes in rows.get("position [m]", ()):
-            _pair(axes, record.time, target[:, k], pose[:, k], name, style.AXIS_COLOURS[name], dashes)
-    for axes in rows.get("heading [°]", ()):
-        _pair(axes, record.time, heading[:, 0], heading[:, 1], "heading", style.BLACK, "-")
-    for k, (name, colour) in enumerate((("ahead", style.BLUE), ("to the left", style.GREEN))):
-        label = f"{name}: rms {style.number(_rms(away[:, k]), 3)} mm"
-        for axes in rows["error [mm]"]:
-            style.line(axes, record.time, away[:, k], color=colour, label=label)
-    for axes in rows["heading error [°]"]:
-        label = f"rms {style.number(_rms(turned), 3)}°"
-        style.line(axes, record.time, turned[:, 0], color=style.BLACK, label=label)
-    for name in ("error [mm]", "heading error [°]"):
-        for axes in rows[name]:
-            axes.axhline(0.0, color=style.GREY, linewidth=0.6)
-    for name, panels in rows.items():
+            for curve, look in drawn:
+                style.line(axes, record.time, curve, **look)
+            if "error" in name:
+                axes.axhline(0.0, color=style.GREY, linewidth=0.6)
         panels[0].set_ylabel(name)
         style.legend_above(panels[-1], columns=4)
-    contacts.mark_all(grid, record)
-    figure.align_ylabels([panels[0] for panels in grid])
+    contacts.mark_all(rows, record)
+    figure.align_ylabels([panels[0] for panels in rows])
     return figure
 
 
@@ -204,10 +201,12 @@ def _lines(axes: Axes, record: Record, signal: str, note: str, extreme: Callable
         style.line(axes, record.time, values, color=colour, linewidth=width, label=label)
 
 
-def _pair(axes: Axes, time: Array, target: Array, actual: Array, name: str, colour: str, dashes: Any) -> None:
-    """Draw the actual values over their reference, which is wide and pale so that both are visible if they agree."""
-    style.line(axes, time, target, color=colour, linewidth=4.0, alpha=0.3, label=f"{name}, reference")
-    style.line(axes, time, actual, color=colour, linestyle=dashes, label=f"{name}, actual")
+def _pair(target: Array, actual: Array, name: str, colour: str, dashes: Any) -> list[Curve]:
+    """Return the actual values over their reference, which is wide and pale so that both are visible if they agree."""
+    return [
+        (target, {"color": colour, "linewidth": 4.0, "alpha": 0.3, "label": f"{name}, reference"}),
+        (actual, {"color": colour, "linestyle": dashes, "label": f"{name}, actual"}),
+    ]
 
 
 def _frame_margin(axes: Axes) -> None:

@@ -141,7 +141,8 @@ def forces_comparison(records: Mapping[str, Record]) -> Figure | None:
 def _forces(records: Mapping[str, Record], title: str) -> Figure | None:
     """Draw rows of forces; for a single run (named ""), with contact modes or the time in which the surface pulls."""
     runs, alone = list(records.values()), "" in records
-    names = touching_names(runs)
+    # Under the unilateral law most candidates never touch.
+    names = [name for name in contact_names(runs) if any(_touched(record, name) for record in runs)]
     if not names:
         return None
     chosen = _most_interesting(names, runs)
@@ -188,11 +189,6 @@ def contact_names(records: Sequence[Record]) -> list[str]:
     for record in records:
         names.update(dict.fromkeys(record.labels.get("contact_normal_force", ())))
     return list(names)
-
-
-def touching_names(records: Sequence[Record]) -> list[str]:
-    """Return the names of contacts that touched; under the unilateral law most candidates never do."""
-    return [name for name in contact_names(records) if any(_touched(record, name) for record in records)]
 
 
 def _touched(record: Record, name: str) -> bool:

@@ -12,19 +12,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
-from dynsim.draw.figures.style import (
-    BLUE,
-    GREEN,
-    GREY,
-    ORANGE,
-    PULLING,
-    Array,
-    legend_above,
-    log_axis,
-    new_figure,
-    number,
-    save_all,
-)
+from dynsim.draw.figures import style
+from dynsim.draw.figures.style import BLUE, GREEN, GREY, ORANGE, PULLING, Array, number
 
 # Maximum length of the arrow of the largest force, relative to the height of the view.
 ARROW = 0.35
@@ -103,7 +92,7 @@ def posture(picture: PlanPicture) -> Figure | None:
     flat = np.ptp(aside) < FLAT * np.ptp(along)
     shapes = [float(np.ptp(up) / np.ptp(along)), *([] if flat else [width / float(np.ptp(along))])]
     height = min(1.2 + 6.6 * sum(shapes), 9.0)
-    figure = new_figure(height, f"{picture.title}: posture and forces of the best plan")
+    figure = style.new_figure(height, f"{picture.title}: posture and forces of the best plan")
     views = figure.subplots(len(shapes), 1, squeeze=False, sharex=True, height_ratios=shapes)[:, 0]
     side = views[0]
     side.contourf(along, up, gap, levels=[-1e9, 0.0], colors=["#D9D9D9"])
@@ -122,7 +111,7 @@ def posture(picture: PlanPicture) -> Figure | None:
     if not flat:
         views[1].set_ylim(aside.min() - MARGIN, aside.max() + MARGIN)
     views[-1].set_xlabel("along the heading [m]")
-    legend_above(side, columns=2)
+    style.legend_above(side, columns=2)
     return figure
 
 
@@ -197,7 +186,7 @@ def _dots(
 
     Bars would have no natural start on the logarithmic axis that a wide range needs.
     """
-    figure = new_figure(1.1 + 0.26 * len(values), title)
+    figure = style.new_figure(1.1 + 0.26 * len(values), title)
     axes = figure.subplots()
     low, high = min(values), max(values)
     wide = high > WIDE * low > 0.0
@@ -214,7 +203,7 @@ def _dots(
     axes.set_xlabel(axis)
     if wide:
         axes.set_xlim(low / (high / low) ** 0.05, high * (high / low) ** 0.05)
-        log_axis(axes, "x")
+        style.log_axis(axes, "x")
     else:
         axes.set_xlim(0.0, 1.1 * high or 1.0)
     return figure
@@ -225,25 +214,22 @@ def robustness(picture: PlanPicture) -> Figure | None:
     shown = {count: corners for count, corners in picture.corners.items() if len(corners[1]) > 1}
     if not shown:
         return None
-    figure = new_figure(4.2, f"{picture.title}: plans with errors of the scene")
+    figure = style.new_figure(4.2, f"{picture.title}: plans with errors of the scene")
     upper, lower = figure.subplots(2, 1, sharex=True)
     labels = [label for label, _, _ in next(iter(shown.values()))[1]]
     width = 0.8 / len(shown)
     for k, (count, (planned, corners)) in enumerate(shown.items()):
         at = np.arange(len(corners)) + (k - 0.5 * (len(shown) - 1)) * width
         colour = (BLUE, GREEN, ORANGE, GREY, PULLING)[k % 5]
-        upper.bar(at, [heat / planned for _, heat, _ in corners], width, color=colour, label=_number_of_braces(count))
+        label = f"{count} brace{'' if count == 1 else 's'}"
+        upper.bar(at, [heat / planned for _, heat, _ in corners], width, color=colour, label=label)
         lower.bar(at, [error for _, _, error in corners], width, color=colour)
     upper.axhline(1.0, color="black", linewidth=0.6)
     upper.set_ylabel("heat over planned")
     lower.set_ylabel("hand error, rms [mm]")
     lower.set_xticks(range(len(labels)), labels, rotation=25.0, ha="right", fontsize=6.5)
-    legend_above(upper, columns=len(shown))
+    style.legend_above(upper, columns=len(shown))
     return figure
-
-
-def _number_of_braces(count: int) -> str:
-    return f"{count} brace{'' if count == 1 else 's'}"
 
 
 FIGURES = {
@@ -256,4 +242,4 @@ FIGURES = {
 
 def draw_plan_figures(picture: PlanPicture, folder: Path, kind: str) -> list[Path]:
     """Draw all figures of a plan to a folder; return the files."""
-    return save_all(FIGURES, picture, folder, kind)
+    return style.save_all(FIGURES, picture, folder, kind)

@@ -465,9 +465,7 @@ def _space_view(axes: Axes3D, body: Skeleton, bounds: tuple[Array, Array], zoom:
     axes.plot(*style.sparse(record["hand_position"]).T, color=style.BLUE, lw=1.0, zorder=5)
     for _, _, position, force in body.contacts():
         axes.plot(*position[:, None], linestyle="none", zorder=7, **_contact_mark(force))
-    axes.set_xlim(low[0], high[0])
-    axes.set_ylim(low[1], high[1])
-    axes.set_zlim(low[2], high[2])
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
     # The square of the axes is smaller than the space available to a long arm: fill the space without clipping.
     axes.set_box_aspect(tuple(high - low), zoom=zoom)
     for artist in axes.get_children():
@@ -486,9 +484,8 @@ def _space_view(axes: Axes3D, body: Skeleton, bounds: tuple[Array, Array], zoom:
         # far one.
         short = share < SHORT_AXIS and len(ticks) > (1 if axis is axes.yaxis else 2)
         axis.set_ticks((ticks[-1:] if axis is axes.yaxis else ticks[[0, -1]]) if short else ticks)
-    axes.view_init(elev=22, azim=-70)
-    for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
         axis.set_pane_color((1.0, 1.0, 1.0, 0.0))
+    axes.view_init(elev=22, azim=-70)
 
 
 def _draw_surface(axes: Axes3D, surface: SceneSurface, low: Array, high: Array) -> None:

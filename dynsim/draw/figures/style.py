@@ -94,7 +94,7 @@ def new_figure(height: float, title: str, *, width: float = WIDTH) -> Figure:
 
 
 def save(figure: Figure, path: Path) -> Path:
-    """Write a figure as PNG, PDF or SVG, depending on the suffix; see :func:`dynsim.system.files.replacing`.
+    """Write a figure as PNG, PDF or SVG, depending on the suffix; equal figures give equal bytes.
 
     Raises
     ------
@@ -105,25 +105,6 @@ def save(figure: Figure, path: Path) -> Path:
     for text in figure.findobj(Text):
         text.set_text(plain(text.get_text()))
     figure.set_dpi(DPI)
-    return write(figure, path)
-
-
-def save_all(makers: Mapping[str, Callable[[T], Figure | None]], of: T, folder: Path, kind: str) -> list[Path]:
-    """Draw and save every figure for which the record or records have data; return the files."""
-    with look():
-        return [
-            save(figure, folder / f"{name}.{kind}") for name, make in makers.items() if (figure := make(of)) is not None
-        ]
-
-
-def write(figure: Figure, path: Path) -> Path:
-    """Write a figure at its own resolution; equal figures give equal bytes.
-
-    Raises
-    ------
-    RecordError
-        See :func:`save`.
-    """
     kind = path.suffix.removeprefix(".")
     with replacing(path) as stream, matplotlib.rc_context({"svg.hashsalt": path.stem}):
         if kind == "png":
@@ -133,6 +114,14 @@ def write(figure: Figure, path: Path) -> Path:
             date = {"pdf": "CreationDate", "svg": "Date"}[kind]
             figure.savefig(stream, format=kind, dpi="figure", metadata={date: None})
     return path
+
+
+def save_all(makers: Mapping[str, Callable[[T], Figure | None]], of: T, folder: Path, kind: str) -> list[Path]:
+    """Draw and save every figure for which the record or records have data; return the files."""
+    with look():
+        return [
+            save(figure, folder / f"{name}.{kind}") for name, make in makers.items() if (figure := make(of)) is not None
+        ]
 
 
 def title(record: Record, subject: str) -> str:
@@ -266,12 +255,8 @@ def time_rows(
         For each row (transient, whole run) or (whole run,); draw everything in all of them.
     """
     end = max(time[-1] for row in rows for time, _ in row)
-    transients = [_transient(row, settle) for row in rows]
-    # A transient that lasts for most of the run needs no panel.
-    transients = [
-        transient if transient is not None and transient.end < TRANSIENT_MAX_SHARE * end / TRANSIENT_ROOM else None
-        for transient in transients
-    ]
+    longest = TRANSIENT_MAX_SHARE * end / TRANSIENT_ROOM
+    transients = [t if t is not None and t.end < longest else None for t in (_transient(row, settle) for row in rows)]
     window = max((transient.end for transient in transients if transient is not None), default=0.0)
     split = window > 0.0
     grid = figure.subplots(

@@ -269,7 +269,10 @@ def samples(sweep: Sweep) -> Figure | None:
     """
     if not sweep.sampled:
         return None
-    metrics, variants, places = sweep.metrics, sweep.variants, _grid_points(sweep)
+    metrics, variants = sweep.metrics, sweep.variants
+    # Each combination of grid values once, in the order of the table.
+    firsts = [sweep.rows[rows[0]] for rows in _grouped(sweep.rows, sweep.grid).values()]
+    places = [{key: row[key] for key in sweep.grid} for row in firsts]
     room = max(_ROWS // len(variants), 1)
     shown = [places[k] for k in np.linspace(0, len(places) - 1, min(room, len(places))).round().astype(int)]
     note = f"; {len(shown)} of {len(places)} grid points, all in statistics.json" if len(shown) < len(places) else ""
@@ -374,12 +377,6 @@ def _grouped(rows: Sequence[Mapping[str, Any]], keys: Sequence[str]) -> dict[tup
     for k, row in enumerate(rows):
         groups.setdefault(tuple(str(row[key]) for key in keys), []).append(k)
     return groups
-
-
-def _grid_points(sweep: Sweep) -> list[dict[str, Any]]:
-    """Return each combination of grid values once, in the order of the table."""
-    firsts = [rows[0] for rows in _grouped(sweep.rows, sweep.grid).values()]
-    return [{key: sweep.rows[k][key] for key in sweep.grid} for k in firsts]
 
 
 def _levels(rows: Sequence[Mapping[str, Any]], key: str) -> list[Any]:

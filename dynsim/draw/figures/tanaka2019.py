@@ -8,12 +8,15 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from dynsim.draw.figures import style
 from dynsim.draw.figures.snake_view import (
@@ -89,6 +92,15 @@ def write_tables(scenario: str, records: Mapping[str, Record], folder: Path) -> 
     return written
 
 
+def _bars(
+    axis: Axes, moved: Sequence[str], places: NDArray[Any], i: int, scale: float, deviations: float, **look: Any
+) -> None:
+    """Draw how far coordinate i was from its target in [T], ± a number of standard ``deviations``."""
+    published = [TABLE_III[name] for name in moved]
+    off = [scale * (p.mean[i] - p.target[i]) for p in published]
+    axis.bar(places, off, yerr=[deviations * scale * p.deviation[i] for p in published], capsize=2, **look)
+
+
 def positioning(records: Mapping[str, Record]) -> Figure:
     """Table III of [T]: deviation from the target displacement, measured in [T] and simulated here."""
     moved = [name for name in TABLE_III if name in records]
@@ -99,20 +111,9 @@ def positioning(records: Mapping[str, Record]) -> Figure:
         scale = 1e3 if unit == "mm" else 1.0
         for k, i in enumerate(part):
             positions = np.arange(len(moved)) + (k - 1) * width
-            published = [TABLE_III[m] for m in moved]
-            off = [scale * (p.mean[i] - p.target[i]) for p in published]
-            spread = [scale * p.deviation[i] for p in published]
             name = SYMBOLS.get(COORDINATES[i], COORDINATES[i])
-            axis.bar(
-                positions,
-                off,
-                0.9 * width,
-                yerr=spread,
-                capsize=2,
-                color=VARIANT_COLOURS[k],
-                alpha=0.6,
-                label=f"Δ{name}, [T]",
-            )
+            look = {"color": VARIANT_COLOURS[k], "alpha": 0.6, "label": f"Δ{name}, [T]"}
+            _bars(axis, moved, positions, i, scale, 1.0, width=0.9 * width, **look)
             ours = [scale * (displacement(records[m])[i] - TABLE_III[m].target[i]) for m in moved]
             axis.plot(positions, ours, "D", color="black", ms=3, label="simulated, no slip" if k == 2 else None)
         axis.axhline(0.0, color="black", lw=0.6)
@@ -130,15 +131,13 @@ def dynamic_positioning(records: Mapping[str, Record]) -> Figure:
     axes = figure.subplots(6, 1, sharex=True)
     marks = {"kinematic": ("|", "black"), "dynamic": ("D", HEAD), "measured": ("o", GROUND)}
     for i, axis in enumerate(axes):
-        unit, scale = ("mm", 1e3) if i < 3 else ("mrad", 1e3)
-        positions = np.arange(len(moved))
-        off = [scale * (TABLE_III[m].mean[i] - TABLE_III[m].target[i]) for m in moved]
-        spread = [2.0 * scale * TABLE_III[m].deviation[i] for m in moved]
-        axis.bar(positions, off, 0.6, yerr=spread, capsize=2, color=VARIANT_COLOURS[2], alpha=0.5, label="[T], ± 2 SD")
+        positions, unit = np.arange(len(moved)), "mm" if i < 3 else "mrad"
+        look = {"color": VARIANT_COLOURS[2], "alpha": 0.5, "label": "[T], ± 2 SD"}
+        _bars(axis, moved, positions, i, 1e3, 2.0, width=0.6, **look)
         for source, (mark, colour) in marks.items():
             names = [m + SOURCES[source] for m in moved]
             there = [k for k, name in enumerate(names) if name in records]
-            ours = [scale * (displacement(records[names[k]])[i] - TABLE_III[moved[k]].target[i]) for k in there]
+            ours = [1e3 * (displacement(records[names[k]])[i] - TABLE_III[moved[k]].target[i]) for k in there]
             axis.plot(positions[there], ours, mark, color=colour, ms=5, label=source)
         axis.axhline(0.0, color="black", lw=0.6)
         axis.set_ylabel(f"Δ{SYMBOLS.get(COORDINATES[i], COORDINATES[i])} [{unit}]")

@@ -475,11 +475,8 @@ class Painter:
         light = 0.58 + 0.42 * np.clip(normal @ LIGHT, 0.0, 1.0)
         shades = np.broadcast_to(colour, (len(faces), 3))[kept] * light[:, None]
         order = np.argsort(shown[..., 2].mean(axis=1))
-        points, fills = (
-            shown[order, :, :2].reshape(-1, 8).tolist(),
-            np.minimum(shades[order], 255.0).astype(int).tolist(),
-        )
-        for corner, fill in zip(points, fills, strict=True):
+        fills = np.minimum(shades[order], 255.0).astype(int).tolist()
+        for corner, fill in zip(shown[order, :, :2].reshape(-1, 8).tolist(), fills, strict=True):
             draw.polygon(corner, fill=tuple(fill))
 
     def _support(self, position: Array, turn: Array, row: int) -> Array:
@@ -522,7 +519,7 @@ class Painter:
         force = float(_between(contact.force, row, share))
         mode, text = None if contact.mode is None else int(contact.mode[row]), None
         x, y, _ = self.camera.project(at)
-        colour = arrow_colour(force)
+        colour = PULLING if force < 0.0 else BLUE
         dot = colour if mode is None else MODES.get(mode, GREY)
         if np.isfinite(force) and force != 0.0 and mode != 0:
             normal = force * contact.normal[row]
@@ -569,11 +566,6 @@ class Painter:
             return
         x, y, _ = self.camera.project(_on(hand.body, np.array(hand.position), position, turn))
         draw.circle((x, y), 4.0 * FINER, fill=self.tint, outline=PAPER, width=FINER)
-
-
-def arrow_colour(force: float) -> str:
-    """Return the colour of a normal force: blue if the surface pushes, orange if it pulls."""
-    return PULLING if force < 0.0 else BLUE
 
 
 def _rgb(colour: str) -> tuple[int, int, int]:
