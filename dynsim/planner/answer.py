@@ -314,6 +314,8 @@ def _row(task: Task, size: Size) -> dict[str, Any]:
     dense = size.planned.dense
     nominal = size.nominal or Corner(1.0, 0.0)
     distance, part, _ = nearest(task, size.braces, dense.times, dense.q)
+    greatest = task.arm.tables.greatest
+    share = (np.abs(dense.torques) / greatest).max()
     links = [task.arm.model.robot.links[i] for i in task.arm.links]
     lower, upper = np.array([(link.lower, link.upper) for link in links]).T
     row |= {
@@ -324,7 +326,7 @@ def _row(task: Task, size: Size) -> dict[str, Any]:
         "closed_least": min(nominal.closed_fraction.values(), default=None),
         "peak_torque_N_m": dense.peak_torque,
         "peak_force_N": dense.peak_force,
-        "torque_share": _torque_share(task, dense),
+        "torque_share": _number(share) if np.isfinite(greatest).any() else None,
         "normal_force_min_N": float(dense.forces.min()) if size.count else None,
         "normal_force_max_N": float(dense.forces.max()) if size.count else None,
         "clearance_m": _number(distance),
@@ -382,12 +384,6 @@ def _size_json(task: Task, size: Size) -> dict[str, Any]:
 def _number(value: float) -> float | None:
     """Return a number for JSON, which has no NaN or infinity: None instead."""
     return float(value) if math.isfinite(value) else None
-
-
-def _torque_share(task: Task, dense: Dense) -> float | None:
-    """Return the maximum torque as a fraction of the motor's limit at rest; None without limits."""
-    share = np.abs(dense.torques) / task.arm.tables.greatest
-    return _number(float(share.max())) if np.isfinite(task.arm.tables.greatest).any() else None
 
 
 def plan_braces(
@@ -496,9 +492,19 @@ def plan_braces(
     with named(scenario):
         problem = task(scenario, options)
         if problem.without_radius and most > 0:
-            warnings.warn(_radius_warning(problem.without_radius), stacklevel=2)
+            warnings.warn(
+                f"plan: candidates {', '.join(problem.without_radius)} have radius 0 (links from URDF have no radius, "
+                "even with <visual>); braces would put the joint axis on the surface; set --radius, or list "
+                "contacts.points with radius_m in --candidates",
+                stacklevel=2,
+            )
         if unplanned := [name for name, load in scenario.config.loads.items() if not isinstance(load, Payload)]:
-            warnings.warn(_load_warning(unplanned), stacklevel=2)
+            warnings.warn(
+                f"plan: loads.{first_few(unplanned)}: ignored by the planner, which supports only payloads; simulated "
+                "runs include these loads and reject plans whose heat they raise; define a constant weight as "
+                "`type: payload`",
+                stacklevel=2,
+            )
         if not np.any(problem.arm.model.robot.gravity):
             raise ScenarioError("plant.gravity_m_s2 = [0, 0, 0]: must not be zero; without gravity braces are useless")
         search = Search(problem, tell)
@@ -510,23 +516,6 @@ def plan_braces(
     singles = {brace.label: known[brace,] for brace in problem.candidates if (brace,) in known}
     heats = {size.count: _ranked(size, ranked[size.count]) for size in sizes}
     return BracePlan(problem, tuple(sizes), search.tally, singles, heats)
-
-
-def _radius_warning(names: Sequence[str]) -> str:
-    """Return the warning about candidates without a radius."""
-    return (
-        f"plan: candidates {', '.join(names)} have radius 0 (links from URDF have no radius, even with <visual>); "
-        "braces would put the joint axis on the surface; set --radius, or list contacts.points with radius_m in "
-        "--candidates"
-    )
-
-
-def _load_warning(names: Sequence[str]) -> str:
-    """Return the warning about loads other than payloads."""
-    return (
-        f"plan: loads.{first_few(names)}: ignored by the planner, which supports only payloads; simulated runs include "
-        "these loads and reject plans whose heat they raise; define a constant weight as `type: payload`"
-    )
 
 
 def _ranked(size: Size, planned: Sequence[Planned]) -> list[tuple[str, float]]:

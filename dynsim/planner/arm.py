@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any, get_type_hints
 
 import numpy as np
 
@@ -232,26 +233,14 @@ def workspace(n: int, points: Points, course: Course) -> Work:
     N, R = K * n + E * c, h + P + n
     W = max(min(WORKING_SETS, K * (P + 2 * n) + E * c), c)
 
-    def zeros(*shape: int) -> Array:
-        return np.zeros(shape)
-
-    def ints(*shape: int) -> Array:
-        return integers(np.zeros(shape))
-
-    return Work(
-        torque=zeros(E, n), by_q=zeros(E, n, n), by_v=zeros(E, n, n), by_f=zeros(E, n, c), gap=zeros(K + 1, P),
-        gap_rate=zeros(K + 1, P, n), hand=zeros(K + 1, h), hand_rate=zeros(K + 1, h, n), R=zeros(n, 9), p=zeros(n, 3),
-        a=zeros(n, 3), below=zeros(n, 4), moment=zeros(n, 3), touch=zeros(c, n, 3), turned=zeros(c, n, 3),
-        normal=zeros(c, 3), shift=zeros(c, n, 3), slip=zeros(c, 7), force=zeros(c, 3), turn=zeros(n, 3),
-        drift=zeros(n, 3), basis=zeros(K, n, n), free=ints(K), rows=zeros(R, n),
-        normal_matrix=zeros(R, R), right=zeros(R), H=zeros(N, N), g=zeros(N), x=zeros(max(N, n)), step=zeros(N),
-        B=zeros(n, K * n + c), column=ints(K * n + c), start=ints(K), pressed=ints(E), skyline=ints(N),
-        working=ints(W, 3), bound=zeros(W),
-        normals=zeros(N, W), dual=zeros(W, W), dual_right=zeros(W), multiplier=zeros(W), passive=ints(W),
-        small=zeros(W, W), small_right=zeros(W), index=ints(W), small_skyline=ints(max(W, R)),
-        between=zeros(n), rate=zeros(n), weight=zeros(E, n), pull=zeros(E, n), change=zeros(K, n), trial=zeros(K, n),
-        trial_forces=zeros(E, c),
-    )  # fmt: skip
+    sizes = {"n": n, "2n": 2 * n, "c": c, "K": K, "K+1": K + 1, "E": E, "h": h, "P": P, "N": N, "R": R, "W": W}
+    sizes |= {"Kn+c": K * n + c, "max(N,n)": max(N, n), "max(W,R)": max(W, R)}
+    arrays: dict[str, Any] = {}
+    for name, hint in get_type_hints(Work, include_extras=True).items():
+        shape, *kind = hint.__metadata__
+        lengths = [int(size) if size.isdigit() else sizes[size] for size in shape.split()]
+        arrays[name] = np.zeros(lengths, dtype=np.int64 if kind else np.float64)
+    return Work(**arrays)
 
 
 def solve(problem: Problem, start: Array, turns: int = 40, tolerance: float = 1e-4) -> Local | None:

@@ -14,7 +14,7 @@ All functions are in one file, because in this package the cache of compiled cod
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
@@ -107,61 +107,61 @@ class Course(NamedTuple):
 
 
 class Work(NamedTuple):
-    """Results and workspace."""
+    """Results and workspace; :func:`dynsim.planner.arm.workspace` reads shapes and types from the annotations."""
 
-    torque: np.ndarray  # (E, n)
-    by_q: np.ndarray  # (E, n, n) ∂τ/∂q at fixed v and f
-    by_v: np.ndarray  # (E, n, n)
-    by_f: np.ndarray  # (E, n, c)
-    gap: np.ndarray  # (K + 1, P) distance from the surface minus radius; the last row is for an instant
-    gap_rate: np.ndarray  # (K + 1, P, n), of nearby points only
-    hand: np.ndarray  # (K + 1, h)
-    hand_rate: np.ndarray  # (K + 1, h, n)
-    R: np.ndarray  # (n, 9)
-    p: np.ndarray  # (n, 3)
-    a: np.ndarray  # (n, 3) joint axes in W
-    below: np.ndarray  # (n, 4) mass and first moment of the bodies that a joint carries
-    moment: np.ndarray  # (n, 3) lever × weight of the bodies that a joint carries
-    touch: np.ndarray  # (c, n, 3) velocity of the contact point per unit rate
-    turned: np.ndarray  # (c, n, 3) ∂n/∂q of the normal at the brace
-    normal: np.ndarray  # (c, 3)
-    shift: np.ndarray  # (c, n, 3) displacement of the contact point on the body per coordinate
-    slip: np.ndarray  # (c, 7) u = v_t / √(|v_t|² + v_s²), velocity of the contact point, that square root
-    force: np.ndarray  # (c, 3)
-    turn: np.ndarray  # (n, 3) ∂F/∂q of a brace
-    drift: np.ndarray  # (n, 3) ∂F/∂v
-    basis: np.ndarray  # (K, n, n) orthonormal basis; the last columns span the null space of hand and braces
-    free: np.ndarray  # (K,) int, number of these columns
-    rows: np.ndarray  # (R, n) constraints of one knot
-    normal_matrix: np.ndarray  # (R, R)
-    right: np.ndarray  # (R,)
-    H: np.ndarray  # (N, N)
-    g: np.ndarray  # (N,)
-    x: np.ndarray  # (N,) L⁻¹ times the step without constraints
-    step: np.ndarray  # (N,)
-    B: np.ndarray  # (n, 2 n + c)
-    column: np.ndarray  # (2 n + c,) int
-    start: np.ndarray  # (K,) int, first unknown of each knot's posture; the forces of its instants follow
-    pressed: np.ndarray  # (E,) int, first force of each instant
-    skyline: np.ndarray  # (N,) int, first nonzero column of each row of H
-    working: np.ndarray  # (W, 3) int: violated constraints of the step: kind, knot or instant, index
-    bound: np.ndarray  # (W,)
-    normals: np.ndarray  # (N, W) normals of these constraints as columns, later multiplied by L⁻¹
-    dual: np.ndarray  # (W, W)
-    dual_right: np.ndarray  # (W,)
-    multiplier: np.ndarray  # (W,)
-    passive: np.ndarray  # (W,) int
-    small: np.ndarray  # (W, W)
-    small_right: np.ndarray  # (W,)
-    index: np.ndarray  # (W,) int
-    small_skyline: np.ndarray  # (W,) int
-    between: np.ndarray  # (n,) posture of an instant
-    rate: np.ndarray  # (n,) velocity of an instant
-    weight: np.ndarray  # (E, n) weights of the squared torques in the model of the cost
-    pull: np.ndarray  # (E, n) half the gradient of the cost by the torques, divided by the fraction of time
-    change: np.ndarray  # (K, n) change of the postures in a step
-    trial: np.ndarray  # (K, n)
-    trial_forces: np.ndarray  # (E, c)
+    torque: Annotated[np.ndarray, "E n"]
+    by_q: Annotated[np.ndarray, "E n n"]  # ∂τ/∂q at fixed v and f
+    by_v: Annotated[np.ndarray, "E n n"]
+    by_f: Annotated[np.ndarray, "E n c"]
+    gap: Annotated[np.ndarray, "K+1 P"]  # distance from the surface minus radius; the last row is for an instant
+    gap_rate: Annotated[np.ndarray, "K+1 P n"]  # of nearby points only
+    hand: Annotated[np.ndarray, "K+1 h"]
+    hand_rate: Annotated[np.ndarray, "K+1 h n"]
+    R: Annotated[np.ndarray, "n 9"]
+    p: Annotated[np.ndarray, "n 3"]
+    a: Annotated[np.ndarray, "n 3"]  # joint axes in W
+    below: Annotated[np.ndarray, "n 4"]  # mass and first moment of the bodies that a joint carries
+    moment: Annotated[np.ndarray, "n 3"]  # lever × weight of the bodies that a joint carries
+    touch: Annotated[np.ndarray, "c n 3"]  # velocity of the contact point per unit rate
+    turned: Annotated[np.ndarray, "c n 3"]  # ∂n/∂q of the normal at the brace
+    normal: Annotated[np.ndarray, "c 3"]
+    shift: Annotated[np.ndarray, "c n 3"]  # displacement of the contact point on the body per coordinate
+    slip: Annotated[np.ndarray, "c 7"]  # u = v_t / √(|v_t|² + v_s²), velocity of the contact point, that square root
+    force: Annotated[np.ndarray, "c 3"]
+    turn: Annotated[np.ndarray, "n 3"]  # ∂F/∂q of a brace
+    drift: Annotated[np.ndarray, "n 3"]  # ∂F/∂v
+    basis: Annotated[np.ndarray, "K n n"]  # orthonormal basis; the last columns span the null space of hand and braces
+    free: Annotated[np.ndarray, "K", int]  # number of these columns
+    rows: Annotated[np.ndarray, "R n"]  # constraints of one knot
+    normal_matrix: Annotated[np.ndarray, "R R"]
+    right: Annotated[np.ndarray, "R"]
+    H: Annotated[np.ndarray, "N N"]
+    g: Annotated[np.ndarray, "N"]
+    x: Annotated[np.ndarray, "max(N,n)"]  # L⁻¹ times the step without constraints
+    step: Annotated[np.ndarray, "N"]
+    B: Annotated[np.ndarray, "n Kn+c"]
+    column: Annotated[np.ndarray, "Kn+c", int]
+    start: Annotated[np.ndarray, "K", int]  # first unknown of each knot's posture; the forces of its instants follow
+    pressed: Annotated[np.ndarray, "E", int]  # first force of each instant
+    skyline: Annotated[np.ndarray, "N", int]  # first nonzero column of each row of H
+    working: Annotated[np.ndarray, "W 3", int]  # violated constraints of the step: kind, knot or instant, index
+    bound: Annotated[np.ndarray, "W"]
+    normals: Annotated[np.ndarray, "N W"]  # normals of these constraints as columns, later multiplied by L⁻¹
+    dual: Annotated[np.ndarray, "W W"]
+    dual_right: Annotated[np.ndarray, "W"]
+    multiplier: Annotated[np.ndarray, "W"]
+    passive: Annotated[np.ndarray, "W", int]
+    small: Annotated[np.ndarray, "W W"]
+    small_right: Annotated[np.ndarray, "W"]
+    index: Annotated[np.ndarray, "W", int]
+    small_skyline: Annotated[np.ndarray, "max(W,R)", int]
+    between: Annotated[np.ndarray, "n"]  # posture of an instant
+    rate: Annotated[np.ndarray, "n"]  # velocity of an instant
+    weight: Annotated[np.ndarray, "E n"]  # weights of the squared torques in the model of the cost
+    pull: Annotated[np.ndarray, "E n"]  # half the gradient of the cost by the torques, divided by the fraction of time
+    change: Annotated[np.ndarray, "K n"]  # change of the postures in a step
+    trial: Annotated[np.ndarray, "K n"]
+    trial_forces: Annotated[np.ndarray, "E c"]
 
 
 @internal_kernel

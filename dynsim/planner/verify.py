@@ -177,12 +177,6 @@ class Verifier:
             left = {n: tried for n, tried in left.items() if tried and n in sound and not verdicts[n].survives}
         return [verdicts[number] for number in range(len(plans))]
 
-    def corners(
-        self, braces: tuple[Candidate, ...], dense: Dense, k_p: float, corners: Sequence[tuple[float, float]]
-    ) -> list[Corner]:
-        """Simulate corners (factor on μ, displacement [m]) of one plan."""
-        return self._runs([(braces, dense, k_p, corner) for corner in corners])
-
     def _runs(self, runs: Sequence[tuple[tuple[Candidate, ...], Dense, float, tuple[float, float]]]) -> list[Corner]:
         """Simulate corners of several plans in parallel."""
         if not runs:
@@ -323,8 +317,8 @@ class Verifier:
         """
 
         def tolerates(corner: tuple[float, float]) -> bool:
-            other = (2.0 - corner[0], -corner[1])
-            return not any(c.reason for c in self.corners(braces, dense, k_p, [corner, other]))
+            both = corner, (2.0 - corner[0], -corner[1])
+            return not any(c.reason for c in self._runs([(braces, dense, k_p, each) for each in both]))
 
         def largest(most: float, corner: Callable[[float], tuple[float, float]]) -> float | None:
             low, high = 0.0, most

@@ -80,12 +80,10 @@ class _Bag:
     def make(self, kind: str, **fields: Any) -> Any:
         return self._types.types[kind](**fields)
 
-    def time(self, nanoseconds: int) -> Any:
-        seconds, nanosec = divmod(nanoseconds, 1_000_000_000)
-        return self.make("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanosec)
-
     def header(self, nanoseconds: int, frame: str) -> Any:
-        return self.make("std_msgs/msg/Header", stamp=self.time(nanoseconds), frame_id=frame)
+        seconds, nanosec = divmod(nanoseconds, 1_000_000_000)
+        stamp = self.make("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanosec)
+        return self.make("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
 
     def write(self, time: int, topic: str, kind: str, message: Any) -> None:
         if topic not in self._channels:

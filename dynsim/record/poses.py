@@ -31,17 +31,15 @@ def add_body_poses(record: Record) -> bool:
     orientation = np.empty((len(names), 4, len(record)), dtype=np.float32)
     # Poses of bodies whose children are still to be computed.
     known: dict[int, tuple[Array, Array]] = {}
-    left = np.bincount([body.parent for body in scene.bodies if body.parent != WORLD], minlength=len(names))
+    last_child = {body.parent: k for k, body in enumerate(scene.bodies)}
     # The last samples of a diverging run may overflow.
     with np.errstate(over="ignore", invalid="ignore"):
         for k, body in enumerate(scene.bodies):
             moved = np.array([columns[body.joint.signal][label] for label in body.joint.labels])
             p, q = _pose(body, moved, known.get(body.parent), (len(record),))
-            if body.parent != WORLD:
-                left[body.parent] -= 1
-                if not left[body.parent]:
-                    del known[body.parent]
-            if left[k]:
+            if last_child[body.parent] == k:
+                known.pop(body.parent, None)
+            if k in last_child:
                 known[k] = p, q
             position[k], orientation[k] = p, continuous(q)
     data = np.ascontiguousarray(position.transpose(2, 0, 1)), np.ascontiguousarray(orientation.transpose(2, 0, 1))

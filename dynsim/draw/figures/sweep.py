@@ -145,7 +145,7 @@ def lines(sweep: Sweep) -> Figure | None:
     figure = style.new_figure(_PANEL * len(metrics) + _ROOM, f"{sweep.name}: over {key}{sweep.failed}")
     panels = figure.subplots(len(metrics), 1, sharex=True, squeeze=False)[:, 0]
     levels = _levels(sweep.rows, key)
-    at = _places(levels)
+    at = np.array(levels, dtype=float) if _numeric(levels) else np.arange(float(len(levels)))
     for axes, (metric, (label, scale)) in zip(panels, metrics.items(), strict=True):
         for variant in sweep.variants:
             look, name = styles[variant], variant or None
@@ -159,7 +159,9 @@ def lines(sweep: Sweep) -> Figure | None:
                 axes.fill_between(at, *limits.T, color=look["color"], alpha=0.15, linewidth=0)
         axes.set_ylabel(label)
         _scale(axes, "y", scale * _values(sweep.rows, metric))
-    _name_places(panels[-1], "x", key, levels)
+    panels[-1].set_xlabel(key)
+    if not _numeric(levels):
+        panels[-1].set_xticks(at, list(map(str, levels)))
     if len(sweep.variants) > 1:
         style.legend_above(panels[0], columns=4)
     return figure
@@ -387,16 +389,6 @@ def _levels(rows: Sequence[Mapping[str, Any]], key: str) -> list[Any]:
 
 def _numeric(levels: Sequence[Any]) -> bool:
     return all(isinstance(level, (int, float)) and not isinstance(level, bool) for level in levels)
-
-
-def _places(levels: Sequence[Any]) -> Array:
-    return np.array(levels, dtype=float) if _numeric(levels) else np.arange(float(len(levels)))
-
-
-def _name_places(axes: Axes, which: str, key: str, levels: Sequence[Any]) -> None:
-    axes.set(**{f"{which}label": key})
-    if not _numeric(levels):
-        axes.set_xticks(range(len(levels)), list(map(str, levels)))
 
 
 def _name_cells(axes: Axes, which: str, key: str, levels: Sequence[Any]) -> None:

@@ -422,10 +422,7 @@ def write(records: Mapping[str, Record], path: str | os.PathLike[str], *, ghost:
     >>> path.name
     'view.html'
     """
-    content = page(records, ghost=ghost).encode("utf-8", errors="replace")
-    with replacing(Path(path)) as stream:
-        stream.write(content)
-    return Path(path)
+    return Inline(page(records, ghost=ghost)).save(path)
 
 
 def _filled(values: Mapping[str, str], scripts: Sequence[str]) -> str:
