@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from dynsim.draw.figures.plan import PlanPicture, Pose, draw_plan_figures
+from dynsim.draw.geometry.projection import UP, Projection
 from dynsim.errors import SimulationStopped
-from dynsim.model.description import Array
 from dynsim.planner.answer import BracePlan, Size
 from dynsim.planner.arm import axis_lines
 from dynsim.planner.problem import Task
@@ -50,14 +50,14 @@ def picture(plan: BracePlan) -> PlanPicture:
     """Return the data for the figures of a plan."""
     task, best = plan.task, plan.best
     assert best is not None
-    heading = _heading(task)
-    poses = _poses(task, best, heading)
-    path = _in_view(task.targets(np.linspace(0.0, task.duration, 200)), heading)
+    view = _view(task)
+    poses = _poses(task, best, view)
+    path = view.project(task.targets(np.linspace(0.0, task.duration, 200)))
     points = np.vstack([path, *(line for pose in poses for line in pose.lines)])[:, [0, 2]]
     low, high = points.min(axis=0) - BEYOND, points.max(axis=0) + BEYOND
     along, up = np.linspace(low[0], high[0], GRID), np.linspace(low[1], high[1], GRID)
-    grid = along[None, :, None] * heading + up[:, None, None] * np.array([0.0, 0.0, 1.0])
-    grid = grid.reshape(-1, 3)
+    ahead, height = np.meshgrid(along, up)
+    grid = view.world(np.stack([ahead, 0.0 * ahead, height], axis=-1)).reshape(-1, 3)
     gaps = [surface.gaps(grid) for surface in build.surfaces(task.scenario).values()]
     ground = np.min(gaps, axis=0).reshape(GRID, GRID) if gaps else np.ones((GRID, GRID))
     answered = {size.count: size for size in plan.answered}
@@ -78,21 +78,16 @@ def picture(plan: BracePlan) -> PlanPicture:
     )
 
 
-def _heading(task: Task) -> Array:
-    """Return the horizontal unit vector from the arm's base to its path."""
+def _view(task: Task) -> Projection:
+    """Return the coordinates along the heading, to its left, and up; the heading is from the arm's base to its path."""
     middle = task.targets(np.array([0.5 * task.span]))[0] - task.arm.tables.origin[0]
     middle[2] = 0.0
     size = float(np.linalg.norm(middle))
-    return middle / size if size > 1e-9 else np.array([1.0, 0.0, 0.0])
+    heading = middle / size if size > 1e-9 else np.array([1.0, 0.0, 0.0])
+    return Projection(np.zeros(3), np.array([heading, np.cross(UP, heading), UP]))
 
 
-def _in_view(points: Array, heading: Array) -> Array:
-    """Convert points, shape (T, 3), to coordinates along the heading, to its left, and up [m]."""
-    left = np.array([-heading[1], heading[0], 0.0])
-    return np.stack([points @ heading, points @ left, points[..., 2]], axis=-1)
-
-
-def _poses(task: Task, size: Size, heading: Array) -> list[Pose]:
+def _poses(task: Task, size: Size, view: Projection) -> list[Pose]:
     """Return the arm at some instants of the first pass."""
     arm, model, dense = task.arm, task.arm.model, size.dense
     surfaces = build.surfaces(task.scenario)
@@ -100,12 +95,12 @@ def _poses(task: Task, size: Size, heading: Array) -> list[Pose]:
     last = int(np.searchsorted(dense.times, task.span))
     for t in np.linspace(0, min(last, len(dense.times) - 1), POSES).astype(int):
         q = arm.coordinates(dense.q[t : t + 1])[0]
-        lines = [_in_view(line, heading) for line in axis_lines(arm, dense.q[t])]
+        lines = list(view.project(axis_lines(arm, dense.q[t])))
         points, forces = np.zeros((len(size.braces), 3)), np.zeros((len(size.braces), 3))
         now = min(round(dense.times[t] / dense.fine[1]), len(dense.fine) - 1)
         for k, brace in enumerate(size.braces):
             centre = model.point_position(brace.body, np.array(brace.point_m), q)
             normal = surfaces[brace.surface].normal(centre)
             points[k], forces[k] = centre - brace.radius * normal, dense.forces[now, k] * normal
-        poses.append(Pose(float(dense.times[t]), lines, _in_view(points, heading), _in_view(forces, heading)))
+        poses.append(Pose(float(dense.times[t]), lines, view.project(points), view.project(forces)))
     return poses

@@ -23,8 +23,9 @@ from dynsim.cli.tables import record_files
 from dynsim.draw.figures.style import BLUE, DEEP, PULLING
 from dynsim.draw.film import Film, write
 from dynsim.draw.film.film import Strip, largest
-from dynsim.draw.film.painter import FINER, FRICTION, Painter, font, labels, view_axes
+from dynsim.draw.film.painter import FINER, FRICTION, Painter, font, labels
 from dynsim.draw.geometry.meshes import Meshes
+from dynsim.draw.geometry.projection import view_axes
 from dynsim.draw.geometry.robot import bounds
 from dynsim.draw.geometry.shapes import body_shapes, from_z, solid
 from dynsim.errors import RecordError
@@ -123,7 +124,7 @@ def test_the_hand_is_where_the_model_has_it(braced: Record, view: str) -> None:
     for instant in np.random.default_rng(4).uniform(0.0, 1.0, 8):
         q = np.array([np.interp(instant, braced.time, column) for column in braced["q"].T])
         where = model.point_position(braced.scene.bodies[hand.body].name, hand.position, q)
-        right, up = camera.axes[:2] @ (where - camera.centre)
+        right, up = camera.axes[:2] @ (where - camera.origin)
         expected = (camera.middle + camera.scale * np.array([right, -up])) / FINER
         marks = pixels(painter.frame(float(instant)), MARK)
         assert len(marks) > 15

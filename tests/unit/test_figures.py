@@ -362,7 +362,7 @@ def test_contacts_with_a_radius_are_marked_on_their_surface() -> None:
 
 def test_labels_of_contacts_do_not_overprint_each_other(braced: Record) -> None:
     body, _ = posture.skeleton(braced)
-    plane = posture.SidePlane(np.zeros(3), np.array([1.0, 0.0, 0.0]))
+    plane = posture.SidePlane(np.zeros(3), np.eye(3)[[0, 2]])
     assert [label.level for label in posture.contact_labels(body, plane, 1000.0)] == [0, 0]
     close = posture.contact_labels(body, plane, 10.0)
     assert [label.level for label in close] == [0, 1]
@@ -655,7 +655,7 @@ def test_what_lies_below_a_surface_is_marked(braced: Record) -> None:
 @pytest.mark.parametrize(("angle", "read"), [(-1e-9, "0"), (-0.4, "0"), (-30.2, "-30"), (180.0, "180")])
 def test_the_azimuth_of_the_side_plane_has_no_minus_zero(angle: float, read: str) -> None:
     turn = np.radians(angle)
-    plane = posture.SidePlane(np.zeros(3), np.array([np.cos(turn), np.sin(turn), 0.0]))
+    plane = posture.SidePlane(np.zeros(3), np.array([[np.cos(turn), np.sin(turn), 0.0], [0.0, 0.0, 1.0]]))
     assert f" {read}°" in plane.label
 
 

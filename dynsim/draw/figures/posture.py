@@ -18,6 +18,7 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection  # typ
 from dynsim.draw.figures import style
 from dynsim.draw.figures.energy import edge_on, target_name
 from dynsim.draw.figures.style import Array
+from dynsim.draw.geometry.projection import UP, Projection
 from dynsim.draw.geometry.robot import penetrations, placed
 from dynsim.draw.geometry.shapes import Faces, box_about, corners_of, grid_faces, outline, round_patch, surface_grids
 from dynsim.record import Record
@@ -124,28 +125,16 @@ def skeleton(record: Record) -> tuple[Skeleton, str]:
 
 
 @dataclass(frozen=True)
-class SidePlane:
-    """Vertical plane through ``origin`` (described by ``where``) along the horizontal unit vector ``direction``."""
+class SidePlane(Projection):
+    """Vertical plane through its origin, described by ``where``; coordinates are along a horizontal line, and z [m]."""
 
-    origin: Array
-    direction: Array
     where: str = "the base"
-
-    def project(self, points: Array) -> Array:
-        """Project world points, (…, 3), to coordinates along the plane and z, (…, 2) [m]."""
-        return np.stack([(points - self.origin) @ self.direction, points[..., 2]], axis=-1)
-
-    def world(self, along: Array, z: Array) -> Array:
-        """Return points in the plane, (…, 3) [m]."""
-        points = self.origin * np.array([1.0, 1.0, 0.0]) + along[..., None] * self.direction
-        points[..., 2] = z
-        return points
 
     @property
     def label(self) -> str:
         """Label of the horizontal axis of the plane."""
         # Rounded first; adding 0 removes the sign of a negative zero.
-        azimuth = round(float(np.degrees(np.arctan2(self.direction[1], self.direction[0])))) + 0
+        azimuth = round(float(np.degrees(np.arctan2(self.axes[0, 1], self.axes[0, 0])))) + 0
         return f"distance from {self.where}, azimuth {azimuth}° [m]"
 
 
@@ -159,12 +148,12 @@ def side_plane(record: Record, drawn: Sequence[Array]) -> SidePlane:
     if not len(spread) or np.abs(spread).max() < NOTHING:
         # The arm starts upright: use its later postures.
         spread = np.concatenate([segments.reshape(-1, 3) for segments in drawn] or [points])[:, :2] - origin[:2]
-    if np.abs(spread).max(initial=0.0) < NOTHING:
-        return SidePlane(origin, np.array([1.0, 0.0, 0.0]), where)
-    first = np.linalg.svd(spread, full_matrices=False)[2][0]
+    first = np.array([1.0, 0.0])
+    if np.abs(spread).max(initial=0.0) >= NOTHING:
+        first = np.linalg.svd(spread, full_matrices=False)[2][0]
     if (spread @ first).sum() < 0.0:
         first = -first
-    return SidePlane(origin, np.array([*first, 0.0]), where)
+    return SidePlane(np.array([*origin[:2], 0.0]), np.array([[*first, 0.0], UP]), where)
 
 
 @dataclass(frozen=True)
@@ -205,7 +194,7 @@ def contact_labels(body: Skeleton, plane: SidePlane, scale: float) -> list[Label
     labels: list[Label] = []
     points = [(*contact, plane.project(contact[2])) for contact in body.contacts()]
     for contact, surface, position, force, at in sorted(points, key=lambda entry: float(entry[4][0])):
-        along, up = plane.project(plane.origin + surface.gradient(position)) - plane.project(plane.origin)
+        along, up = plane.axes @ surface.gradient(position)
         steep = abs(along) > abs(up)
         side = (-1 if along > 0.0 else 1, 0) if steep else (0, 1 if up < 0.0 else -1)
         text = contact.name if np.isnan(force) else f"{contact.name}\n{style.number(force, 3)} N"
@@ -352,7 +341,7 @@ def _frame_side(axes: Axes, plane: SidePlane, extent: tuple[Array, Array], surfa
     axes.set_xlabel(plane.label)
     axes.set_ylabel("z [m]")
     along, z = np.meshgrid(np.linspace(low[0], high[0], 160), np.linspace(low[1], high[1], 120))
-    points = plane.world(along, z)
+    points = plane.world(np.stack([along, z], axis=-1))
     for surface in surfaces:
         value = surface.value(points)
         if value.min() < 0.0 < value.max():

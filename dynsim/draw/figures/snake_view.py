@@ -14,8 +14,9 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from dynsim.draw.figures import style
-from dynsim.draw.figures.posture import SidePlane, add_outlines
+from dynsim.draw.figures.posture import add_outlines
 from dynsim.draw.figures.style import Array
+from dynsim.draw.geometry.projection import ABOVE, UP, Projection
 from dynsim.draw.geometry.shapes import corners_of, wheel_groups
 from dynsim.errors import RecordError
 from dynsim.record import Record
@@ -64,11 +65,11 @@ class View:
         solids = [corners_of(record, scene, body, row) for body in object_bodies(record).values()]
         self.objects = [corners for shapes in solids for corners, _ in shapes]
         x, y, yaw = record["base_pose"][row]
-        self.plane = SidePlane(np.array([x, y, 0.0]), np.array([np.cos(yaw), np.sin(yaw), 0.0]))
+        self.beside = Projection(np.array([x, y, 0.0]), np.array([[np.cos(yaw), np.sin(yaw), 0.0], UP]))
 
     def project(self, points: Array, above: bool) -> Array:
         """Project points to the plane of the drawing, (n, 3) → (n, 2) [m]."""
-        return points[:, :2] if above else self.plane.project(points)
+        return (ABOVE if above else self.beside).project(points)
 
     def extent(self, above: bool) -> Array:
         """Return all points that a view must show, (k, 2)."""

@@ -18,7 +18,8 @@ from PIL import Image, ImageColor, ImageDraw
 from dynsim.draw.figures import style
 from dynsim.draw.figures.style import GREY, PULLING, VARIANT_COLOURS
 from dynsim.draw.figures.style import title as titled
-from dynsim.draw.film.painter import FINER, FROM, PAPER, Camera, Painter, View, font, view_axes
+from dynsim.draw.film.painter import FINER, PAPER, Camera, Painter, font
+from dynsim.draw.geometry.projection import FROM, View, view_axes
 from dynsim.draw.geometry.robot import Array, azimuth, bounds, robots
 from dynsim.errors import RecordError
 from dynsim.record import TIME, Record

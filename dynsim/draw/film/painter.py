@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -21,6 +21,7 @@ from PIL import Image, ImageColor, ImageDraw, ImageFont
 
 from dynsim.draw.figures.style import BLACK, BLUE, DEEP, GREEN, GREY, ORANGE, PULLING, SKY
 from dynsim.draw.geometry.meshes import Meshes, simplified
+from dynsim.draw.geometry.projection import Projection
 from dynsim.draw.geometry.robot import (
     DrawnContact,
     DrawnRobot,
@@ -144,33 +145,22 @@ def labels(
 
 
 # Camera: parallel projection, so that the scale does not depend on the distance.
-View = Literal["side", "top", "iso"]
-# Directions from the robot to the camera; the x axis is the longest horizontal extent of the robot.
-FROM: dict[str, tuple[float, float, float]] = {
-    "side": (0.0, -1.0, 0.0),
-    "top": (0.0, 0.0, 1.0),
-    "iso": (-0.5, -1.0, 0.55),
-}
-
-
 @dataclass(frozen=True)
-class Camera:
-    """Parallel projection p = scale · (right, −up) · (r − centre) + middle.
+class Camera(Projection):
+    """Parallel projection p = scale · (right, −up) · (r − origin) + middle.
 
     Attributes
     ----------
+    origin : (3,) ndarray
+        Point r shown in the middle [m].
     axes : (3, 3) ndarray
         Unit vectors in the world: right, up and towards the viewer.
-    centre : (3,) ndarray
-        Point r shown in the middle [m].
     scale : float
         Scale [pixel/m].
     middle : (2,) ndarray
         Middle of the image [pixel]; y is down.
     """
 
-    axes: Array
-    centre: Array
     scale: float
     middle: Array
 
@@ -184,24 +174,13 @@ class Camera:
         size = np.maximum(high - low, 1e-9)
         scale = float(min((right - left) / size[0], (bottom - top) / size[1]))
         middle = np.array([0.5 * (left + right), 0.5 * (top + bottom)])
-        return cls(axes, 0.5 * (low + high) @ axes, scale, middle)
+        return cls(0.5 * (low + high) @ axes, axes, scale, middle)
 
     def project(self, points: Array) -> Array:
         """Project world points, (…, 3) [m], to x and y [pixel] and the coordinate towards the viewer [m], (…, 3)."""
-        seen = (points - self.centre) @ self.axes.T
+        seen = super().project(points)
         seen[..., :2] = self.middle + seen[..., :2] * np.array([self.scale, -self.scale])
-        return np.asarray(seen)
-
-
-def view_axes(view: View, azimuth: float) -> Array:
-    """Return the unit vectors right, up and towards the viewer, (3, 3)."""
-    c, s = np.cos(azimuth), np.sin(azimuth)
-    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    back = np.array(FROM[view])
-    back = turn @ (back / np.linalg.norm(back))
-    right = turn[:, 0] if view == "top" else np.cross([0.0, 0.0, 1.0], back)
-    right = right / np.linalg.norm(right)
-    return np.stack([right, np.cross(back, right), back])
+        return seen
 
 
 Array = NDArray[np.float64]
@@ -423,7 +402,7 @@ class Painter:
         # Visible part: the corners of the image projected along the line of sight.
         seen = np.array([[0.0, 0.0], [width, 0.0], [width, height], [0.0, height]])
         flat = (seen - self.camera.middle) * np.array([1.0, -1.0]) / self.camera.scale
-        points = self.camera.centre + flat @ self.camera.axes[:2]
+        points = self.camera.origin + flat @ self.camera.axes[:2]
         points += ((z - points[:, 2]) / up)[:, None] * self.camera.axes[2]
         ticks = MaxNLocator(10, steps=[1, 2, 5, 10]).tick_values(0.0, float(np.linalg.norm(high - low)))
         step = ticks[1] - ticks[0]

@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dynsim._version import __version__
-from dynsim.draw.film.painter import view_axes
 from dynsim.draw.geometry.meshes import Mesh, Meshes, simplified
+from dynsim.draw.geometry.projection import view_axes
 from dynsim.draw.geometry.robot import (
     POSE_ERROR,
     DrawnRobot,
