@@ -24,7 +24,7 @@ from dynsim.draw.geometry.shapes import Faces, box_about, corners_of, grid_faces
 from dynsim.record import Record
 from dynsim.record.measures import hand_target
 from dynsim.record.poses import POSITION, contact_positions, point_positions
-from dynsim.record.scene import WORLD, Joint, Point, Scene, SceneSurface
+from dynsim.record.scene import WORLD, Point, Scene, SceneSurface
 
 # Number of postures that are drawn faintly, evenly spaced in time, in addition to the last one.
 FAINT = 6
@@ -51,8 +51,10 @@ class Skeleton:
         points, base = self.record[POSITION][row].astype(np.float64), self.scene.base
         lines = []
         for k, body in enumerate(self.scene.bodies):
+            # A translation of a floating, planar or rolling joint separates two bodies.
+            separates = bool(body.joint.part_of) and body.joint.kind in ("prismatic", "planar")
             # A mobile base is drawn as a solid, see :meth:`solids`.
-            if k in base or body.parent in base or _is_translation_row(body.joint):
+            if k in base or body.parent in base or separates:
                 continue
             # A prismatic joint at the root moves its body away from its mount.
             start = np.array(body.joint.position) if body.parent == WORLD else points[body.parent]
@@ -111,11 +113,6 @@ class Skeleton:
                 position = position - surface.gap(position) * surface.normal(position)
             contacts.append((point, surface, position, force))
         return contacts
-
-
-def _is_translation_row(joint: Joint) -> bool:
-    """Return whether a joint is a translation of a floating, planar or rolling joint, which separates two bodies."""
-    return bool(joint.part_of) and joint.kind in ("prismatic", "planar")
 
 
 def skeleton(record: Record) -> tuple[Skeleton, str]:

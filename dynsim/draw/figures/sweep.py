@@ -291,7 +291,8 @@ def samples(sweep: Sweep) -> Figure | None:
     for row, (variant, grid_place) in zip(panels, rows, strict=True):
         here = list(_at(sweep.of(variant), grid_place))
         # A single grid point is not named.
-        where = [f"{names[key]} = {_level(value)}" for key, value in grid_place.items()] if len(places) > 1 else []
+        values = {key: style.number(value) if _numeric([value]) else value for key, value in grid_place.items()}
+        where = [f"{names[key]} = {value}" for key, value in values.items()] if len(places) > 1 else []
         texts = [variant] * bool(variant) + [_short(", ".join(where), _HEAD - len(variant))] * bool(where)
         head = f"{', '.join(texts)}\n" if texts else ""
         for axes, (metric, (label, scale)) in zip(row, metrics.items(), strict=True):
@@ -425,10 +426,6 @@ def _with_interval(value: float, half: float) -> str:
 def _is_wide(low: float, high: float) -> bool:
     """Return whether values between these limits are positive and of very different size."""
     return bool(low > 0.0 and high > _WIDE * low)
-
-
-def _level(value: Any) -> str:
-    return style.number(value) if _numeric([value]) else str(value)
 
 
 def _short(text: str, long: int = _LABEL) -> str:

@@ -188,21 +188,6 @@ NEARLY = 9
 QUALITY = 20
 
 
-def check_length(count: int, size: tuple[int, int]) -> None:
-    """Raise if a GIF, whose frames are all in memory, would be too large.
-
-    Raises
-    ------
-    RecordError
-        If the frames have too many pixels.
-    """
-    if count * size[0] * size[1] > GIF_PIXELS_MAX:
-        raise RecordError(
-            f"a GIF of {count} frames of {size[0]}x{size[1]} pixels needs too much memory; write an .mp4, "
-            "raise --speed, or lower --fps or --size"
-        )
-
-
 def check(kind: str, fps: int) -> None:
     """Check format and frame rate before the first frame is painted.
 
@@ -516,8 +501,11 @@ def write(
     check(kind, fps)
     film = Film(records, view=view, size=size, speed=speed, fps=fps, plot=plot)
     total = len(film.times)
-    if kind == "gif":
-        check_length(total, size)
+    if kind == "gif" and total * size[0] * size[1] > GIF_PIXELS_MAX:
+        raise RecordError(
+            f"a GIF of {total} frames of {size[0]}x{size[1]} pixels needs too much memory; write an .mp4, "
+            "raise --speed, or lower --fps or --size"
+        )
     frames = film.frames(lambda done: progress(done, total))
     with replacing(path) as stream:
         if kind == "gif":

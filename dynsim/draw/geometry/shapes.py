@@ -181,7 +181,8 @@ def drawn_shape(shape: Shape, meshes: Meshes) -> dict[str, Any] | None:
 
 def body_shapes(scene: Scene, reach: float, meshes: Meshes) -> list[list[dict[str, Any]]]:
     """Return the shapes of every body; a body without shapes gets rods to its children, and joints get hubs."""
-    radius = _radius(scene, ROD * reach)
+    tubes = [shape.size[0] for body in scene.bodies if _is_tube(body) for shape in body.shapes[:1]]
+    radius = float(np.median(tubes)) if tubes else ROD * reach
     base = set(scene.base)
     drawn = []
     for k, body in enumerate(scene.bodies):
@@ -225,11 +226,6 @@ def gripper(shapes: list[list[dict[str, Any]]], reach: float) -> dict[str, Any]:
     """Return two fingers at the hand, as boxes in its body frame [m]: distance ahead, and aside open and closed."""
     size = max(1.7 * thinnest(shapes), 0.012 * reach)
     return {"size": [1.6 * size, 0.4 * size, 0.8 * size], "ahead": 0.5 * size, "aside": [0.8 * size, 0.28 * size]}
-
-
-def _radius(scene: Scene, default: float) -> float:
-    tubes = [shape.size[0] for body in scene.bodies if _is_tube(body) for shape in body.shapes[:1]]
-    return float(np.median(tubes)) if tubes else default
 
 
 def _is_tube(body: Body) -> bool:
