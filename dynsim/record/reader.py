@@ -1,9 +1,10 @@
 """Reading and writing of records as HDF5 files.
 
 A file is HDF5 data followed by one line with the SHA-256 of all bytes before it, which HDF5 ignores. The digest reveals
-damage before the HDF5 library is called, which may crash or hang on a damaged file. A file without that line, or with
-another digest, is read only with ``trust=True`` (``--trust``). In both cases sizes are checked before data are
-decompressed. A file is rejected if it may belong to another run than the files next to it.
+damage. A file without that line, or with another digest, is read only with ``trust=True`` (``--trust``). Sizes are
+checked before data are decompressed. A file that this process did not write is read in a child process with limits of
+time and memory (:mod:`dynsim.record.isolated`), because the HDF5 library may crash or loop endlessly on a damaged file.
+A file is rejected if it may belong to another run than the files next to it.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.errors import RecordError, brief
+from dynsim.record import isolated
 from dynsim.record.content import FORMAT, TIME, Content, Event, Signal, check_name, check_signal, check_time, is_numeric
 from dynsim.record.quaternion import Array
 from dynsim.record.scene import Scene
@@ -30,6 +32,8 @@ from dynsim.system.inputs import is_file
 
 EVENT_COLUMNS = {"time": float, "kind": str, "name": str, "value": float, "description": str}
 """Attributes of events; each is a data set in the group ``events``."""
+_written: set[str] = set()
+"""Digests of the files that this process wrote."""
 _LABELS_IN_ATTRIBUTE = 1000
 """More labels than this are stored as a data set: an HDF5 attribute holds at most 64 kB, which is 4090 labels."""
 
@@ -72,7 +76,9 @@ def encode(content: Content) -> memoryview:
             except ValueError as error:
                 raise RecordError(f"signal {name!r} cannot be saved: {error}") from error
     image.seek(0, os.SEEK_END)
-    image.write(b"\ndynsim-sha256:%s\n" % hashlib.sha256(image.getbuffer()).hexdigest().encode("ascii"))
+    digest = hashlib.sha256(image.getbuffer()).hexdigest()
+    _written.add(digest)
+    image.write(b"\ndynsim-sha256:%s\n" % digest.encode("ascii"))
     return image.getbuffer()
 
 
@@ -102,9 +108,6 @@ def _write_events(file: Any, events: Sequence[Event]) -> None:
 
 
 _FORMATS = "dynsim-record-"
-SIZE_LIMIT = 2 << 30
-"""A file may expand to this many bytes, or to ``RATIO_LIMIT`` times its size if that is more."""
-RATIO_LIMIT = 100
 _LAST_LINE = re.compile(rb"\ndynsim-sha256:([0-9a-f]{64})\n")
 _LAST_LINE_SIZE = 80
 
@@ -132,19 +135,19 @@ def read(path: Path, *, trust: bool = False) -> Content:
             raise RecordError(f"{path}: no such record{hint}")
         check_complete(path)
         with path.open("rb") as stream:
-            doubt = _doubt(path, stream)
+            digest, doubt = _digest(path, stream)
     except (OSError, ValueError) as error:
         raise RecordError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})") from error
     if doubt and not trust:
         raise RecordError(f"{path}: {doubt}; {_TRUST}")
-    return decode(path, path)
+    return decode(path) if digest in _written else isolated.read(path)
 
 
 _TRUST = "if you trust its source, read it with --trust (in Python: Record.load(path, trust=True))"
 
 
-def _doubt(path: Path, stream: BinaryIO) -> str:
-    """Return why the file may not be as dynsim wrote it, or "" if it is.
+def _digest(path: Path, stream: BinaryIO) -> tuple[str, str]:
+    """Return the digest of the data, and why the file may not be as dynsim wrote it, or "" if it is.
 
     Raises
     ------
@@ -158,26 +161,24 @@ def _doubt(path: Path, stream: BinaryIO) -> str:
     if not stream.read(8).startswith(b"\x89HDF\r\n\x1a\n"):
         raise RecordError(f"{path}: not a readable HDF5 file (wrong signature)")
     if match is None:
-        return "no digest (SHA-256) at the end: it was truncated, or written by another program"
+        return "", "no digest (SHA-256) at the end: it was truncated, or written by another program"
     stream.seek(0)
     actual, left = hashlib.sha256(), size - _LAST_LINE_SIZE
     while left and (block := stream.read(min(left, 1 << 20))):
         actual.update(block)
         left -= len(block)
     if actual.hexdigest().encode("ascii") != match[1]:
-        return "its content does not match its digest (SHA-256): it was damaged, or changed after dynsim wrote it"
-    return ""
+        return "", "its content does not match its digest (SHA-256): it was damaged, or changed after dynsim wrote it"
+    return actual.hexdigest(), ""
 
 
-def decode(path: Path, source: Path | BinaryIO) -> Content:
+def decode(path: Path) -> Content:
     """Read and check the content of an HDF5 file.
 
     Parameters
     ----------
     path : Path
-        Name of the file, for messages.
-    source : Path or binary file
-        The file, or its bytes.
+        HDF5 file.
 
     Raises
     ------
@@ -187,22 +188,16 @@ def decode(path: Path, source: Path | BinaryIO) -> Content:
     import h5py
 
     try:
-        size = source.stat().st_size if isinstance(source, Path) else source.seek(0, os.SEEK_END)
-        with h5py.File(source, "r") as file:
-            return _Reader(file, size).content()
+        with h5py.File(path, "r") as file:
+            return _Reader(file, path.stat().st_size).content()
     except RecordError as error:
         raise RecordError(f"{path}: {error}") from error
-    except MemoryError as error:
-        raise RecordError(f"{path}: not enough memory to read it") from error
+    except MemoryError:
+        raise
     # With damaged files h5py raises exceptions of almost any type.
     except Exception as error:
         text = str(error).strip("'\"").splitlines() or [type(error).__name__]
         raise RecordError(f"{path}: not a readable HDF5 file ({text[0]})") from error
-
-
-def _allowed(size: int) -> int:
-    """Return the number of bytes that a file of this size may expand to."""
-    return max(SIZE_LIMIT, RATIO_LIMIT * size)
 
 
 # Groups of data sets, and how messages name their data sets.
@@ -220,7 +215,7 @@ class _Reader:
     def __init__(self, file: Any, size: int) -> None:
         self._file = file
         self._size = size
-        self._left = _allowed(size)
+        self._left = isolated.data_limit(size)
 
     def content(self) -> Content:
         version, complete = (self._file.attrs.get(name) for name in ("format", "complete"))
@@ -333,7 +328,7 @@ class _Reader:
         if self._left < 0:
             raise RecordError(
                 f"{name} would expand to {size} bytes; the limit for a file of {self._size} bytes is "
-                f"{_allowed(self._size)} in total"
+                f"{isolated.data_limit(self._size)} in total"
             )
         return data[()]
 

@@ -1,14 +1,16 @@
 """Damaged and malicious record files: each is read as written or refused in one line; none crashes dynsim.
 
-The HDF5 library itself crashes, or never returns, on one of sixty damaged files, so these tests read files
-in child processes.
+The HDF5 library itself crashes, or never returns, on one of sixty damaged files, so most of these tests
+read files in child processes.
 """
 
 import itertools
 import os
 import random
+import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -19,7 +21,7 @@ import pytest
 from support.messages import raises
 
 from dynsim.errors import RecordError
-from dynsim.record import Record, reader
+from dynsim.record import Record, isolated, reader
 from dynsim.record.scene import Body, Joint, Point, Scene, SceneSurface, Shape
 
 
@@ -266,7 +268,7 @@ FOREIGN: list[tuple[Change, str]] = [
     (circle, "again"),
     (raw_file, "s"),
     (virtual, "s"),
-    (bomb, "s 43980465111040 2147483648"),
+    (bomb, "s 43980465111040 900000000"),
     (no_gzip, "HDF5"),
     (huge_contiguous, "time 281474976710656"),
     (type_as_signal, "s"),
@@ -313,7 +315,7 @@ def test_axes_events_and_scenes_that_are_none_are_refused(tmp_path: Path, change
     with h5py.File(path, "r+") as file:
         change(file, tmp_path)
     with raises(RecordError, *names.split()) as error:
-        reader.decode(path, path)
+        reader.decode(path)
     assert str(error.value).startswith(f"{path}: ")
     assert "\n" not in str(error.value)
 
@@ -330,7 +332,7 @@ def foreign(change: Change, folder: Path) -> Path:
 def test_a_file_that_is_no_record_is_refused_with_the_reason(tmp_path: Path, change: Change, names: str):
     path = foreign(change, tmp_path)
     with raises(RecordError, *names.split()) as error:
-        Record.load(path, trust=True)
+        reader.decode(path)
     assert str(error.value).startswith(f"{path}: ")
     assert "\n" not in str(error.value)
 
@@ -411,3 +413,102 @@ def test_damage_is_found_or_does_no_harm(tmp_path: Path):
     contents += [whole[:-80] + flipped(whole[-80:], seed) for seed in range(40)]
     contents += [mangled(whole, seed) for seed in range(80)]
     assert load_all(tmp_path, contents) == ["refused"] * len(contents)
+
+
+# -- isolation --------------------------------------------------------------------------------------------------------
+
+ENDLESS = Path(__file__).parents[1] / "fuzz" / "inputs" / "endless.h5"
+"""A small record with a correct digest, on which the HDF5 library loops endlessly."""
+
+
+def of_another_process(path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    telling().save(path)
+    monkeypatch.setattr(reader, "_written", set())
+    return path
+
+
+def test_a_file_of_another_process_is_read_in_a_child_and_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    path = telling().save(tmp_path / "record.h5")
+    with monkeypatch.context() as context:
+        context.setattr(isolated, "read", None)
+        here = Record.load(path)
+    monkeypatch.setattr(reader, "_written", set())
+    monkeypatch.setattr(reader, "decode", None)
+    there = Record.load(path)
+    assert same(here, there)
+    assert there.signals["q"].data.flags.writeable
+
+
+def test_an_endless_file_ends_with_one_error(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(isolated, "TIME_S", 2)
+    with raises(RecordError, "endless.h5", "2 s", "processor time"):
+        Record.load(ENDLESS)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_reading_ends_at_a_signal(number: signal.Signals, tmp_path: Path):
+    """Also the child ends, which reads the endless file."""
+    command = [sys.executable, "-P", "-m", "dynsim", "export", str(ENDLESS), "--format", "csv", "--out", "x.csv"]
+    process = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True)
+
+    def children() -> list[int]:
+        return [
+            int(file.parent.name)
+            for file in Path("/proc").glob("[0-9]*/stat")
+            if f" {process.pid} " in file.read_text().rpartition(")")[2][:20]
+        ]
+
+    while not (readers := children()):
+        assert process.poll() is None
+        time.sleep(0.05)
+    process.send_signal(number)
+    _, errors = process.communicate(timeout=60)
+    assert (process.returncode, "Traceback" in errors) == (128 + number, False), errors
+    assert not any(Path(f"/proc/{reader}").exists() for reader in readers)
+
+
+@pytest.mark.parametrize(
+    ("body", "names"),
+    [
+        ("os.kill(os.getpid(), signal.SIGSEGV)", "HDF5 SIGSEGV"),
+        ("sys.stdout.buffer.write(b'half'); sys.exit(3)", "code 3"),
+        ("bytearray(isolated.MEMORY)", "memory"),
+    ],
+)
+def test_a_reader_that_dies_is_one_error(body: str, names: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    path = of_another_process(tmp_path / "record.h5", monkeypatch)
+    served = "isolated.serve("
+    assert served in isolated.START
+    program = isolated.START.replace(served, f"import os; decode = lambda path: {body}\n{served}")
+    monkeypatch.setattr(isolated, "START", program)
+    with raises(RecordError, "record.h5", *names.split()):
+        Record.load(path)
+
+
+def test_a_file_that_expands_too_much_is_refused(tmp_path: Path):
+    """A data set of zeros, 1 GB in 1 MB, from a stranger who wrote the right digest."""
+    path = tmp_path / "zeros.h5"
+    with h5py.File(telling().save(path), "r+") as file:
+        del file["signals/force"]
+        data = file.create_dataset("signals/force", (5, 4, 6_000_000), "f8", compression="gzip", fillvalue=1.0)
+        data.attrs.update({"unit": "N", "labels": ["c"], "description": ""})
+        data[0, 0, 0] = 2.0
+    with raises(RecordError, "zeros.h5", "force", "960000000"):
+        Record.load(path, trust=True)
+
+
+def test_trusted_damage_ends_in_one_error_or_does_no_harm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Without the protection of the digest each file is read, refused, or ends its own reader."""
+    monkeypatch.setattr(isolated, "TIME_S", 2)
+    whole = bytes(telling().to_hdf5())
+    refused = 0
+    for seed in range(12):
+        path = tmp_path / "record.h5"
+        path.write_bytes(flipped(whole, seed) if seed % 2 else mangled(whole, seed))
+        try:
+            Record.load(path, trust=True)
+        except RecordError as error:
+            refused += str(error).startswith(f"{path}: ") and "\n" not in str(error)
+        else:
+            refused += 1
+    assert refused == 12
