@@ -35,6 +35,7 @@ from dynsim.cli.drawing import (
     open_page,
     print_page,
     view,
+    warn_about_meshes,
 )
 from dynsim.cli.export import export
 from dynsim.cli.hardware import EXAMPLE, hw, hw_drive
@@ -99,6 +100,7 @@ def run(
             errors.print(f"results up to the stop are in {escaped(folder)}, marked incomplete")
         raise
     save_run(record, folder)
+    warn_about_meshes([record.scene])
     shown = Page({loaded.variant or loaded.name: record}, folder)
     page = None
     with interruptible_drawing(folder):
@@ -165,6 +167,7 @@ def compare(
     records = {s.variant: records[s.variant] for s in loaded if s.variant in records}
     if records:
         save_comparison(records, folder)
+        warn_about_meshes(record.scene for record in records.values())
         with interruptible_drawing(folder):
             if not no_figures:
                 wanted = [
@@ -225,6 +228,7 @@ def check(
             count = f"{len(variants)} variants" if len(variants) > 1 else "1 variant"
             print_line(f"{escaped(name)}: ok ({count})")
             print_starts(console, starts)
+            warn_about_meshes(start.scene for start in starts.values())
     _warn_about_plugins()
     if failed:
         raise typer.Exit(2)

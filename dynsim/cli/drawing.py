@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import StrEnum
@@ -22,6 +22,7 @@ from dynsim.system.terminal import escaped
 
 if TYPE_CHECKING:
     from dynsim.record import Record
+    from dynsim.record.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -144,9 +145,18 @@ def view(
     page = out or (first if len(records) == 1 else Path()) / VIEW
     with console.status(f"writing {escaped(page)}"):
         write(named, page, ghost=ghost)
+    warn_about_meshes(record.scene for record in named.values())
     print_written(page)
     if open_:
         open_page(page)
+
+
+def warn_about_meshes(scenes: Iterable[Scene | None]) -> None:
+    """Print a warning for each mesh of the scenes that cannot be drawn."""
+    from dynsim.draw.geometry.meshes import mesh_notes
+
+    for note in dict.fromkeys(note for scene in scenes for note in mesh_notes(scene)):
+        errors.print(f"[yellow]warning:[/] {escaped(note)}")
 
 
 def write_view(records: Mapping[str, Record], folder: Path, quiet: bool) -> Path | None:
@@ -207,6 +217,7 @@ def animate(
     wanted = _size(size)
     check(out.suffix.lower().removeprefix("."), fps)
     named = labelled(records, trust=trust)
+    warn_about_meshes(record.scene for record in named.values())
     with film_progress(quiet) as report:
         write(
             named,

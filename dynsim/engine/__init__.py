@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from dynsim.errors import ModelError, ScenarioError, SimulationInterrupted, SimulationStopped, UnreachableReference
 from dynsim.record import Record
+from dynsim.record.scene import Scene
 from dynsim.scenario import Scenario, require_scenario
 from dynsim.system import interruption
 from dynsim.system.memo import remembering
@@ -63,6 +64,8 @@ class Start:
         sampled loop, and jumps at a start in equilibrium.
     off_path : float or None
         Distance of the hand from the start of its path [m]; None without a path.
+    scene : Scene or None
+        Bodies, surfaces and points for pictures; None if the plant cannot be drawn.
     """
 
     hand: NDArray[np.float64]
@@ -74,6 +77,7 @@ class Start:
     tip_margin_braced: float | None = None
     warnings: Sequence[str] = ()
     off_path: float | None = None
+    scene: Scene | None = None
 
 
 def simulate(scenario: Scenario, progress: Progress | None = None, *, pictured: bool = True) -> Record:

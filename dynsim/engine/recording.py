@@ -464,6 +464,12 @@ def pictured_parts(scene: Scene, scenario: Scenario) -> Scene:
     return replace(scene, objects=tuple(scenario.config.objects or ()), mesh_folders=folders, grip=grip, tip=tip)
 
 
+def drawn_scene(scenario: Scenario, robot: Robot, contacts: Sequence[Contact]) -> Scene | None:
+    """Return the scene of a robot for pictures; None if it cannot be drawn."""
+    scene = robot_scene(robot, contacts, build.surfaces(scenario))
+    return None if scene is None else pictured_parts(scene, scenario)
+
+
 def make_record(
     scenario: Scenario,
     prepared: Prepared,
@@ -551,8 +557,7 @@ def make_record(
     for event in happened:
         record.add_event(event.time, event.kind, event.name)
     if pictured:
-        scene = robot_scene(robot, contacts, build.surfaces(scenario))
-        record.scene = None if scene is None else pictured_parts(scene, scenario)
+        record.scene = drawn_scene(scenario, robot, contacts)
         if add_body_poses(record):
             _add_touching_points(record, robot, contacts)
     end = _end(record, prepared, pushed, begun, within=lost)

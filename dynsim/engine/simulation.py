@@ -44,7 +44,7 @@ from dynsim.engine.link_sensors import AppliedWrench
 from dynsim.engine.operator import EncodedCommands, Operator
 from dynsim.engine.outcome import interrupted, mark_stopped, raise_stopped, run_to_end
 from dynsim.engine.prepare import Prepared, at_start, prepare, sample_times
-from dynsim.engine.recording import make_record
+from dynsim.engine.recording import drawn_scene, make_record
 from dynsim.engine.soundness import unstable_loop
 from dynsim.engine.stepped import GUARDS, Snapshot, State, Touch, event_name, take_log
 from dynsim.engine.stopping import last_state, stopped
@@ -1630,7 +1630,8 @@ def start_of(scenario: Scenario) -> Start:
         *_below(scenario, robot),
         *build.left_out_warnings(scenario, contacts),
     ]
-    return Start(hand, points, gaps, key, solved, *_margins(scenario, model, contacts), warnings)
+    scene = drawn_scene(scenario, robot, contacts)
+    return Start(hand, points, gaps, key, solved, *_margins(scenario, model, contacts), warnings, scene=scene)
 
 
 def _touching(model: Model, contacts: Sequence[Contact]) -> tuple[dict[str, Array], dict[str, float]]:

@@ -5,9 +5,13 @@ from __future__ import annotations
 import base64
 import gzip
 import html
+import io
 import json
 import os
 import re
+import subprocess
+import sys
+import zipfile
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -22,6 +26,7 @@ from support.messages import raises, says
 
 import dynsim
 from dynsim import cli
+from dynsim.draw.geometry import meshes
 from dynsim.draw.geometry.meshes import Mesh, Meshes, read_mesh, simplified, welded
 from dynsim.draw.page import content, page, viewable, write
 from dynsim.draw.page.content import Blocks, three
@@ -142,6 +147,100 @@ def test_broken_meshes_are_refused(name: str, text: str, tmp_path: Path) -> None
     (tmp_path / name).write_text(text)
     with raises(RecordError, name):
         read_mesh(tmp_path / name)
+
+
+# Copies of the wedge by nodes that instantiate the previous one ten times: 10^8 in 3.7 kB.
+COPIES = "".join(f'<node id="k{k}">' + f'<instance_node url="#k{k - 1}"/>' * 10 + "</node>" for k in range(1, 9))
+LIBRARY = f'<library_nodes><node id="k0"><instance_geometry url="#g"/></node>{COPIES}</library_nodes>'
+LOOP = '<library_nodes><node id="k8"><instance_node url="#k8"/></node></library_nodes>'
+ENTITIES = '<!DOCTYPE COLLADA [<!ENTITY a "lol"><!ENTITY b "&a;&a;">]>'
+BODY = dae().partition("?>")[2]
+
+
+def with_nodes(library: str) -> str:
+    """The wedge, and once more with the node k8 of a library."""
+    scenes, end = "<library_visual_scenes>", "</visual_scene>"
+    return dae().replace(scenes, library + scenes).replace(end, f'<node><instance_node url="#k8"/></node>{end}')
+
+
+def zipped() -> bytes:
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("wedge.dae", dae() + " " * 1_000_000)
+    return stream.getvalue()
+
+
+HOSTILE = {
+    "copies.dae": (with_nodes(LIBRARY), "4e+08 triangles"),
+    "empty.dae": (with_nodes(LIBRARY.replace('<instance_geometry url="#g"/>', "")), "nodes"),
+    "loop.dae": (with_nodes(LOOP), "k8 itself"),
+    "zip.dae": (zipped(), "zip"),
+    "bomb.dae": (f'<?xml version="1.0" encoding="utf-16"?>{ENTITIES}{BODY}'.encode("utf-16"), "XML entities"),
+    "code.dae": (f'<?xml version="1.0" encoding="utf-7"?>{BODY}', "utf-7"),
+    "deep.dae": (dae().replace("<node>", "<node>" * 20_000, 1), "nested"),
+    "large.stl": (bytes(80) + (2_100_000).to_bytes(4, "little") + bytes(50 * 2_100_000), "MB"),
+    "many.obj": ("v 0 0 0\nf" + " 1" * 2_100_000, "triangles"),
+}
+READ = """
+import resource, sys
+from pathlib import Path
+from dynsim.draw.geometry import meshes
+from dynsim.draw.geometry.meshes import read_mesh
+from dynsim.errors import RecordError
+resource.setrlimit(resource.RLIMIT_CPU, (8, 9))
+resource.setrlimit(resource.RLIMIT_AS, (2 << 30, 2 << 30))
+try:
+    read_mesh(Path(sys.argv[1]))
+except RecordError as error:
+    print(error)
+"""
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_a_hostile_mesh_is_refused_and_every_command_says_so(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text, names = HOSTILE[name]
+    file = meshed_robot(tmp_path)
+    (tmp_path / name).write_bytes(text if isinstance(text, bytes) else text.encode())
+    command = [sys.executable, "-c", READ, str(tmp_path / name)]
+    environment = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
+    assert done.stdout.count("\n") == 1
+    for word in (str(tmp_path / name), *names.split()):
+        assert word in done.stdout
+    robot = next(tmp_path.glob("*.urdf"))
+    robot.write_text(re.sub(r'(<mesh filename=")[^"]*', rf"\g<1>{name}", robot.read_text()))
+    folder = tmp_path / "run"
+    for words in (
+        ("check", file),
+        ("run", file, "--quiet", "--out", folder, "--set", "duration_s=0.02"),
+        ("view", folder, "--no-open"),
+        ("animate", folder, "--out", tmp_path / "a.gif", "--fps", "5", "--quiet"),
+    ):
+        assert run(monkeypatch, *words) == 0
+        assert "".join(done.stdout.split()) in "".join(capsys.readouterr().err.split())
+    notes = data_of((folder / "view.html").read_text())[0]["notes"]
+    assert any(note.startswith(done.stdout.strip()) for note in notes)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "iso-8859-1", "us-ascii"])
+def test_encodings_of_collada_files(encoding: str, tmp_path: Path) -> None:
+    text = f'<?xml version="1.0" encoding="{encoding.removesuffix("-sig")}"?>{BODY}'
+    (tmp_path / "a.dae").write_bytes(text.encode(encoding))
+    assert len(read_mesh(tmp_path / "a.dae").triangles) == len(FACES)
+
+
+def test_copies_of_a_mesh_within_the_budget_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The scan counts as many triangles as the reader places."""
+    (tmp_path / "a.dae").write_text(with_nodes(LIBRARY).replace("#k8", "#k2"))
+    count = len(read_mesh(tmp_path / "a.dae").triangles)
+    assert count == 101 * len(FACES)
+    monkeypatch.setattr(meshes, "TRIANGLES_MAX", count)
+    read_mesh(tmp_path / "a.dae")
+    monkeypatch.setattr(meshes, "TRIANGLES_MAX", count - 1)
+    with raises(RecordError, "a.dae", f"{count} triangles"):
+        read_mesh(tmp_path / "a.dae")
 
 
 def painted(text: str) -> str:
@@ -295,7 +394,7 @@ def test_meshes_are_found_where_the_robot_is(robot: Record) -> None:
 
 def test_a_mesh_is_packed_once(robot: Record) -> None:
     meshes = Meshes()
-    meshes.of_robot(robot)
+    meshes.of_robot(robot.scene)
     file = "package://wedges/meshes/wedge.stl"
     assert meshes.index(file) == meshes.index(file) == 0
     assert len(meshes.unique) == 1

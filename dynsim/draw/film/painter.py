@@ -252,7 +252,7 @@ class Painter:
         self._position = record[POSITION].astype(np.float64)
         self._turn = record[ORIENTATION].astype(np.float64)
         meshes = Meshes()
-        meshes.of_robot(record)
+        meshes.of_robot(record.scene)
         shapes = body_shapes(robot.scene, robot.reach, meshes)
         self._fixed = [shown for shape in robot.scene.fixed if (shown := drawn_shape(shape, meshes)) is not None]
         self._meshes = simplified(meshes.unique, TRIANGLES)

@@ -182,7 +182,7 @@ def viewable(record: Record) -> bool:
 
 def _record(name: str, robot: DrawnRobot, blocks: Blocks, meshes: Meshes, low: Array, high: Array) -> dict[str, Any]:
     record, scene, rows = robot.record, robot.scene, robot.rows
-    meshes.of_robot(record)
+    meshes.of_robot(record.scene)
     position, turn = record[POSITION][rows], record[ORIENTATION][rows]
     shapes = body_shapes(scene, robot.reach, meshes)
     groups = wheel_groups(record, scene)
