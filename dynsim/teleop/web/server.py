@@ -2,17 +2,24 @@
 
 All users of the machine, and all web pages in a browser on it, can reach the loopback address. Therefore the path
 contains a token, ``Host`` must be this server (against DNS rebinding), and the ``Origin`` of a web socket must be the
-page of this server.
+page of this server. Connections without a valid request cost the drive little: only a few are accepted per second, and
+each has a short time for its request.
 """
 
 from __future__ import annotations
 
 import asyncio
+import errno
 import hmac
 import http
 import json
+import logging
+import os
 import secrets
+import socket as socketlib
 import threading
+import time
+from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -26,6 +33,7 @@ from websockets.http11 import Request, Response
 from dynsim.errors import DynsimError
 from dynsim.teleop.web.pilot import MAX_BYTES, Deadman, PilotCommand, Refused, parse
 
+LOG = logging.getLogger("dynsim.teleop")
 LOOPBACK = "127.0.0.1"
 FRAMES = 60.0
 """Maximum frame rate of a client [1/s]."""
@@ -34,6 +42,10 @@ MAX_MESSAGES = 400
 """Maximum number of messages of a client per second; a browser sends 50."""
 MAX_REFUSED = 20
 """Number of invalid messages after which the connection of a client is closed."""
+MAX_ACCEPTED, MAX_WAITING = 40, 1024
+"""Maximum number of connections that are accepted in each second, and of those that wait for it in the system."""
+REQUEST_TIME = 1.0
+"""Maximum time from the acceptance of a connection to its complete request [s]."""
 LAST_MESSAGE_TIME = 1.0
 """Maximum time for the last message to all clients [s]."""
 _HEADERS = {
@@ -45,6 +57,48 @@ _HEADERS = {
     "Cross-Origin-Opener-Policy": "same-origin",
     "Cross-Origin-Resource-Policy": "same-origin",
 }
+
+
+class _ListeningSocket(socketlib.socket):
+    """Listening socket that accepts at most ``MAX_ACCEPTED`` connections per second.
+
+    ``asyncio`` has no limit of its own, but it stops accepting for a second when ``accept`` reports that the system has
+    no more file descriptors.
+    """
+
+    def __init__(self, port: int) -> None:
+        super().__init__(socketlib.AF_INET, socketlib.SOCK_STREAM)
+        if os.name == "posix":
+            self.setsockopt(socketlib.SOL_SOCKET, socketlib.SO_REUSEADDR, 1)
+        self.bind((LOOPBACK, port))
+        self._accepted: deque[float] = deque(maxlen=MAX_ACCEPTED)
+        self._resumes = 0.0
+
+    def accept(self) -> tuple[socketlib.socket, Any]:
+        now = time.monotonic()
+        if now < self._resumes:  # within a pause asyncio would try again at once
+            raise BlockingIOError
+        try:
+            if len(self._accepted) == MAX_ACCEPTED and now - self._accepted[0] < 1.0:
+                raise OSError(errno.EMFILE, "too many connections per second")
+            connection = super().accept()
+        except OSError as error:
+            if error.errno in (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM):
+                self._resumes = now + 0.5
+            raise
+        self._accepted.append(now)
+        return connection
+
+
+class _FailureCount(logging.Handler):
+    """Counter of log lines about connections that failed, instead of a traceback for each."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.count = 0
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.count += 1
 
 
 @dataclass(eq=False)
@@ -76,25 +130,33 @@ class Server:
         Called when the pilot ends the drive.
     """
 
-    deadman: Deadman
-    hello: Mapping[str, Any]
-    axes: int
-    modes: tuple[int, ...]
-    page: Callable[[str], str]
-    end: Callable[[], None]
-    token: str = field(default_factory=lambda: secrets.token_urlsafe(24))
-    port: int = 0
-    failure: BaseException | None = None
-    had_clients: bool = False
-    _clients: dict[ServerConnection, _Client] = field(default_factory=dict)
-    _pilot: _Client | None = None
-    _frame: str = ""
-    _loop: asyncio.AbstractEventLoop | None = None
-    _thread: threading.Thread | None = None
-    _ready: threading.Event = field(default_factory=threading.Event)
-    _quit: asyncio.Event | None = None
-    _why: str = ""
-    _page: bytes = b""
+    def __init__(
+        self,
+        deadman: Deadman,
+        hello: Mapping[str, Any],
+        axes: int,
+        modes: tuple[int, ...],
+        page: Callable[[str], str],
+        end: Callable[[], None],
+    ) -> None:
+        self._deadman, self._hello, self._axes, self._modes, self._end = deadman, hello, axes, modes, end
+        self._make_page = page
+        self.token = secrets.token_urlsafe(24)
+        self._clients: dict[ServerConnection, _Client] = {}
+        self._pilot: _Client | None = None
+        self._frame = ""
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._thread: threading.Thread | None = None
+        self._ready = threading.Event()
+        self._quit: asyncio.Event | None = None
+        self._why = ""
+        self.failure: BaseException | None = None
+        self.port = 0
+        self._page = b""
+        self.had_clients = False
+        self._failures = _FailureCount()
+        self._log = logging.Logger("dynsim.teleop.connections", logging.ERROR)
+        self._log.addHandler(self._failures)
 
     @property
     def address(self) -> str:
@@ -133,6 +195,9 @@ class Server:
             self._loop.call_soon_threadsafe(self._quit.set)
         if self._thread is not None:
             self._thread.join()
+        if count := self._failures.count:
+            self._failures.count = 0
+            LOG.warning("%d connections to the drive's port failed, or came too fast", count)
 
     def show(self, frame: Mapping[str, Any]) -> None:
         """Send a new frame to all clients; thread-safe. A busy client receives the newest frame only."""
@@ -154,10 +219,13 @@ class Server:
 
     async def _serve(self, port: int) -> None:
         self._loop, self._quit = asyncio.get_running_loop(), asyncio.Event()
+        self._loop.set_exception_handler(lambda loop, context: self._log.error(context["message"]))
         async with serve(
             self._serve_client,
-            LOOPBACK,
-            port,
+            sock=_ListeningSocket(port),
+            backlog=MAX_WAITING,
+            open_timeout=REQUEST_TIME,
+            logger=self._log,
             process_request=self._guard,
             max_size=MAX_BYTES,
             max_queue=8,
