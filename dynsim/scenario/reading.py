@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 import itertools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,8 +26,37 @@ from dynsim.system.shipped import shipped_scenario, shipped_scenarios
 
 # Keys of a file that are not part of a single variant.
 TOP = ("variants",)
-# Maximum magnitude of a number in a scenario, in any unit.
-SIZE_MAX = 1e30
+# Smallest and largest magnitude of a number by the end of its key, which is its unit; the first match counts.
+MAGNITUDES = {
+    "noise_deg": (1e-12, 360.0),
+    "noise_rad": (1e-12, 6.3),
+    "noise_m": (1e-12, 10.0),
+    "resolution_deg": (1e-12, 360.0),
+    "resolution_m": (1e-12, 10.0),
+    "delay_s": (1e-12, 60.0),
+    "_kg_m2": (1e-18, 1e12),
+    "_kg": (1e-12, 1e9),
+    "_N_per_m": (1e-9, 1e15),
+    "_N_m_per_rad": (1e-9, 1e15),
+    "_per_rad": (1e-12, 1e12),
+    "_per_m": (1e-12, 1e12),
+    "_per_s": (1e-12, 1e9),
+    "_per_A": (1e-12, 1e9),
+    "_rad_s2": (1e-12, 1e9),
+    "_m_s2": (1e-12, 1e9),
+    "_s": (1e-15, 1e9),
+    "_N_m": (1e-15, 1e9),
+    "_m": (1e-15, 1e6),
+    "_N": (1e-15, 1e9),
+    "_deg": (1e-15, 1e6),
+    "_rad": (1e-15, 1e5),
+    "_V": (1e-12, 1e9),
+    "_A": (1e-12, 1e9),
+    "_ohm": (1e-12, 1e12),
+    "_H": (1e-15, 1e6),
+    "_hz": (1e-9, 1e9),
+    "": (1e-30, 1e15),
+}
 # Maximum number of other variants that are searched for unknown keys after an error.
 VARIANTS_SEARCHED = 100
 
@@ -334,15 +363,27 @@ def _make_absolute(data: Any, folder: Path) -> None:
 
 
 def _check_sizes(value: Any, keys: tuple[int | str, ...], origin: Origin) -> None:
-    """Reject numbers whose powers and products could overflow a float; other checks reject NaN and infinity."""
+    """Reject numbers that are no physical quantities; other checks reject NaN and infinity."""
     if isinstance(value, dict | list):
         for key, item in value.items() if isinstance(value, dict) else enumerate(value):
             _check_sizes(item, (*keys, key), origin)
-    elif isinstance(value, int | float) and (SIZE_MAX < abs(value) < np.inf or 0 < abs(value) < 1.0 / SIZE_MAX):
-        raise ScenarioError(
-            f"{origin.location(keys)}: {dotted(keys)} = {value_text(value)}: the magnitude must be between "
-            f"{1.0 / SIZE_MAX:g} and {SIZE_MAX:g}, or zero"
-        )
+    elif isinstance(value, int | float) and not isinstance(value, bool) and value != 0 and abs(value) < np.inf:
+        smallest, largest = magnitudes(keys)
+        if not smallest <= abs(value) <= largest:
+            raise ScenarioError(
+                f"{origin.location(keys)}: {dotted(keys)} = {value_text(value)}: the magnitude must be between "
+                f"{smallest:g} and {largest:g}, or zero"
+            )
+
+
+def magnitudes(keys: Sequence[int | str]) -> tuple[float, float]:
+    """Return the smallest and the largest magnitude of a number under these keys, from the unit in the last name."""
+    # Names of joints and bodies follow the key with the unit, and indices of lists.
+    for key in reversed(keys):
+        for unit, limits in MAGNITUDES.items():
+            if unit and isinstance(key, str) and key.endswith(unit):
+                return limits
+    return MAGNITUDES[""]
 
 
 def to_yaml(resolved: Mapping[str, Any]) -> str:
