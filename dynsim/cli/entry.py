@@ -100,7 +100,7 @@ def _plain_warnings() -> Iterator[None]:
     def show(message: Warning | str, category: type[Warning], *location: Any, **options: Any) -> None:
         if issubclass(category, UserWarning):
             errors.print(f"[yellow]warning:[/] {escaped(str(message))}")
-        else:
+        elif not issubclass(category, RuntimeWarning):  # of numpy; results that are not finite have errors of their own
             shown(message, category, *location, **options)
 
     warnings.showwarning = show

@@ -5,11 +5,10 @@ plan.yaml is a runnable scenario. :mod:`dynsim.planner.pictures` draws the figur
 
 from __future__ import annotations
 
-import csv
-import io
 from pathlib import Path
 
 from dynsim.planner.answer import BracePlan
+from dynsim.record.csv_rows import csv_table
 from dynsim.scenario import to_yaml
 from dynsim.system.files import check_writable, replacing, write_json
 
@@ -31,8 +30,9 @@ def save_plan(plan: BracePlan, folder: Path, figures: bool = True, kind: str = "
     drawn = [folder / "view.html", *(folder / "figures").glob("plan_*")]
     write_json(folder / "plan.json", plan.json)
     write_json(folder / "plan_table.json", plan.table)
+    columns = list(dict.fromkeys(key for row in plan.table for key in row))
     with replacing(folder / "plan_table.csv") as stream:
-        stream.write(_csv(plan).encode())
+        stream.write(csv_table(columns, plan.table).encode())
     for earlier in (folder / "plan.yaml", *drawn) if plan.best is None else drawn:
         earlier.unlink(missing_ok=True)
     if plan.best is None:
@@ -43,13 +43,3 @@ def save_plan(plan: BracePlan, folder: Path, figures: bool = True, kind: str = "
         from dynsim.planner.pictures import draw_plan
 
         draw_plan(plan, folder, kind)
-
-
-def _csv(plan: BracePlan) -> str:
-    """Return the table as CSV with the columns of all rows."""
-    columns = list(dict.fromkeys(key for row in plan.table for key in row))
-    text = io.StringIO()
-    writer = csv.DictWriter(text, columns, restval="", lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(plan.table)
-    return text.getvalue()

@@ -1,11 +1,14 @@
-"""Strict reading of numeric tables and grids from CSV files; errors name file, line and reason."""
+"""CSV files: strict reading of numeric tables and grids (errors name file, line and reason), and writing of tables."""
 
 from __future__ import annotations
 
+import csv
+import io
 import math
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from dynsim.errors import DynsimError
 from dynsim.system.inputs import read_text
@@ -109,3 +112,19 @@ def _row(line: str, columns: Sequence[str], location: str) -> list[float]:
 def _shown(line: str) -> str:
     """Quote a line of the file for a message, without control characters and shortened to 80 characters."""
     return repr(line if len(line) <= 80 else line[:79] + "…")
+
+
+def csv_table(names: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> str:
+    """Return rows as CSV text, with all digits and empty fields for missing values."""
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(csv_cell(name) for name in names)
+    writer.writerows([csv_cell(row.get(name)) for name in names] for row in rows)
+    return stream.getvalue()
+
+
+def csv_cell(value: Any) -> Any:
+    """Return a cell of a table; a text that a spreadsheet would compute as a formula gets an apostrophe in front."""
+    if isinstance(value, str) and value.startswith(("=", "+", "-", "@", "\t", "\r")) and not _NUMBER.fullmatch(value):
+        return f"'{value}"
+    return value

@@ -14,6 +14,7 @@ from typing import Literal, TextIO
 import numpy as np
 
 from dynsim.errors import RecordError
+from dynsim.record.csv_rows import csv_cell
 from dynsim.record.quaternion import Array
 from dynsim.record.record import Record
 from dynsim.system.files import replacing
@@ -131,7 +132,7 @@ def _write_csv(record: Record, file: TextIO, joints: list[str], time: Array, q: 
     units = [[record.units[pair[k]] for pair in pairs for _ in _in_both(record, *pair)] for k in (0, 1)]
     headings = [f"{joint} [{unit}]" for column in units for joint, unit in zip(joints, column, strict=True)]
     rows = csv.writer(file)
-    rows.writerow(["time [s]", *headings])
+    rows.writerow(["time [s]", *map(csv_cell, headings)])
     rows.writerows([f"{value:.9g}" for value in (t, *qs, *vs)] for t, qs, vs in zip(time, q, v, strict=True))
 
 

@@ -10,9 +10,10 @@ from typing import Any, Protocol
 from dynsim.engine import SIMULATION, simulate
 from dynsim.errors import ScenarioError, SimulationInterrupted, SimulationStopped, brief
 from dynsim.record import Record
+from dynsim.record.csv_rows import csv_table
 from dynsim.scenario import Scenario, load_scenario, variant_names
 from dynsim.studies.processes import WorkerInterrupted, WorkerLost, run_in_processes
-from dynsim.studies.sweep import csv_table, flat
+from dynsim.studies.sweep import flat
 from dynsim.system.files import json_text, replace_together
 
 

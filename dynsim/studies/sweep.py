@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -17,6 +15,7 @@ import numpy as np
 from dynsim._version import __version__
 from dynsim.engine.recording import commit, save_run
 from dynsim.errors import RecordError, ScenarioError, SimulationInterrupted, brief
+from dynsim.record.csv_rows import csv_table
 from dynsim.record.sensitivity import sensitivities, spread
 from dynsim.studies.batch import BatchWork, Keep, run_all
 from dynsim.studies.cluster import ClusterError
@@ -57,15 +56,6 @@ def numbers(summary: dict[str, Any]) -> dict[str, Any]:
     for contact in summary.get("contacts", ()):
         values |= {f"{contact['name']}.{key}": value for key, value in contact.items()}
     return {key: value for key, value in values.items() if is_finite(value) and key not in _EXCLUDED}
-
-
-def csv_table(names: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> str:
-    """Return rows as CSV text, with all digits and empty fields for missing values."""
-    stream = io.StringIO()
-    writer = csv.DictWriter(stream, names, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return stream.getvalue()
 
 
 # The journal of a sweep has one line per completed run; an interrupted sweep is resumed from it.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import tomllib
@@ -133,3 +134,12 @@ def test_pictures_read_no_keys_of_scenarios() -> None:
     package = Path(dynsim.__file__).parent
     reading = [path for path in (package / "draw").rglob("*.py") if "provenance" in path.read_text(encoding="utf-8")]
     assert reading == []
+
+
+def test_wrong_settings_of_numba_are_one_error() -> None:
+    done = subprocess.run(
+        [sys.executable, "-P", "-m", "dynsim", "check", "single_pendulum"],
+        env=os.environ | {"NUMBA_NUM_THREADS": "0"}, capture_output=True, text=True, timeout=120, check=False,
+    )  # fmt: skip
+    assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
+    assert "NUMBA_" in done.stderr
