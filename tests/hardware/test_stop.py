@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
+from collections.abc import Callable
+from contextlib import nullcontext
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-from support.messages import check_message
+from support.messages import check_message, raises
 
 from dynsim.errors import SimulationStopped
 from dynsim.hardware.bus.packet import Instruction, Packet
-from dynsim.hardware.replay.output import ReplayProgress, ReplayState, StopRequest, stop_on_signals
+from dynsim.hardware.errors import ReplayAborted
+from dynsim.hardware.replay.output import UNARMED, ReplayProgress, ReplayState, StopRequest, stop_on_signals
 from dynsim.hardware.replay.rules import Cause
+from dynsim.hardware.replay.session import run_replay
+from dynsim.record import Record
+
+from .conftest import Run, check_goals_within_limits
 
 ON_THE_WAY = [
     ReplayState.CONNECT,
@@ -174,23 +184,67 @@ def test_handlers_are_given_back() -> None:
     assert signal.getsignal(signal.SIGINT) is before
 
 
-@pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])
-def test_an_exception_out_of_the_blue_still_stops_the_robot(rig, error) -> None:
+@pytest.mark.parametrize("error", [KeyboardInterrupt, SystemExit])
+def test_an_exception_out_of_the_blue_still_stops_the_robot(rig, tmp_path: Path, error: type[BaseException]) -> None:
     """Without the signal handlers a Ctrl-C lands in the middle of a read: the policy is carried out all the same."""
     run = rig.prepare(policy="off")
     read = run.replay.bus.port.readPort
 
     def read_port(length: int) -> bytes:
-        if run.replay.journal.state == ReplayState.REPLAY and run.clock.now() > 1.9 and run.replay.result.fault is None:
+        if run.clock.now() > 1.9 and not thrown:
+            thrown.append(run.clock.now())
             raise error("out of the blue")
         return read(length)
 
+    thrown: list[float] = []
     run.replay.bus.port.readPort = read_port
     with pytest.raises(error):
-        run.replay.run()
-    assert run.result.fault.cause == Cause.PROGRAM
-    assert run.result.end_state == "off"
+        run_replay(rig.motion(), rig.map, nullcontext((run.replay.bus, run.clock)), tmp_path, live=True, policy="off")
+    assert thrown
+    summary = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
+    assert (summary["faults"][0]["cause"], summary["end_state"]) == (Cause.PROGRAM.value, "off")
     assert not any(servo["torque_enable"] for servo in run.line.servos.registers.values())
+    assert len(Record.load(tmp_path / "measured.h5")) > 10
+
+
+def failing_port(run: Run, at: int) -> SimpleNamespace:
+    """Let the ``at``-th call of the port raise an error that nothing expects; the namespace counts the calls."""
+    port, calls = run.replay.bus.port, SimpleNamespace(count=0)
+
+    def wrapped(method: Callable[..., Any]) -> Callable[..., Any]:
+        def call_port(*arguments: Any) -> Any:
+            calls.count += 1
+            if calls.count == at:
+                raise ZeroDivisionError("out of the blue " * 20)
+            return method(*arguments)
+
+        return call_port
+
+    port.readPort, port.writePort = wrapped(port.readPort), wrapped(port.writePort)
+    return calls
+
+
+@pytest.mark.parametrize("share", [0.0, 0.02, 0.1, 0.3, 0.32, 0.34, 0.4, 0.6, 0.8, 0.9, 0.96, 0.98, 0.995])
+def test_an_error_at_any_exchange_is_a_fault_with_end_state_and_record(rig, tmp_path: Path, share: float) -> None:
+    whole = rig.prepare()
+    calls = failing_port(whole, 0)
+    whole.replay.run()
+    run = rig.prepare()
+    failing_port(run, 1 + int(share * (calls.count - 1)))
+    with raises(ReplayAborted, "ZeroDivisionError", "end state") as error:
+        run_replay(rig.motion(), rig.map, nullcontext((run.replay.bus, run.clock)), tmp_path, live=True)
+    assert len(str(error.value).splitlines()) == 1
+    result = error.value.result
+    assert result.fault.cause == Cause.PROGRAM
+    assert "Traceback" in (tmp_path / "replay.log").read_text(encoding="utf-8")
+    assert not Record.load(tmp_path / "measured.h5").complete
+    torque = [bool(servo["torque_enable"]) for servo in run.line.servos.registers.values()]
+    if result.fault_state in UNARMED:
+        assert (result.end_state, any(torque)) == ("not armed", False)
+    else:
+        assert result.end_state == ("holding" if all(torque) else "off")
+        assert [servo.torque for servo in result.servos] == torque
+    check_goals_within_limits(run)
 
 
 def test_a_simulated_robot_that_stops_is_a_fault_with_a_record(rig) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import struct
+import traceback
 from collections.abc import Callable, Collection, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass, field, replace
@@ -18,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dynsim.errors import SimulationStopped
+from dynsim.errors import SimulationStopped, brief
 from dynsim.hardware.bus.control_table import (
     HEALTH_BLOCK,
     MX_106,
@@ -652,10 +653,10 @@ class Replay:
         self._ending = Ending(self.loop, self.result, self.policy or servo_map.safety.policy)
 
     def run(self) -> ReplayResult:
-        """Execute the replay to its end or to a fault; problems of bus and outputs are part of the result.
+        """Execute the replay to its end or to a fault; all errors are part of the result.
 
-        Other exceptions (for example a KeyboardInterrupt without :class:`StopRequest`) are raised again after the fault
-        policy was applied.
+        A request to exit (for example a KeyboardInterrupt without :class:`StopRequest`) is raised again after the fault
+        policy was applied and the result is complete.
         """
         try:
             self._verify()
@@ -678,9 +679,12 @@ class Replay:
             self._fault(Fault(Cause.SIMULATION, f"the simulated robot of the virtual servos (--plant) {error}"))
         except BaseException as error:
             # Never leave a robot with its torque on without applying the fault policy.
-            self._fault(Fault(Cause.PROGRAM, repr(error)))
-            self._finish()
-            raise
+            self._fault(Fault(Cause.PROGRAM, brief(error)))
+            for line in traceback.format_exception(error):
+                self.journal.add_line(line.rstrip())
+            if not isinstance(error, Exception):
+                self._finish()
+                raise
         self._finish()
         return self.result
 

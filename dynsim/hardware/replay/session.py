@@ -82,12 +82,17 @@ def run_replay(
             replay = Replay(motion, servo_map, bus, clock, live=live, dump_folder=folder, **options)
             background = _open_outputs(replay, folder)
             try:
-                result = replay.run()
+                if moved:
+                    replay.journal.add_line(f"files of an earlier replay were moved to {moved}")
+                replay.run()
             finally:
-                failures |= background.close()
-            failures |= replay.journal.failures
-    except Exception as error:
+                result = replay.result
+                failures |= background.close() | replay.journal.failures
+    except BaseException as error:
         if result is None:
+            raise
+        if not isinstance(error, Exception):
+            _save(result, folder, failures)
             raise
         # The end state of the result is valid; only closing the port has failed.
         failures["port"] = error

@@ -74,6 +74,14 @@ class WrongRegister(_Timed):
     id: int
     value: Annotated[int, Field(ge=0)]
 
+    @model_validator(mode="after")
+    def _fits(self) -> WrongRegister:
+        """Reject a value that is too large for the register."""
+        largest = 2**16 - 1 if self.kind == "wrong_model" else 2**8 - 1
+        if self.value > largest:
+            raise error_at("value", f"the register holds at most {largest}")
+        return self
+
 
 class AngleFault(_Timed):
     """Backlash of the shaft, or a jump of the measured position, by ``angle`` [rad]."""
