@@ -49,6 +49,16 @@ def test_a_misspelt_kind_is_told_as_such(tmp_path: Path) -> None:
         load_fault_script(path)
 
 
+@pytest.mark.parametrize(("kind", "largest"), [("wrong_mode", 255), ("wrong_firmware", 255), ("wrong_model", 65535)])
+def test_a_value_that_its_register_cannot_hold_is_refused(kind: str, largest: int, tmp_path: Path) -> None:
+    path = tmp_path / "faults.yaml"
+    path.write_text(f"faults:\n  - {{kind: {kind}, id: 2, value: {largest}}}\n", encoding="utf-8")
+    load_fault_script(path)
+    path.write_text(f"faults:\n  - {{kind: {kind}, id: 2, value: {largest + 1}}}\n", encoding="utf-8")
+    with raises(ServoMapError, f"{path}:2: faults.0.value = {largest + 1}", str(largest)):
+        load_fault_script(path)
+
+
 @pytest.mark.parametrize("command", ["virtual", "replay"])
 def test_the_commands_refuse_it_before_anything_starts(script: Path, map_file: Path, command: str) -> None:
     from .conftest import swing
