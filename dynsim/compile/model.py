@@ -22,10 +22,12 @@ from dynsim.errors import ModelError, brief
 from dynsim.model.description import Array, Contact, Robot
 from dynsim.model.surfaces import Surface
 from dynsim.record import record
+from dynsim.system.arguments import names_wrong_types
 
 _FLOAT64 = np.dtype(np.float64)
 
 
+@names_wrong_types
 class Model:
     """Dynamics of a :class:`~dynsim.model.description.Robot`.
 

@@ -18,6 +18,7 @@ from dynsim.record import Record
 from dynsim.record.scene import Scene
 from dynsim.scenario import Scenario, require_scenario
 from dynsim.system import interruption
+from dynsim.system.arguments import names_wrong_types
 from dynsim.system.memo import remembering
 
 # No log output unless the caller configures it. Here, not in dynsim/__init__.py: every module that logs imports this.
@@ -80,6 +81,7 @@ class Start:
     scene: Scene | None = None
 
 
+@names_wrong_types
 def simulate(scenario: Scenario, progress: Progress | None = None, *, pictured: bool = True) -> Record:
     """Simulate a scenario and return its record.
 
@@ -141,6 +143,7 @@ def note_warnings(scenario: Scenario, record: Record | None) -> None:
         log.warning("%s: %s", scenario.title, warning)
 
 
+@names_wrong_types
 def check(scenario: Scenario, started: Callable[[Start], None] | None = None) -> Start:
     """Validate a scenario up to the first step and return its start positions and contact gaps.
 

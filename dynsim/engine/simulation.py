@@ -63,6 +63,7 @@ from dynsim.scenario.build import START_TOLERANCE, check_start
 from dynsim.scenario.combinations import LINEARIZATION, WATCHED_EVENTS
 from dynsim.scenario.effect import without_effect
 from dynsim.system import interruption
+from dynsim.system.arguments import names_wrong_types
 from dynsim.system.memo import Memo, recall, remembering
 
 if TYPE_CHECKING:
@@ -92,6 +93,7 @@ _SAVED = (
 _TABLES = {f"run.{field}": field for field in ("tick", "tick_table", "event", "event_table")}
 
 
+@names_wrong_types
 class Simulation:
     """Step a scenario interactively: advance, apply forces, change references, save and restore.
 
@@ -655,7 +657,7 @@ class Simulation:
         Raises
         ------
         ModelError
-            If a value is not a finite number.
+            If a value is not a finite number, or the shapes do not match.
 
         Examples
         --------
@@ -666,6 +668,10 @@ class Simulation:
         >>> state = simulation.advance(0.5)
         """
         values = _finite("reference", lines)
+        if np.asarray(motors).dtype.kind not in "iu" or values.shape != (*np.shape(motors), 2):
+            raise ModelError(
+                f"motors = {brief(motors)}: must be indices of motors, with one row (position, rate) each in lines"
+            )
         if (balance := self._prepared.balance) is not None:
             values[:, 0] += balance.shift[motors]
         self._follow_lines(motors, values)

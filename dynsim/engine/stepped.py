@@ -10,10 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.engine.prepare import Prepared
+from dynsim.errors import RecordError, brief
 from dynsim.integrators import events
 from dynsim.integrators import run as ki
 from dynsim.integrators.contacts import events as contact_events
 from dynsim.record import Record
+from dynsim.system.arguments import names_wrong_types
 
 Array = NDArray[np.float64]
 
@@ -61,6 +63,7 @@ def event_name(prepared: Prepared, number: int) -> tuple[str, str] | None:
     return CONTACT_EVENTS[kind], (prepared.stops if first == ki.STOP_LOG else prepared.dry)[k].joint
 
 
+@names_wrong_types
 @dataclass(frozen=True)
 class State:
     """State of a simulation.
@@ -122,6 +125,8 @@ class State:
         ------
         MissingEntry
             If the record has no positions, rates or currents.
+        RecordError
+            If the record has no such sample.
 
         Examples
         --------
@@ -131,6 +136,8 @@ class State:
         0.0
         """
         names = ("q", "v", "current")
+        if not -len(record.time) <= sample < len(record.time):
+            raise RecordError(f"sample = {brief(sample)}: the record has {len(record.time)} samples")
         return cls(float(record.time[sample]), *(np.array(record[name][sample], dtype=np.float64) for name in names))
 
 

@@ -21,6 +21,7 @@ from dynsim.planner.verify import Corner, Tolerances, Verdict, Verifier
 from dynsim.record import Record
 from dynsim.scenario import Scenario, require_scenario
 from dynsim.scenario.schema import Payload
+from dynsim.system.arguments import names_wrong_types
 
 # Relative difference of the heats below which two rounds agree.
 AGREE = 0.01
@@ -386,6 +387,7 @@ def _number(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
 
 
+@names_wrong_types
 def plan_braces(
     scenario: Scenario,
     *,

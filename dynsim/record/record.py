@@ -22,6 +22,7 @@ from dynsim.record import export, reader
 from dynsim.record.content import TIME, Content, Event, Signal, check_name, check_signal, check_time
 from dynsim.record.quaternion import Array
 from dynsim.record.scene import Scene
+from dynsim.system.arguments import names_wrong_types
 from dynsim.system.files import replacing
 
 if TYPE_CHECKING:
@@ -65,6 +66,7 @@ class Entries(dict[str, Any]):
         raise MissingEntry(f"no {self._kind} {brief(key)}; this record has: {', '.join(self) or 'none'}")
 
 
+@names_wrong_types
 class Record(Content):
     """Results of one run: signals with units, events, scene and provenance.
 

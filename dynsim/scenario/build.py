@@ -23,6 +23,7 @@ from dynsim.model.description import WORLD, Array, Contact, Foot, Inertia, Load,
 from dynsim.model.surfaces import Surface
 from dynsim.scenario.candidates import candidates
 from dynsim.scenario.schema import ContactPoint, Contacts, LinkSensorConfig, Payload, Scenario
+from dynsim.system.arguments import names_wrong_types
 from dynsim.system.memo import recall
 
 if TYPE_CHECKING:
@@ -213,6 +214,7 @@ def _first_references(scenario: Scenario, built: Robot) -> Array | None:
     return q
 
 
+@names_wrong_types
 def build_model(scenario: Scenario) -> Model:
     """Build the rigid-body model of a scenario's plant.
 

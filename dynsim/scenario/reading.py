@@ -20,6 +20,7 @@ from pydantic import ValidationError
 from dynsim.config.problems import INDEX, Origin, dotted, explain, key_text, suggest, unknown_keys, value_text
 from dynsim.errors import ScenarioError, brief
 from dynsim.scenario.schema import Scenario, ScenarioConfig
+from dynsim.system.arguments import names_wrong_types
 from dynsim.system.files import check_complete
 from dynsim.system.inputs import DEPTH_LIMIT, YamlMapping, is_file, parse_yaml, read_text
 from dynsim.system.shipped import shipped_scenario, shipped_scenarios
@@ -93,6 +94,7 @@ def variant_names(path: str | Path) -> list[str]:
     return read_scenario(path).variants
 
 
+@names_wrong_types
 def load_scenario(path: str | Path, variant: str | None = None, overrides: Mapping[str, Any] | None = None) -> Scenario:
     """Load and validate one variant of a scenario.
 

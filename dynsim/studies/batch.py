@@ -13,6 +13,7 @@ from dynsim.scenario import Scenario, require_scenario
 from dynsim.studies.outcome import RunResult
 from dynsim.studies.processes import WorkerInterrupted, WorkerLost, run_in_processes
 from dynsim.system import interruption
+from dynsim.system.arguments import names_wrong_types
 from dynsim.system.memo import Memo, remembering
 
 Keep = Literal["none", "failed", "all"]
@@ -22,6 +23,7 @@ Task = TypeVar("Task")
 ATTEMPTS = 2
 
 
+@names_wrong_types
 def simulate_batch(
     scenarios: Iterable[Scenario],
     *,

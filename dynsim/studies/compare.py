@@ -14,6 +14,7 @@ from dynsim.record.csv_rows import csv_table
 from dynsim.scenario import Scenario, load_scenario, variant_names
 from dynsim.studies.processes import WorkerInterrupted, WorkerLost, run_in_processes
 from dynsim.studies.sweep import flat
+from dynsim.system.arguments import names_wrong_types
 from dynsim.system.files import json_text, replace_together
 
 
@@ -23,6 +24,7 @@ class VariantProgress(Protocol):
     def __call__(self, variant: str, time: float, stage: str = SIMULATION) -> None: ...
 
 
+@names_wrong_types
 def compare(
     path: str | Path,
     *,

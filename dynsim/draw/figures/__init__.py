@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 from dynsim.errors import DynsimError, RecordError, brief
 from dynsim.record import Record
+from dynsim.system.arguments import names_wrong_types
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -91,6 +92,7 @@ def draw_comparison(records: Mapping[str, Record], folder: Path, kind: str = "pn
         return list(modules.pop().draw_comparison(drawn, Path(folder), kind))
 
 
+@names_wrong_types
 def figure(records: Record | Mapping[str, Record], name: str, *, title: bool = True) -> Figure:
     """Draw one figure of a record, or overlay several, and return the matplotlib Figure.
 

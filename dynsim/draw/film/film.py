@@ -23,6 +23,7 @@ from dynsim.draw.geometry.projection import FROM, View, view_axes
 from dynsim.draw.geometry.robot import Array, azimuth, bounds, robots
 from dynsim.errors import RecordError
 from dynsim.record import TIME, Record
+from dynsim.system.arguments import names_wrong_types
 from dynsim.system.files import replacing
 from dynsim.system.terminal import plain
 
@@ -438,6 +439,7 @@ class Film:
             done(k)
 
 
+@names_wrong_types
 def write(
     records: Mapping[str, Record],
     path: str | os.PathLike[str],

@@ -48,6 +48,7 @@ from dynsim.record import TIME, Record, Signal
 from dynsim.record.measures import GRIPPER_STATES, hand_target
 from dynsim.record.poses import ORIENTATION, POSITION
 from dynsim.record.scene import Scene
+from dynsim.system.arguments import names_wrong_types
 from dynsim.system.files import replacing
 
 # Compression of time series: quantised, differenced, and split into byte planes.
@@ -390,6 +391,7 @@ def page(records: Mapping[str, Record], *, ghost: bool = False, scripts: Sequenc
     return _filled({"title": html.escape(title), "data": data, "connect": allowed}, scripts)
 
 
+@names_wrong_types
 def write(records: Mapping[str, Record], path: str | os.PathLike[str], *, ghost: bool = False) -> Path:
     """Write the page of one or several records to a file atomically.
 
@@ -518,6 +520,7 @@ class Inline:
         return Path(path)
 
 
+@names_wrong_types
 def show(*records: Record, ghost: bool = False, height: int = 640) -> Inline:
     """Show records in 3D, with plots over time; notebooks display the page inline.
 
