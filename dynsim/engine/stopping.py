@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import time as clock
 from collections.abc import Callable, Sequence
@@ -38,9 +39,8 @@ log = logging.getLogger(__name__)
 
 # Interval of the checks, and time to wait for compiled code that was asked to return [s].
 LOOK_S, PATIENCE_S = 0.1, 0.5
-# A run whose present step takes longer than this is stuck [s]. The longest step observed took 80 s, with 24 contacts
-# whose forces no method of the solver finds.
-STUCK_S = 600.0
+# Processor time without progress of the simulated time after which a run is stopped [s]; see LEAST_PROGRESS.
+STALLED_S = 50.0
 # Maximum number of time-stepping steps in the caller's thread: contacts may close within them.
 MOST_SHORT = 50
 # Time of one contact-solver iteration divided by the cube of the number of rows [s].
@@ -110,7 +110,7 @@ class OutOfTime(Exception):
 
 
 class WallWatch:
-    """Watches the wall-clock limit of a run and detects a step that does not end.
+    """Watches the wall-clock limit of a run, and detects a run that makes no progress.
 
     Parameters
     ----------
@@ -120,36 +120,40 @@ class WallWatch:
 
     def __init__(self, limit: float | None) -> None:
         self._limit, self._spent = limit, 0.0
-        self._looked = clock.monotonic()
-        self._seen, self._still = -1, 0.0
+        # Simulated time of the last progress, and processor time since [s].
+        self._reached, self._idle = -math.inf, 0.0
+        self.begin()
 
     @property
     def over(self) -> bool:
         """True if the limit is exceeded."""
         return self._limit is not None and self._spent > self._limit
 
+    @property
+    def stalled(self) -> bool:
+        """True if the simulated time has not advanced within STALLED_S of processor time."""
+        return self._idle > STALLED_S
+
     def begin(self) -> None:
         """Start a piece of work; time between pieces does not count."""
-        self._looked, self._seen, self._still = clock.monotonic(), -1, 0.0
+        self._looked, self._worked = clock.monotonic(), clock.process_time()
 
-    def spend(self) -> float:
-        """Add the time since the last check, and return it [s]."""
-        now = clock.monotonic()
-        passed, self._looked = now - self._looked, now
-        self._spent += passed
-        return passed
+    def spend(self, run: ki.Run) -> None:
+        """Add the time since the last check."""
+        spent, worked = self._looked, self._worked
+        self.begin()
+        self._spent += self._looked - spent
+        self._idle += self._worked - worked
+        if run.clock[ki.TIME] - self._reached > run.clock[ki.LEAST_PROGRESS]:
+            self._reached, self._idle = run.clock[ki.TIME], 0.0
 
     def look(self, run: ki.Run) -> None:
-        """Raise :class:`OutOfTime` if the limit is exceeded or a step does not end."""
-        passed = self.spend()
+        """Raise :class:`OutOfTime` if the limit is exceeded, or the run makes no progress."""
+        self.spend(run)
         if self.over:
             raise OutOfTime(ki.OUT_OF_TIME)
-        seen = int(run.count.sum()) + (0 if run.newton is None else int(run.newton.count.sum()))
-        # A suspended process has not checked either.
-        self._still = self._still + min(passed, 10.0 * LOOK_S) if seen == self._seen else 0.0
-        self._seen = seen
-        if self._still > STUCK_S:
-            raise OutOfTime(ki.STUCK)
+        if self.stalled:
+            raise OutOfTime(ki.NO_PROGRESS)
 
 
 def load(prepared: Prepared) -> None:
@@ -232,18 +236,20 @@ def advance(
     if due:
         remainder = partial(kernel, prepared.system, prepared.workspace, run, EVERY_STEP)
         ended, raised = run_in_thread(remainder, ask, both)
-    watch.spend()
+    watch.spend(run)
     if not ended:
         prepared = copied(prepared)
     count = prepared.run.count
     count[ki.ASKED] = 0
     if not ended or count[ki.STATUS] == ki.RUNNING:
-        if isinstance(raised, OutOfTime):
-            count[ki.STATUS] = raised.status
-        elif not ended:
+        if not ended and not (isinstance(raised, OutOfTime) and raised.status == ki.OUT_OF_TIME):
             count[ki.STATUS] = ki.STUCK
+        elif isinstance(raised, OutOfTime):
+            count[ki.STATUS] = raised.status
         elif watch.over:
             count[ki.STATUS] = ki.OUT_OF_TIME
+        elif watch.stalled:
+            count[ki.STATUS] = ki.NO_PROGRESS
     return prepared, None if isinstance(raised, OutOfTime) else raised
 
 
@@ -466,7 +472,7 @@ def _reason(scenario: Scenario, prepared: Prepared) -> str:
         other = STEP_OVER if _can_step_over(prepared) else "another integrator.method"
         because = short_step_reason(prepared) or f"use {other}, or longer steps if they are fixed"
         return (
-            f"{where}: no progress, the last {ki.MOST_TRIALS} steps advanced by less than "
+            f"{where}: no progress, the last {ki.MOST_TRIALS} steps, or the last minute, advanced by less than "
             f"{run.clock[ki.LEAST_PROGRESS]:.1e} s, last step {run.clock[ki.STEP]:.1e} s"
             f"{_modes_text(prepared)}; {because}"
         )

@@ -360,7 +360,16 @@ class Stands:
             return
         self.advance(system, ws, run, 20)
         self.inside.set()
-        self.released.wait(60.0)
+        # Watches count processor time.
+        while not self.released.wait(1e-3):
+            compute(0.01)
+
+
+def compute(seconds: float) -> None:
+    """Use processor time of this thread [s]."""
+    end = time.thread_time() + seconds
+    while time.thread_time() < end:
+        pass
 
 
 def interrupt_when(event: threading.Event) -> None:
@@ -396,7 +405,7 @@ def test_ctrl_c_ends_a_run_whose_step_does_not(monkeypatch: pytest.MonkeyPatch, 
 
 
 def test_a_step_that_does_not_end_is_stuck(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(stopping, "STUCK_S", 0.3)
+    monkeypatch.setattr(stopping, "STALLED_S", 0.3)
     stands = Stands(monkeypatch)
     try:
         with pytest.raises(SimulationStopped) as raised:
@@ -408,8 +417,8 @@ def test_a_step_that_does_not_end_is_stuck(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_steps_that_take_long_are_not_stuck(monkeypatch: pytest.MonkeyPatch):
-    """Each step of a run takes more than half of STUCK_S: the run continues, because it advances."""
-    monkeypatch.setattr(stopping, "STUCK_S", 0.4)
+    """Each step of a run takes more than half of STALLED_S: the run continues, because it advances."""
+    monkeypatch.setattr(stopping, "STALLED_S", 0.4)
     advance = driver.advance
 
     def slowly(system: Any, ws: Any, run: Any, limit: int) -> None:
@@ -417,12 +426,27 @@ def test_steps_that_take_long_are_not_stuck(monkeypatch: pytest.MonkeyPatch):
             advance(system, ws, run, limit)
             return
         for _ in range(5):
-            time.sleep(0.25)
+            compute(0.25)
             advance(system, ws, run, 1)
         advance(system, ws, run, limit)
 
     monkeypatch.setattr(driver, "advance", slowly)
     assert dynsim.simulate(floor()).complete
+
+
+def test_pieces_without_progress_add_up(monkeypatch: pytest.MonkeyPatch):
+    """A run of many short pieces, as of a sampled controller, is stopped too."""
+    monkeypatch.setattr(stopping, "STALLED_S", 0.3)
+    watch, run = stopping.WallWatch(None), SimpleNamespace(clock=np.zeros(32))
+    run.clock[ki.LEAST_PROGRESS] = 1e-6
+    for _ in range(8):
+        watch.begin()
+        compute(0.05)
+        watch.spend(run)
+    assert watch.stalled
+    run.clock[ki.TIME] = 2e-6
+    watch.spend(run)
+    assert not watch.stalled
 
 
 def test_a_simulation_goes_on_after_ctrl_c_as_if_nothing_had_been(monkeypatch: pytest.MonkeyPatch, ctrl_c: None):
