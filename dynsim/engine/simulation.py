@@ -1563,6 +1563,7 @@ def check(scenario: Scenario, started: Callable[[Start], None]) -> Start:
     started(start)
     prepared = prepare(scenario)
     control, model = prepared.control, prepared.model
+    start = replace(start, scene=drawn_scene(scenario, model.robot, prepared.contacts))
     if prepared.balance is not None:
         # Pressing compliant contacts moves joints.
         points, gaps = _touching(model, prepared.contacts)
@@ -1636,8 +1637,7 @@ def start_of(scenario: Scenario) -> Start:
         *_below(scenario, robot),
         *build.left_out_warnings(scenario, contacts),
     ]
-    scene = drawn_scene(scenario, robot, contacts)
-    return Start(hand, points, gaps, key, solved, *_margins(scenario, model, contacts), warnings, scene=scene)
+    return Start(hand, points, gaps, key, solved, *_margins(scenario, model, contacts), warnings)
 
 
 def _touching(model: Model, contacts: Sequence[Contact]) -> tuple[dict[str, Array], dict[str, float]]:

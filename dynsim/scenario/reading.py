@@ -27,36 +27,34 @@ from dynsim.system.shipped import shipped_scenario, shipped_scenarios
 
 # Keys of a file that are not part of a single variant.
 TOP = ("variants",)
-# Smallest and largest magnitude of a number by the end of its key, which is its unit; the first match counts.
+# Smallest magnitude of a number in a scenario, and the largest by the end of its key, which is its unit; the first match
+# counts.
+MAGNITUDE_MIN = 1e-30
 MAGNITUDES = {
-    "noise_deg": (1e-12, 360.0),
-    "noise_rad": (1e-12, 6.3),
-    "noise_m": (1e-12, 10.0),
-    "resolution_deg": (1e-12, 360.0),
-    "resolution_m": (1e-12, 10.0),
-    "delay_s": (1e-12, 60.0),
-    "_kg_m2": (1e-18, 1e12),
-    "_kg": (1e-12, 1e9),
-    "_N_per_m": (1e-9, 1e15),
-    "_N_m_per_rad": (1e-9, 1e15),
-    "_per_rad": (1e-12, 1e12),
-    "_per_m": (1e-12, 1e12),
-    "_per_s": (1e-12, 1e9),
-    "_per_A": (1e-12, 1e9),
-    "_rad_s2": (1e-12, 1e9),
-    "_m_s2": (1e-12, 1e9),
-    "_s": (1e-15, 1e9),
-    "_N_m": (1e-15, 1e9),
-    "_m": (1e-15, 1e6),
-    "_N": (1e-15, 1e9),
-    "_deg": (1e-15, 1e6),
-    "_rad": (1e-15, 1e5),
-    "_V": (1e-12, 1e9),
-    "_A": (1e-12, 1e9),
-    "_ohm": (1e-12, 1e12),
-    "_H": (1e-15, 1e6),
-    "_hz": (1e-9, 1e9),
-    "": (1e-30, 1e15),
+    "noise_deg": 360.0,
+    "noise_rad": 6.3,
+    "noise_m": 10.0,
+    "resolution_deg": 360.0,
+    "resolution_m": 10.0,
+    "delay_s": 60.0,
+    "_kg_m2": 1e12,
+    "_N_per_m": 1e15,
+    "_N_m_per_rad": 1e15,
+    "_per_rad": 1e9,
+    "_per_m": 1e12,
+    "_kg": 1e9,
+    "_N_m": 1e9,
+    "_m": 1e6,
+    "_deg": 1e6,
+    "_rad": 1e5,
+    "_H": 1e6,
+    "_N": 1e9,
+    "_s": 1e9,
+    "_s2": 1e9,
+    "_V": 1e9,
+    "_A": 1e9,
+    "_hz": 1e9,
+    "": 1e15,
 }
 # Maximum number of other variants that are searched for unknown keys after an error.
 VARIANTS_SEARCHED = 100
@@ -370,21 +368,21 @@ def _check_sizes(value: Any, keys: tuple[int | str, ...], origin: Origin) -> Non
         for key, item in value.items() if isinstance(value, dict) else enumerate(value):
             _check_sizes(item, (*keys, key), origin)
     elif isinstance(value, int | float) and not isinstance(value, bool) and value != 0 and abs(value) < np.inf:
-        smallest, largest = magnitudes(keys)
-        if not smallest <= abs(value) <= largest:
+        largest = largest_magnitude(keys)
+        if not MAGNITUDE_MIN <= abs(value) <= largest:
             raise ScenarioError(
                 f"{origin.location(keys)}: {dotted(keys)} = {value_text(value)}: the magnitude must be between "
-                f"{smallest:g} and {largest:g}, or zero"
+                f"{MAGNITUDE_MIN:g} and {largest:g}, or zero"
             )
 
 
-def magnitudes(keys: Sequence[int | str]) -> tuple[float, float]:
-    """Return the smallest and the largest magnitude of a number under these keys, from the unit in the last name."""
+def largest_magnitude(keys: Sequence[int | str]) -> float:
+    """Return the largest magnitude of a number under these keys, from the unit in the last name."""
     # Names of joints and bodies follow the key with the unit, and indices of lists.
     for key in reversed(keys):
-        for unit, limits in MAGNITUDES.items():
+        for unit, largest in MAGNITUDES.items():
             if unit and isinstance(key, str) and key.endswith(unit):
-                return limits
+                return largest
     return MAGNITUDES[""]
 
 

@@ -449,7 +449,10 @@ def test_an_endless_file_ends_with_one_error(monkeypatch: pytest.MonkeyPatch):
 def test_reading_ends_at_a_signal(number: signal.Signals, tmp_path: Path):
     """Also the child ends, which reads the endless file."""
     command = [sys.executable, "-P", "-m", "dynsim", "export", str(ENDLESS), "--format", "csv", "--out", "x.csv"]
-    process = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        command, cwd=tmp_path, stderr=subprocess.PIPE, text=True,
+        preexec_fn=lambda: signal.signal(number, signal.SIG_DFL),  # in the background SIGINT is ignored
+    )  # fmt: skip
 
     def children() -> list[int]:
         return [

@@ -403,8 +403,8 @@ def test_parse_override():
         ("duration_s=*a", ("--set duration_s", "*a", "&a")),
         ("duration_s=&a [*a]", ("--set duration_s", "*a", "&a")),
         ("duration_s=" + "9" * 5000, ("--set duration_s", "5000", "308")),
-        ("duration_s=" + "9" * 308, (re.compile(r"--set: duration_s = 9+…"), "1e-30", "1e+30")),
-        ("duration_s=1e-300", ("--set: duration_s = 1e-300", "1e-30", "1e+30")),
+        ("duration_s=" + "9" * 308, (re.compile(r"--set: duration_s = 9+…"), "1e-30", "1e+09")),
+        ("duration_s=1e-300", ("--set: duration_s = 1e-300", "1e-30", "1e+09")),
         ("duration_s=2024-99-99", ("--set: duration_s = '2024-99-99'",)),
         ("duration_s=._", ("--set: duration_s = '._'",)),
         ("duration_s='\"", ("--set duration_s", "YAML")),
@@ -435,7 +435,7 @@ def test_an_override_changes_nothing_but_what_it_names(tmp_path: Path):
 
 def test_numbers_that_no_result_can_be_computed_from_are_refused(monkeypatch: pytest.MonkeyPatch):
     for value in (1e31, 1e-31, -1e300):
-        with raises(ScenarioError, "plant.chain.0.com_m.2", "1e-30", "1e+30"):
+        with raises(ScenarioError, "plant.chain.0.com_m.2", "1e-30", "1e+06"):
             load_scenario("elbow_comparison", overrides={"plant.chain.0.com_m": [0, 0, value]})
 
     def overflow(*_: object) -> None:

@@ -198,7 +198,7 @@ def test_what_programs_leave_behind_changes_nothing(arm):
     """An answer takes programs of several sizes: again, in tables that are full of NaN."""
     for seed in range(40):
         _, motion, _, tables, first = prepared(arm, seed)
-        for table in (tables._arrays.inside, *tables._arrays.program):
+        for table in (tables.arrays.inside, *tables.arrays.program):
             if table.dtype == np.float64:
                 table[:] = np.nan
         again = tables.solve(*motion)
@@ -212,7 +212,7 @@ def test_passive_joints_as_equations_give_a_certificate_too(arm):
     proofs = 0
     for seed in range(30):
         model, (q, v, vdot), braces, tables, answer = prepared(arm, seed)
-        arrays, passive = tables._arrays, model.n - len(model.robot.motors)
+        arrays, passive = tables.arrays, model.n - len(model.robot.motors)
         if answer.feasible or not 0 < passive < arrays.first[-1]:
             continue
         scale = statics.brace_rows(model.arrays, tables._ws, arrays)
@@ -233,7 +233,7 @@ def test_a_brace_is_shortened_with_its_friction(arm):
         name, brace = next(iter(braces.items()))
         if not answer.feasible or brace.normal_force is not None or answer.normal_forces[name] <= brace.min_N + 1e-6:
             continue
-        arrays = tables._arrays
+        arrays = tables.arrays
         J = model.point_jacobian(brace.body, brace.point, motion[0])
         shortened = answer.torques + (1.0 - brace.min_N / answer.normal_forces[name]) * J.T @ answer.forces[name]
         room = 1e-8 * (1.0 + np.abs(shortened))

@@ -32,7 +32,6 @@ from dynsim.draw.figures.snake_view import (
 )
 from dynsim.draw.figures.style import VARIANT_COLOURS
 from dynsim.record import Record
-from dynsim.record.csv_rows import csv_cell
 from dynsim.snake.lifting import snake_geometry
 from dynsim.snake.published import (
     COORDINATES,
@@ -88,7 +87,7 @@ def write_tables(scenario: str, records: Mapping[str, Record], folder: Path) -> 
     written = []
     for name, rows in tables(scenario, records).items():
         stream = io.StringIO()
-        csv.writer(stream, lineterminator="\n").writerows([csv_cell(cell) for cell in row] for row in rows)
+        csv.writer(stream, lineterminator="\n").writerows(rows)
         written.append(write_text(folder / f"{name}.csv", stream.getvalue()))
     return written
 

@@ -130,32 +130,29 @@ class Server:
         Called when the pilot ends the drive.
     """
 
-    def __init__(
-        self,
-        deadman: Deadman,
-        hello: Mapping[str, Any],
-        axes: int,
-        modes: tuple[int, ...],
-        page: Callable[[str], str],
-        end: Callable[[], None],
-    ) -> None:
-        self._deadman, self._hello, self._axes, self._modes, self._end = deadman, hello, axes, modes, end
-        self._make_page = page
-        self.token = secrets.token_urlsafe(24)
-        self._clients: dict[ServerConnection, _Client] = {}
-        self._pilot: _Client | None = None
-        self._frame = ""
-        self._loop: asyncio.AbstractEventLoop | None = None
-        self._thread: threading.Thread | None = None
-        self._ready = threading.Event()
-        self._quit: asyncio.Event | None = None
-        self._why = ""
-        self.failure: BaseException | None = None
-        self.port = 0
-        self._page = b""
-        self.had_clients = False
-        self._failures = _FailureCount()
-        self._log = logging.Logger("dynsim.teleop.connections", logging.ERROR)
+    deadman: Deadman
+    hello: Mapping[str, Any]
+    axes: int
+    modes: tuple[int, ...]
+    page: Callable[[str], str]
+    end: Callable[[], None]
+    token: str = field(default_factory=lambda: secrets.token_urlsafe(24))
+    port: int = 0
+    failure: BaseException | None = None
+    had_clients: bool = False
+    _clients: dict[ServerConnection, _Client] = field(default_factory=dict)
+    _pilot: _Client | None = None
+    _frame: str = ""
+    _loop: asyncio.AbstractEventLoop | None = None
+    _thread: threading.Thread | None = None
+    _ready: threading.Event = field(default_factory=threading.Event)
+    _quit: asyncio.Event | None = None
+    _why: str = ""
+    _page: bytes = b""
+    _failures: _FailureCount = field(default_factory=_FailureCount)
+    _log: logging.Logger = field(default_factory=lambda: logging.Logger("connections of a drive", logging.ERROR))
+
+    def __post_init__(self) -> None:
         self._log.addHandler(self._failures)
 
     @property
