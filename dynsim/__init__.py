@@ -51,7 +51,8 @@ __all__ = [
     "view",
 ]
 
-# Loaded on first use: numba and pydantic take a second that `dynsim --help` need not wait for.
+# These modules are imported on first use: importing numba and pydantic takes a second and is not needed for
+# `dynsim --help`.
 _HOME = {
     "Brace": "dynsim.compile.bracing",
     "BracePlan": "dynsim.planner.answer",
@@ -71,7 +72,7 @@ _HOME = {
 }
 
 
-# Names that are modules.
+# Public names that refer to modules.
 _MODULES = {"film": "dynsim.draw.film", "view": "dynsim.draw.page"}
 
 

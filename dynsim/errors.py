@@ -1,4 +1,4 @@
-"""Exceptions of dynsim: one class per cause, each with the exit code of the command line."""
+"""Exceptions raised by dynsim: one class per cause, each with an exit code for the command line."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ class DynsimError(Exception):
 
 
 def brief(value: object) -> str:
-    """Return a value for an error message: on one line, at most 80 characters."""
+    """Return the ``repr`` of a value for an error message, on one line and shortened to 80 characters."""
     text = " ".join(repr(value).split())
     return text if len(text) <= 80 else f"{text[:77]}..."
 
 
 def first_few(names: Sequence[str], most: int = 4) -> str:
-    """Return the first ``most`` names as text, and the number of the remaining names."""
+    """Return the first ``most`` names, separated by commas, and how many more there are."""
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 class ScenarioError(DynsimError):
-    """A scenario cannot be read or is invalid; the message names file, line, key, value and fix."""
+    """A scenario cannot be read or is invalid; the message states the file, line, key, value and fix."""
 
 
 class PluginError(DynsimError):
@@ -52,7 +52,7 @@ class ModelError(DynsimError):
     Attributes
     ----------
     keys : tuple
-        Path of the faulty key in the scenario, to find its line; empty if no single key is at fault.
+        Path of the faulty key in the scenario, used to look up its line; empty if no single key is at fault.
     """
 
     def __init__(self, message: str, *, keys: tuple[int | str, ...] = ()) -> None:
@@ -61,19 +61,19 @@ class ModelError(DynsimError):
 
 
 class UnreachableReference(DynsimError):
-    """The joints cannot follow a reference path; the message contains time and distance.
+    """The joints cannot follow a reference path; the message states the time and the reason.
 
     Attributes
     ----------
     keys : tuple
-        Key of the path in the scenario, as in :class:`ModelError`.
+        Key of the reference path in the scenario, as in :class:`ModelError`.
     """
 
     keys: ClassVar[tuple[int | str, ...]] = ("controller", "hand", "path")
 
 
 class CheckRefused(DynsimError):
-    """A robot cannot or must not execute a motion; the message contains joint or body, time and margin."""
+    """A robot cannot or must not execute a motion; the message states the joint or body, the time and the margin."""
 
 
 class RecordError(DynsimError):
@@ -81,9 +81,9 @@ class RecordError(DynsimError):
 
 
 class MissingEntry(RecordError, KeyError):
-    """A record has no signal, or its summary no entry, with that name; the message lists the known names."""
+    """A record has no signal (or its summary has no entry) with the requested name; the message lists all names."""
 
-    # A KeyError shows its message in quotes.
+    # A KeyError would print its message in quotes.
     __str__ = Exception.__str__
 
 
@@ -97,7 +97,7 @@ class SimulationStopped(DynsimError):
     time : float
         Simulated time of the stop [s].
     state : dict[str, Any]
-        Last good state: quantities and their values.
+        Last valid state: the value of each quantity, by name.
     record : Record | None
         Results up to the stop, if any.
     """
@@ -114,7 +114,7 @@ class SimulationStopped(DynsimError):
         self.record: Any = None
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # By default exceptions are pickled by their arguments alone; state and record are added here.
+        # By default, an exception is pickled with its arguments only; add the state and the record.
         return _rebuild, (type(self), str(self), self.time, self.state, self.kind, self.record)
 
 

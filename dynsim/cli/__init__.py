@@ -7,10 +7,11 @@ import sys
 
 
 def main() -> None:
-    """Run ``dynsim``."""
-    # Before numpy is imported: matrices are small, and idle threads would take a tenth of the processor time.
+    """Run the command-line program ``dynsim``."""
+    # Set this before numpy is imported: matrices are small, and idle threads would use a tenth of the processor time.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    # Imported objects are never freed; default garbage collection, and one at exit, take a third of `dynsim check`.
+    # Imported objects are never freed; garbage collection with the default settings, including a collection at exit,
+    # would take a third of the run time of `dynsim check`.
     gc.set_threshold(200_000)
     atexit.register(gc.freeze)
     from dynsim.system import interruption

@@ -59,7 +59,7 @@ FiguresOption = Annotated[bool, typer.Option("--no-figures", help="Skip the figu
 
 
 def parsed_overrides(texts: list[str] | None) -> dict[str, Any]:
-    """Return the values of ``--set`` by key."""
+    """Return the values passed with ``--set``, by key."""
     from dynsim.scenario import SetOptions, parse_override
 
     return SetOptions(parse_override(text) for text in texts or ())
@@ -103,7 +103,7 @@ def _log_to_stderr() -> None:
     import logging
 
     class OnStderr(logging.StreamHandler[TextIO]):
-        """Handler for the current stderr of a terminal: a progress bar replaces stderr to print above itself."""
+        """Handler that writes to the current stderr, because a progress bar replaces stderr to print above itself."""
 
         def __init__(self) -> None:
             super().__init__(sys.stderr)

@@ -79,8 +79,9 @@ def run(
 ) -> None:
     """Simulate one scenario; write its record, summary, figures and a 3D page.
 
-    The integration method is chosen automatically (`integrator.method: auto`); the summary reports the method and the
-    reason. Exit codes: 0 done, 2 bad input, 3 the run stopped early (results up to then are saved).
+    The integration method is chosen automatically (`integrator.method: auto`); the summary reports the method and why
+    it was chosen. Exit codes: 0 if the run was completed, 2 if the input is invalid, 3 if the run stopped early
+    (results up to then are saved).
     """
     from dynsim.engine.recording import RUN_FILES, save_run
     from dynsim.scenario import load_scenario
@@ -97,7 +98,7 @@ def run(
     except SimulationStopped as stop:
         if stop.record is not None:
             save_run(stop.record, folder)
-            errors.print(f"results up to the stop are in {escaped(folder)}, marked incomplete")
+            errors.print(f"results up to the stop are in {escaped(folder)} and are marked incomplete")
         raise
     save_run(record, folder)
     warn_about_meshes([record.scene])
@@ -153,7 +154,7 @@ def compare(
             discard(folder, COMPARISON_FILES)
             save_run(stop.record, folder / name)
             where = escaped(folder / name)
-            errors.print(f"results of {escaped(name)} up to the stop are in {where}, marked incomplete")
+            errors.print(f"results of {escaped(name)} up to the stop are in {where} and are marked incomplete")
 
     failure: SimulationStopped | None = None
     try:
@@ -163,7 +164,7 @@ def compare(
         raise
     except SimulationStopped as stop:
         failure = stop
-    # In the order of the file, not of completion.
+    # Sort the records in the order of the variants in the file, not in the order in which they were completed.
     records = {s.variant: records[s.variant] for s in loaded if s.variant in records}
     if records:
         save_comparison(records, folder)
@@ -198,9 +199,9 @@ def check(
 ) -> None:
     """Validate scenarios without simulating them: keys, model, contacts at the start, reachable references.
 
-    Prints for each variant the start position of the hand and of each contact point (full precision, ready to copy into
-    a path or surface), the gap of each contact, the joints that `initial.on_surface` moved, and the tip margin of a
-    mobile base at rest.
+    For each variant, the command prints the start position of the hand and of each contact point (in full precision,
+    ready to be copied into a path or surface), the gap at each contact, the joints that `initial.on_surface` moved, and
+    the tip margin of a mobile base at rest.
     """
     from dynsim.engine import check as check_scenario
     from dynsim.engine.compilation import watched
@@ -221,7 +222,7 @@ def check(
             raise
         except DynsimError as error:
             failed = True
-            # The start positions help to find the error.
+            # Print the start positions, because they help the user to find the error.
             print_starts(console, starts)
             errors.print(f"[red]error:[/] {escaped(str(error))}")
         else:
@@ -248,7 +249,7 @@ def plot(
     format_: FormatOption = FigureFormat.png,
     trust: TrustOption = False,
 ) -> None:
-    """Draw the figures of one record, or overlay several."""
+    """Draw the figures of one record, or of several records and their overlay."""
     files = record_files(records)
     named = labelled(files, trust=trust)
     for path, (label, record) in zip(files, named.items(), strict=True):
@@ -277,7 +278,7 @@ def schema() -> None:
 
 
 app.command(epilog="Example: dynsim sweep elbow_comparison --variants all --grid contacts.friction=0:1:5")(sweep)
-# Modules for serial ports and servos are loaded only when these commands run.
+# The commands `hw …` load modules for serial ports and servos only when they run.
 hw.command("drive", epilog=EXAMPLE)(hw_drive)
 app.add_typer(hw, name="hw")
 app.command(

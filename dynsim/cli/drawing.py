@@ -1,4 +1,4 @@
-"""Figures and pages after runs, drawn in this process or in one process per core, and the commands view and animate."""
+"""Drawing of figures and 3D pages after runs, in this process or in parallel, and the commands view and animate."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Figures:
-    """Task to draw figures of records to a folder: one set per record, or overlays of all records (``together``)."""
+    """Task that draws figures of records: one set per record, or overlays of all records if ``together`` is True."""
 
     records: dict[str, Record]
     folder: Path
@@ -47,7 +47,7 @@ class Figures:
 
 @dataclass(frozen=True)
 class Page:
-    """Task to write the page that shows records in 3D."""
+    """Task that writes the page that shows records in 3D."""
 
     records: dict[str, Record]
     folder: Path
@@ -63,7 +63,7 @@ class Page:
 
 @contextmanager
 def interruptible_drawing(folder: Path) -> Iterator[None]:
-    """Handle signals again in the block; on a signal, print where the results are."""
+    """Handle signals again within the block; if one arrives, print where the results are."""
     interruption.heed()
     try:
         interruption.check()
@@ -74,7 +74,7 @@ def interruptible_drawing(folder: Path) -> Iterator[None]:
 
 
 def draw(figures: Figures, quiet: bool) -> None:
-    """Draw figures in this process and show a status."""
+    """Draw figures in this process, and show a status line meanwhile."""
     with drawing(figures.folder, quiet):
         figures.draw()
 
@@ -85,7 +85,7 @@ def draw_all(wanted: Sequence[Figures], page: Page, quiet: bool) -> Path | None:
     Raises
     ------
     RecordError
-        See :func:`dynsim.draw.figures.draw`; also if a worker process was killed from outside.
+        As for :func:`dynsim.draw.figures.draw`; also if a worker process was killed.
     KeyboardInterrupt
         After Ctrl-C; figures that were not finished are missing.
     """
@@ -103,7 +103,7 @@ def draw_all(wanted: Sequence[Figures], page: Page, quiet: bool) -> Path | None:
         if isinstance(task, Page):
             pages.append(done)
 
-    # Longest tasks first.
+    # Start the longest tasks first.
     tasks: list[Figures | Page] = [*wanted, page]
     workers = min(cores(), len(tasks))
     with drawing(page.folder, quiet):
@@ -117,7 +117,7 @@ def draw_all(wanted: Sequence[Figures], page: Page, quiet: bool) -> Path | None:
 
 
 def _draw(task: Figures | Page, _: Any) -> Path | None:
-    """Draw in a worker process."""
+    """Execute one drawing task in a worker process."""
     return task.draw()
 
 
@@ -127,7 +127,7 @@ def _draw(task: Figures | Page, _: Any) -> Path | None:
 def view(
     records: RecordsArgument,
     ghost: Annotated[
-        bool, typer.Option("--ghost", help="Overlay the records, the first one solid; default: side by side.")
+        bool, typer.Option("--ghost", help="Overlay the records, with the first one solid; default: side by side.")
     ] = False,
     open_: Annotated[bool, typer.Option("--open/--no-open", help="Open the page in a browser.")] = True,
     out: Annotated[
@@ -136,7 +136,7 @@ def view(
     ] = None,
     trust: TrustOption = False,
 ) -> None:
-    """Write a self-contained 3D page of records; opens in any browser, offline."""
+    """Write a self-contained 3D page of records, which any browser can open offline."""
     from dynsim.draw.page import write
     from dynsim.engine.recording import VIEW
 
@@ -173,12 +173,12 @@ def print_page(page: Path | None, quiet: bool) -> None:
 
 
 def open_page(page: Path) -> None:
-    """Open a page in the default browser, or print that there is no display."""
+    """Open a page in the default browser, or print its path if no browser can be opened."""
     open_address(page.absolute().as_uri(), escaped(page))
 
 
 def open_address(address: str, name: str = "") -> None:
-    """Open an address in the default browser, or print that there is no display."""
+    """Open an address in the default browser, or print it if no browser can be opened."""
     import webbrowser
 
     # Without a display some systems start a browser inside the terminal.

@@ -21,10 +21,10 @@ from dynsim.system.terminal import escaped, lenient_streams
 
 
 def main(received: Sequence[int]) -> None:
-    """Run the command line and exit; errors become one line and an exit code.
+    """Run the command line and exit; print an error as one line, and set the exit code.
 
     ``received`` is the list of signals from :func:`dynsim.system.interruption.handled`, whose block encloses this call.
-    Without results to save, Ctrl-C ends with exit code 130.
+    If there are no results to save, Ctrl-C ends the program with exit code 130.
     """
     with lenient_streams() as output, _plain_warnings():
         code = _exit_code()
@@ -34,7 +34,7 @@ def main(received: Sequence[int]) -> None:
                 code = _explain_lost_output(output.failure)
     code = interruption.exit_code(received) if code == SimulationInterrupted.exit_code else code
     if interruption.is_left():
-        # At exit the interpreter would free data that a thread in compiled code still uses.
+        # A normal exit would free data that a thread in compiled code still uses.
         with suppress(OSError, ValueError):
             sys.stderr.flush()
         os._exit(code)
@@ -52,7 +52,7 @@ def _exit_code() -> int:
     except MemoryError as error:
         problem, code = f"not enough memory: {error}".removesuffix(": "), DynsimError.exit_code
     except OSError as error:
-        # An error of the operating system that no caller could explain better.
+        # An error of the operating system that no caller has replaced by a better message.
         problem, code = _explain_system(error), DynsimError.exit_code
     except KeyboardInterrupt:
         return SimulationInterrupted.exit_code
@@ -63,7 +63,7 @@ def _exit_code() -> int:
 
 
 def _command() -> Any:
-    """Return the command of ``app``, without a metavar for flags, which take no value."""
+    """Return the command line as one command; its help shows no metavar for flags, because they take no value."""
     command = typer.main.get_command(app)
     waiting = [command]
     while waiting:
@@ -94,7 +94,7 @@ def _explain_lost_output(failure: OSError) -> int:
 
 @contextmanager
 def _plain_warnings() -> Iterator[None]:
-    """Print warnings about input or files as one line on stderr, without their location in the code."""
+    """Print warnings about input or files in the block as one line on stderr, without their location in the code."""
     shown = warnings.showwarning
 
     def show(message: Warning | str, category: type[Warning], *location: Any, **options: Any) -> None:

@@ -35,18 +35,19 @@ def export(
         ExportFormat,
         typer.Option(
             "--format",
-            help="Record: csv, joint-trajectory (ROS), urdf-log (JSON lines), mcap (ROS 2 messages). "
-            "Robot of a scenario: urdf, mjcf (MuJoCo).",
+            help="Formats for a record: csv, joint-trajectory (ROS), urdf-log (JSON lines), mcap (ROS 2 messages). "
+            "Formats for the robot of a scenario: urdf, mjcf (MuJoCo).",
         ),
     ],
     rate: Annotated[
         float | None,
-        typer.Option("--rate", help="Resample the joint motion to this rate [Hz]; default: the samples of the record."),
+        typer.Option("--rate", help="Resample the joint motion to this rate [Hz]; default: no resampling."),
     ] = None,
     out: Annotated[
         Path | None,
         typer.Option(
-            "--out", help="Output file; default: next to the record, or NAME.urdf or NAME.mjcf.xml for a scenario."
+            "--out",
+            help="Output file; default: a file next to the record; for a scenario, NAME.urdf or NAME.mjcf.xml.",
         ),
     ] = None,
     variant: VariantOption = None,

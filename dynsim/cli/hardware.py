@@ -1,4 +1,4 @@
-"""Commands ``dynsim hw …``: replay, checks and maintenance of real and virtual servos, and driving with servos."""
+"""Commands ``dynsim hw …``: replay a record on real or virtual servos, drive them live, and check or configure them."""
 
 from __future__ import annotations
 
@@ -43,9 +43,10 @@ if TYPE_CHECKING:
 
 hw = typer.Typer(
     no_args_is_help=True,
-    help="Replay a record on Dynamixel servos, real or virtual. Not a safety device: fit a power cut.",
+    help="Replay a record on real or virtual Dynamixel servos. Not a safety device: fit an emergency power switch.",
 )
-# The terminal wraps long lines, so that paths can be copied. No markup: "[rad]" is a unit, not a style.
+# Leave the wrapping of long lines to the terminal, so that paths can be copied. Disable markup, because "[rad]" is a
+# unit, not a style.
 console = Terminal(soft_wrap=True, highlight=False, markup=False, emoji=False)
 
 
@@ -53,7 +54,7 @@ Policy = StrEnum("Policy", ["hold", "decelerate", "off"])
 
 
 RecordFile = Annotated[Path, typer.Argument(metavar="RECORD", help="Record of a run (record.h5).")]
-MapFile = Annotated[Path, typer.Option("--map", help="Servo map: a file, or a shipped map (arm, snake).")]
+MapFile = Annotated[Path, typer.Option("--map", help="Servo map: a file, or the name of a shipped map (arm, snake).")]
 Port = Annotated[str, typer.Option("--port", help="Serial device, e.g. /dev/ttyUSB0.")]
 Rate = Annotated[float | None, typer.Option("--rate", help="Command rate [Hz]; default: the rate in the map.")]
 Speed = Annotated[float, typer.Option("--speed", help="Playback speed; 0.5 is half speed.")]
@@ -61,12 +62,12 @@ ReplayPort = Annotated[str, typer.Option("--port", help="Serial device, or `virt
 PolicyOption = Annotated[
     Policy | None, typer.Option("--policy", help="Reaction to a fault; default: the policy in the map.")
 ]
-Live = Annotated[bool, typer.Option("--live", help="Move the robot. Without it a real port gets a dry run.")]
+Live = Annotated[bool, typer.Option("--live", help="Move the robot; without this option, a real port gets a dry run.")]
 Yes = Annotated[
     bool,
-    typer.Option("--yes", help="Skip the confirmation (except when the start is farther than safety.start_distance)."),
+    typer.Option("--yes", help="Skip the confirmation, unless the start is farther away than safety.start_distance."),
 ]
-Configure = Annotated[bool, typer.Option("--configure", help="Write EEPROM settings that differ from the map.")]
+Configure = Annotated[bool, typer.Option("--configure", help="Correct EEPROM settings that differ from the map.")]
 Faults = Annotated[Path | None, typer.Option("--faults", help="Fault script for virtual servos.")]
 Plant = Annotated[str | None, typer.Option("--plant", help="Scenario that provides the load for the virtual servos.")]
 PlantVariant = Annotated[str | None, typer.Option("--variant", help="Variant of that scenario.")]
@@ -81,9 +82,9 @@ def require_client_library() -> None:
 def scan(
     port: Port,
     map_file: Annotated[Path | None, typer.Option("--map", help="Compare the servos with this servo map.")] = None,
-    baud: Annotated[int | None, typer.Option("--baud", help="Scan only this bit rate [bit/s].")] = None,
+    baud: Annotated[int | None, typer.Option("--baud", help="Scan only at this bit rate [bit/s].")] = None,
 ) -> None:
-    """List responding servos at all common bit rates (read-only)."""
+    """List the servos that respond at any common bit rate (read-only)."""
     require_client_library()
     from dynsim.hardware.bus import scan as survey
     from dynsim.hardware.bus.control_table import RETURN_DELAY_SECONDS_PER_UNIT, VOLT_PER_UNIT
@@ -92,7 +93,7 @@ def scan(
     answers = survey.scan(port, bauds)
     if not answers:
         raise VerificationFailed(
-            f"{port}: no servo answered at {', '.join(f'{b}' for b in bauds)} bit/s; check power and cable. "
+            f"{port}: no servo answered at {', '.join(f'{b}' for b in bauds)} bit/s; check the power and the cable. "
             "MX servos with Protocol 1 firmware do not answer: update them to Protocol 2.0"
         )
     owners = {servo.id: servo for servo in servo_map.servos} if servo_map else {}
@@ -130,7 +131,7 @@ def _compare_with_map(answers: list[Any], servo_map: Any) -> None:
     ]
     if wrong:
         raise VerificationFailed("; ".join(wrong))
-    console.print(f"all {len(seen)} servos of {servo_map.path} answer")
+    console.print(f"all {len(seen)} servos in {servo_map.path} answered")
 
 
 @hw.command(epilog="Example: dynsim hw check results/elbow_comparison/two_elbows/record.h5 --map arm")
@@ -162,11 +163,11 @@ def _print_check(motion: Any, servo_map: Any) -> None:
     plan = motion.plan
     console.print(
         f"check passed: {motion.duration:.2f} s at {plan.rate:g} Hz, "
-        f"{plan.cycle_time * 1e3:.2f} of {1e3 / plan.rate:.2f} ms per cycle on the bus"
+        f"bus busy for {plan.cycle_time * 1e3:.2f} of {1e3 / plan.rate:.2f} ms per cycle"
     )
     if tightest := motion.tightest(servo_map):
         margin, part = tightest
-        console.print(f"tightest: {margin}, {100 * part:.0f} % left")
+        console.print(f"smallest margin: {margin}, {100 * part:.0f} % left")
 
 
 @hw.command(epilog="Example: dynsim hw replay results/elbow_comparison/two_elbows/record.h5 --map arm --port virtual")
@@ -189,7 +190,7 @@ def replay(
 ) -> None:
     """Check the record, verify and arm the servos, move to the start, replay, and save the measurements.
 
-    Ctrl-C once: controlled stop. Twice: torque off.
+    Press Ctrl-C once for a controlled stop, twice to switch the torque off.
     """
     require_client_library()
     from dynsim.hardware.ports import VIRTUAL, bus_on
@@ -236,7 +237,7 @@ def replayed(
     quiet: bool,
     **options: Any,
 ) -> Any:
-    """Run a replay that signals can stop, with a progress bar unless ``quiet``; add display errors to ``lost``."""
+    """Run a replay that signals can stop; show progress unless ``quiet``, and add display errors to ``lost``."""
     from dynsim.hardware.replay.output import StopRequest, displayed, stop_on_signals
     from dynsim.hardware.replay.session import run_replay
 
@@ -246,7 +247,7 @@ def replayed(
 
 
 def print_dry_run(result: Any) -> None:
-    """Print the result of a replay without motion."""
+    """Print the result of a dry run, in which nothing moved."""
 
     from dynsim.hardware.replay.rules import QUANTITIES, differences
 
@@ -256,14 +257,14 @@ def print_dry_run(result: Any) -> None:
     console.print(table)
     for line in differences(result.limits):
         console.print(line)
-    console.print("dry run: servos verified and bus timed, nothing was moved; use --live to move")
+    console.print("dry run: the servos were verified and the bus was timed, but nothing was moved; use --live to move")
 
 
 def print_replay(result: Any, done: str, folder: Path, record: Path) -> None:
-    """Print the state after a successful motion, and the next command."""
+    """Print whether the torque is on after a successful motion, and the command that compares the records."""
     left = "ON, holding" if result.end_state == "holding" else "off"
-    console.print(f"{done}; torque {left}; {folder / 'measured.h5'}")
-    console.print(f"compare: dynsim hw compare {record} {folder / 'measured.h5'}")
+    console.print(f"{done}; the torque is {left}; measured record: {folder / 'measured.h5'}")
+    console.print(f"to compare: dynsim hw compare {record} {folder / 'measured.h5'}")
 
 
 def _fault_script(path: Path | None, servo_map: Any) -> Any:
@@ -296,10 +297,10 @@ def print_timing(result: Any) -> None:
 def recover(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of a replay that crashed.")],
     out: Annotated[
-        Path | None, typer.Option("--out", help="Output folder for record and summary; default: FOLDER.")
+        Path | None, typer.Option("--out", help="Output folder for the record and the summary; default: FOLDER.")
     ] = None,
 ) -> None:
-    """Build a record (marked incomplete) from the log of a replay that crashed."""
+    """Build a record (marked incomplete) from the data saved by a replay that crashed."""
     from dynsim.hardware.replay import measured
     from dynsim.hardware.replay.output import MEASURED
 
@@ -314,7 +315,7 @@ def recover(
 )
 def compare(
     record: RecordFile,
-    measured: Annotated[Path, typer.Argument(metavar="MEASURED", help="measured.h5 of a replay.")],
+    measured: Annotated[Path, typer.Argument(metavar="MEASURED", help="Measured record of a replay (measured.h5).")],
     gate: Annotated[
         Path | None, typer.Option("--gate", help="YAML file with error bounds; exit code 5 if one is exceeded.")
     ] = None,
@@ -335,7 +336,7 @@ def compare(
     bounds = load_gate(gate) if gate else None
     comparison = compare_records(Record.load(record, trust=trust), Record.load(measured, trust=trust))
     folder = out or measured.parent
-    # First, because it raises an error for unknown joints.
+    # Draw first, because this raises an error for unknown joints.
     figure = draw_comparison(comparison, folder / "comparison.png", joints or ())
     table = Table("joint", "rms [rad]", "max [rad]", "at [s]", "rms, common delay removed [rad]", "own delay [ms]")
     common = not math.isnan(comparison.delay)
@@ -353,7 +354,7 @@ def compare(
             angles = [f"{wheel.turned:.3f}", f"{wheel.angle_max:.4f}", f"{wheel.angle_end:+.4f}"]
             wheels.add_row(wheel.wheel, *rates, *angles)
         console.print(wheels)
-    why = "" if common else " (no delay explains half of the mean square error of all joints)"
+    why = "" if common else " (no delay explains half of the mean square error over all joints)"
     console.print(f"{comparison.delay_text}{why}, worst joint {comparison.worst.joint}")
     write_json(folder / "comparison.json", comparison.summary())
     console.print(f"figure: {figure}")
@@ -369,7 +370,7 @@ def virtual(
     plant: Plant = None,
     variant: PlantVariant = None,
 ) -> None:
-    """Run virtual servos on a pseudo-terminal for any Dynamixel tool; stop with Ctrl-C."""
+    """Run virtual servos on a pseudo-terminal to which any Dynamixel tool can connect; stop with Ctrl-C."""
     require_client_library()
     from dynsim.hardware.replay.output import StopRequest, stop_on_signals
     from dynsim.hardware.servo_map import load_servo_map
@@ -380,7 +381,7 @@ def virtual(
     robot = _plant(plant, variant, servo_map)
     terminal = PseudoTerminal(line_for_map(servo_map, script=script, plant=robot), link)
     stop = StopRequest()
-    # A plain line, because other programs wait for it.
+    # Print a plain line, because other programs wait for it.
     print(
         f"{len(servo_map.servos)} virtual servos at {servo_map.bus.baud} bit/s on {plain(link or terminal.device)}",
         flush=True,
@@ -393,13 +394,13 @@ def virtual(
 def stop_servos(
     port: Port,
     map_file: Annotated[
-        Path | None, typer.Option("--map", help="Use bit rate and servo IDs of this servo map.")
+        Path | None, typer.Option("--map", help="Use the bit rate and the servo IDs of this servo map.")
     ] = None,
-    baud: Annotated[int | None, typer.Option("--baud", help="Only this bit rate [bit/s].")] = None,
+    baud: Annotated[int | None, typer.Option("--baud", help="Use only this bit rate [bit/s].")] = None,
 ) -> None:
-    """Switch torque off on all servos at all common bit rates, even during a replay.
+    """Switch off the torque of all servos, at all common bit rates, even during a replay.
 
-    Not a substitute for a power cut.
+    This is not a substitute for an emergency power switch.
     """
     require_client_library()
     from dynsim.hardware.bus import scan as survey
@@ -407,7 +408,7 @@ def stop_servos(
     servo_map, bauds = _map_and_bauds(map_file, baud, survey.STOP_BAUD_RATES)
     asked = survey.stop_all(port, bauds, servo_map.ids if servo_map else ())
     on = [id_ for id_, still_on in asked.torque.items() if still_on]
-    # Without a map, servos at a bit rate at which the port failed are unknown.
+    # Without a map, servos that use a bit rate at which the port failed are not known.
     if on or not asked.torque or (asked.trouble and not servo_map):
         who = f"ID {', '.join(map(str, on))}" if on else "all servos" if asked.torque else "any servo"
         why = f" ({'; '.join(asked.trouble)})" if asked.trouble else ""
@@ -433,12 +434,12 @@ def calibrate(
         bool, typer.Option("--nudge", help="Turn each joint by 3° and back to check its direction.")
     ] = False,
     live: Annotated[bool, typer.Option("--live", help="Move the robot (with --nudge).")] = False,
-    yes: Annotated[bool, typer.Option("--yes", help="Ask no questions, only report (with --nudge).")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask questions, only report (with --nudge).")] = False,
     write: Annotated[bool, typer.Option("--write", help="Correct the signs in the map (with --nudge).")] = False,
 ) -> None:
-    """Store the zero position: pose the robot by hand with torque off, then run this.
+    """Store the zero position: pose the robot by hand with the torque off, then run this command.
 
-    With --nudge: find joints with the wrong direction instead, one by one.
+    With --nudge, the command moves the joints one by one instead, to find joints that turn in the wrong direction.
     """
     require_client_library()
     from dynsim.hardware.ports import bus_on
@@ -451,19 +452,19 @@ def calibrate(
         raise ServoMapError(f"{target} is a shipped map; write your own map with --out")
     unknown = [name for name in joint or () if name not in servo_map.joints]
     if unknown:
-        raise ServoMapError(f"{map_file} has no joint {', '.join(unknown)}; it has {', '.join(servo_map.joints)}")
+        raise ServoMapError(f"{map_file} has no joint {', '.join(unknown)}; joints: {', '.join(servo_map.joints)}")
     if nudge:
         chosen = [servo for servo in servo_map.servos if servo.joint in (joint or servo_map.joints)]
         signs, blocked = find_directions(servo_map, chosen, port, live=live, asked=not yes)
         text = f"The sign of {', '.join(signs)} is wrong in {target}."
-        if signs and (write or (not shipped and _agreed(text, "write it?"))):
+        if signs and (write or (not shipped and _agreed(text, "correct it?"))):
             write_into_map(servo_map, "sign", signs, target)
-            console.print(f"written to {target}")
+            console.print(f"correct signs were written to {target}")
         if blocked:
             raise VerificationFailed(f"{', '.join(blocked)} did not turn as commanded; check for an obstacle")
         return
     if live or yes or write:
-        raise ServoMapError("--live, --yes and --write require --nudge; zero ticks are read with the torque off")
+        raise ServoMapError("--live, --yes and --write require --nudge: zero ticks are read while the torque is off")
     chosen = [servo for servo in servo_map.servos if (servo.joint in joint if joint else servo.in_position_mode)]
     with bus_on(port, servo_map) as (bus, _):
         ticks = read_zero_ticks(bus, chosen)
@@ -478,7 +479,7 @@ def calibrate(
 # Command ``dynsim hw drive``: the user drives a simulation in real time, and servos follow it.
 EXAMPLE = "Example: dynsim hw drive elbow_comparison --variant two_elbows --map arm --port virtual"
 SERVOS = "servos"
-"""Subfolder of the measured run."""
+"""Name of the subfolder for the measured run."""
 
 
 def hw_drive(
@@ -506,10 +507,11 @@ def hw_drive(
     faults: Faults = None,
     quiet: QuietOption = False,
 ) -> None:
-    """Like `dynsim teleop`, with servos following the simulated joints.
+    """Drive a scenario live, as with `dynsim teleop`, while servos follow the simulated joints.
 
-    Servos are verified and armed, and move to the start, as in a replay; every posture is checked against the map
-    before it is sent. Ctrl-C once: controlled stop. Twice: torque off. The button on the page ends the drive normally.
+    As in a replay, the servos are verified and armed, and move to the start. Every posture is checked against the map
+    before it is sent. Press Ctrl-C once for a controlled stop, twice to switch the torque off. The button on the page
+    ends the drive normally.
     """
     require("live", "websockets")
     require_client_library()
@@ -535,7 +537,7 @@ def hw_drive(
     moves = live or port == VIRTUAL
     result: Any = None
     with SimulationProcess(request) as process:
-        with console.status("loading the kernels; the first time, compiling them takes half a minute"):
+        with console.status("loading the kernels; on first use, compiling them takes half a minute"):
             ready = process.ready()
         motion = check_drive(
             ready.first, servo_map, process.feed, step=ready.step, longest=longest, rate=rate, scene=ready.still.scene
@@ -543,7 +545,7 @@ def hw_drive(
         if live and port != VIRTUAL:
             confirm_replay(servo_map, motion, port, asked=not yes, at_most=True)
         if moves:
-            print_address(ready.address, "Ctrl-C stops the robot, a second one releases it", open_=open_)
+            print_address(ready.address, "Ctrl-C stops the robot; a second Ctrl-C switches the torque off", open_=open_)
         posture = dict(zip(servo_map.joints, motion.start.tolist(), strict=True))
         error: DynsimError | None = None
         try:
@@ -599,9 +601,9 @@ def _write_page(name: str, folder: Path, result: Any, *, quiet: bool) -> None:
     write_view(records, folder, quiet)
 
 
-# Prompts and tables of the commands that move a robot: before a replay, and for nudges of single servos.
+# Prompts of the commands that move a robot: before a replay, and when the joints are nudged one by one.
 ANSWERS = ("y", "n", "again")
-CLEAR = "Is everyone clear of the robot, and is the power cut within reach?"
+CLEAR = "Is everyone clear of the robot, and is the emergency power switch within reach?"
 
 
 def confirm_replay(servo_map: ServoMap, motion: MotionTask, port: str, *, asked: bool, at_most: bool = False) -> None:
@@ -616,9 +618,9 @@ def confirm_replay(servo_map: ServoMap, motion: MotionTask, port: str, *, asked:
     port : str
         Serial device.
     asked : bool
-        Whether to ask. A start beyond ``safety.start_distance`` is always asked.
+        Whether to ask for confirmation. If the start is farther than ``safety.start_distance``, it is always requested.
     at_most : bool, optional
-        Whether the motion may end earlier than its duration.
+        Whether the motion may end before ``motion.duration``.
 
     Raises
     ------
@@ -641,11 +643,11 @@ def confirm_replay(servo_map: ServoMap, motion: MotionTask, port: str, *, asked:
     agreed = not asked or _agreed(CLEAR, "move?")
     bound = servo_map.safety.start_distance
     if agreed and (far := [distance for distance in distances if distance.size > bound]):
-        still = "" if asked else " (asked even with --yes)"
-        console.print(f"more than safety.start_distance = {bound:g} rad from the start{still}:")
+        still = "" if asked else " (this requires confirmation even with --yes)"
+        console.print(f"these joints are more than safety.start_distance = {bound:g} rad from the start{still}:")
         for distance in far:
             console.print(f"  {distance}")
-        agreed = _agreed("All joints move to the start together. Is the whole path free?", "move to the start?")
+        agreed = _agreed("All joints will move to the start together. Is their path clear?", "move to the start?")
     if not agreed:
         raise ReplayInterrupted("not confirmed; nothing was moved")
 
@@ -653,7 +655,7 @@ def confirm_replay(servo_map: ServoMap, motion: MotionTask, port: str, *, asked:
 def find_directions(
     servo_map: ServoMap, chosen: Sequence[MappedServo], port: str, *, live: bool, asked: bool
 ) -> tuple[dict[str, int], list[str]]:
-    """Nudge one joint after the other, and ask whether it moved in the direction of the map.
+    """Nudge the joints one by one, and ask whether each joint moved in the direction given by the map.
 
     Parameters
     ----------
@@ -664,23 +666,23 @@ def find_directions(
     port : str
         Serial device, or ``VIRTUAL``.
     live : bool
-        Whether to move; without it a real port gets a dry run.
+        Whether to move the robot; if False, a real port gets a dry run.
     asked : bool
-        Whether to ask; otherwise the motion is only reported.
+        Whether to ask the user; if False, the motion is only reported.
 
     Returns
     -------
     signs : dict of str to int
-        Correct sign of every joint that turned against the map.
+        Correct sign of every joint that turned opposite to the direction in the map.
     blocked : list of str
         Joints that did not reach their goals.
 
     Raises
     ------
     ReplayInterrupted
-        If the user declines, does not answer, or stopped a nudge.
+        If the user declines, does not answer, or stops a nudge.
     VerificationFailed, ReplayAborted
-        If a servo is not ready to move, or an abort rule ended a nudge; torque is off.
+        If a servo is not ready to move, or an abort rule ends a nudge; the torque is off then.
     """
     from dynsim.hardware.nudge import ANGLE
     from dynsim.hardware.ports import VIRTUAL, bus_on
@@ -689,7 +691,7 @@ def find_directions(
     angle = f"{math.degrees(ANGLE):g}°"
     if real and live and asked:
         console.print(
-            f"{servo_map.robot}: {len(chosen)} joint(s) will turn {angle} and back, one by one; torque off elsewhere."
+            f"{servo_map.robot}: {len(chosen)} joint(s) will turn {angle} and back, one by one; the others stay limp."
         )
         if not _agreed(CLEAR, "move?"):
             raise ReplayInterrupted("not confirmed; nothing was moved")
@@ -714,7 +716,7 @@ def find_directions(
         servo.joint: -servo.sign for servo in servo_map.servos if not agrees.get(servo.joint, True)
     }
     for joint, sign in signs.items():
-        console.print(f"{joint}: turns opposite to the map; its sign should be {sign}")
+        console.print(f"{joint} turns opposite to the direction in the map; its sign should be {sign}")
     return signs, blocked
 
 
@@ -728,7 +730,7 @@ def _nudge(bus: Bus, clock: Clock, servo_map: ServoMap, servo: MappedServo, *, l
 
 
 def _ask_direction(moved: Nudge, *, asked: bool) -> str:
-    """Print the motion of a joint and ask for its direction; returns "y", "n" or "again"."""
+    """Print how far a joint moved, and ask whether the direction was right; return "y", "n" or "again"."""
     console.print(
         f"{moved.joint} (ID {moved.id}): {math.degrees(moved.moved):+.1f}° (map), {moved.ticks:+d} ticks, and back"
     )
@@ -742,7 +744,7 @@ def _ask_direction(moved: Nudge, *, asked: bool) -> str:
             answer = typer.prompt(question).strip().lower()
         return answer
     except typer.Abort:
-        raise ReplayInterrupted(f"no answer about {moved.joint}; torque is off, nothing was written") from None
+        raise ReplayInterrupted(f"no answer about {moved.joint}; the torque is off, and nothing was written") from None
 
 
 def _agreed(text: str, question: str) -> bool:

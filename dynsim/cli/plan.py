@@ -74,8 +74,8 @@ def plan(
 ) -> None:
     """Find where an arm should brace: points, surfaces, posture along the hand path, contact forces and gains.
 
-    For each number of braces, finds the set with the least motor heat and re-simulates it with errors in friction and
-    surface height. Writes plan.yaml with one variant per plan; run it with `dynsim run
+    For each number of braces, the command finds the set with the least motor heat and re-simulates it with errors in
+    friction and surface height. It writes plan.yaml with one variant per plan; run this file with `dynsim run
     results/SCENARIO/plan/plan.yaml`.
     """
     from dynsim.scenario import load_scenario
@@ -131,7 +131,7 @@ def plan(
 
 
 def _numbers(text: str) -> tuple[int, int]:
-    """Parse ``0:3`` or ``2``."""
+    """Parse the minimum and maximum number of braces, such as ``0:3``, or a single number, such as ``2``."""
     first, colon, last = text.partition(":")
     try:
         least = int(first)
@@ -141,7 +141,7 @@ def _numbers(text: str) -> tuple[int, int]:
 
 
 def _weights(texts: list[str]) -> float:
-    """Return the cost of the peak torque [W/(N m)]."""
+    """Parse the values of ``--weight`` and return the cost of the peak torque [W/(N m)]."""
     peak = 0.0
     for text in texts:
         key, _, value = text.partition("=")
@@ -158,7 +158,7 @@ def _weights(texts: list[str]) -> float:
 
 
 def _gains(text: str) -> tuple[float, ...]:
-    """Return gains in descending order."""
+    """Parse comma-separated gains and return them in descending order."""
     try:
         values = tuple(sorted((float(part) for part in text.split(",")), reverse=True))
     except ValueError:

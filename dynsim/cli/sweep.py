@@ -84,8 +84,8 @@ def sweep(
 ) -> None:
     """Simulate a scenario over a grid of values, random samples, or both; write a table of all runs and figures.
 
-    A failed run becomes a row with its reason. Exit codes: 0 at least one run succeeded, 2 bad input, 3 no run
-    succeeded, 130 Ctrl-C.
+    The table has a row for each failed run, too, with the reason for the failure. Exit codes: 0 if at least one run
+    succeeded, 2 if the input is invalid, 3 if no run succeeded, 130 after Ctrl-C.
     """
     from dynsim.studies.processes import cores
 
@@ -149,7 +149,7 @@ def _variants(known: Sequence[str], wanted: str | None) -> tuple[str | None, ...
 
 
 def _warn_about_unknown(row: SweepRow, plotted: Sequence[str]) -> None:
-    """Warn before the sweep if the first run lacks a number to plot; another variant may have it."""
+    """Warn early if the first completed run lacks a number to be plotted; another variant may have it."""
     from dynsim.config.problems import suggest
 
     for number in plotted:
@@ -181,7 +181,7 @@ def _draw(
                 f"--plot {number}: no run has that number{suggest(number, known)}; {folder / TABLES[0]} lists all; "
                 "use --resume with another --plot to redraw without simulating"
             )
-    # The partial numbers of a stopped run must not be plotted like complete results.
+    # The numbers of a run that stopped early must not be plotted like those of a complete run.
     table = Sweep(
         name,
         [(row if row.status == OK else replace(row, numbers={})).cells() for row in rows],

@@ -1,4 +1,4 @@
-"""Terminal output: tables of summaries, comparisons, starts, choices and plans; messages and progress bars."""
+"""Terminal output: tables of summaries, comparisons, start positions and plans; lists, messages and progress bars."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ Summary = Mapping[str, Any]
 
 # Width of the longest row heading.
 _HEADING_WIDTH = 30
-# Energies below this fraction of the turnover, and coordinates below this [m], are rounding errors.
+# Energies below this fraction of the energy turnover, and coordinates below this value [m], count as rounding errors.
 ROUNDING = 1e-12
 
 
 def _format(value: float, form: str) -> str:
-    """Format a number; "0" for zero, and no sign if it is rounded to zero."""
+    """Format a number: zero as "0", and a number that is rounded to zero without a sign."""
     text = format(value, form)
     if value == 0.0:
         return "0"
@@ -58,7 +58,7 @@ def _deepest(summary: Summary) -> str | None:
 
 
 def _base(key: str) -> Callable[[Summary], Any]:
-    """Return a function that reads a number of the mobile base from a summary (None without a base)."""
+    """Return a function that reads a number about the mobile base from a summary (None if there is no base)."""
     return lambda summary: summary.get("base", {}).get(key)
 
 
@@ -152,7 +152,7 @@ def print_summary(console: Console, summary: Summary) -> None:
 
 
 def print_comparison(console: Console, summaries: Mapping[str, Summary]) -> None:
-    """Print all variants side by side, one column per variant; in several tables if the terminal is too narrow."""
+    """Print all variants side by side, one column per variant; use several tables if the terminal is too narrow."""
     names, everything = list(summaries), list(summaries.values())
     # "wheel2R 3.17 of 1.68" is the widest cell; most tables do not have this row.
     cell = max([20 if any(s.get("worst_joint") for s in everything) else 10, *map(len, names)]) + 2
@@ -196,7 +196,7 @@ def _rows(
 
 
 def print_choices(console: Terminal) -> None:
-    """Print shipped scenarios and the members of every family, with the first lines of their descriptions."""
+    """Print all shipped scenarios, plants, surfaces, controllers, paths and motors, each with a short description."""
     from dynsim.library.families import FAMILIES, member, members
     from dynsim.scenario import load_scenario, shipped_scenarios, variant_names
 
@@ -214,10 +214,10 @@ def print_choices(console: Terminal) -> None:
 def _print_choice(
     console: Terminal, title: str, rows: Sequence[tuple[str, ...]], headings: tuple[str, ...] = ()
 ) -> None:
-    """Print a table on a terminal, or tab-separated lines for programs."""
+    """Print a table to a terminal, or tab-separated lines to a file or pipe, for use by other programs."""
     if console.unbounded:
         lines = ["\t".join(plain(cell).replace("\n", "\\n") for cell in row) for row in [(title,), *rows, ()]]
-        # Without the console, which would expand the tabs.
+        # Do not print through the console, which would expand the tabs.
         print("\n".join(lines), file=console.file)
         return
     table = _table(title, show_header=bool(headings))
@@ -229,20 +229,20 @@ def _print_choice(
 
 
 def print_starts(console: Console, starts: Mapping[str, Start]) -> None:
-    """Print the start positions of hand and contact points [m] per variant, as YAML lists in full precision.
+    """Print the start positions of the hand and contact points [m] of each variant, as YAML lists in full precision.
 
-    Also prints contact gaps, joints moved by initial.on_surface, and the tip margin of a mobile base at rest.
+    Also print the contact gaps, the joints moved by initial.on_surface, and the tip margin of a mobile base at rest.
     """
     for variant, start in starts.items():
         values = {"hand": f"{_coordinates(start.hand)}"}
         values |= {f"contact {name}": f"{_coordinates(point)}" for name, point in start.contacts.items()}
         values |= {f"gap of {name}": f"{gap:+.4g} m" for name, gap in start.gaps.items()}
         for joint, (to, was, unit) in start.solved.items():
-            values[joint] = f"{to!r} {unit}, by on_surface; was {was:.6g}"
+            values[joint] = f"{to!r} {unit}, set by on_surface; was {was:.6g}"
         if start.tip_margin is not None:
             braced = ""
             if start.tip_margin_braced is not None:
-                braced = f", {start.tip_margin_braced:.4g} with braces of least heat"
+                braced = f", {start.tip_margin_braced:.4g} with brace forces of least heat"
             values["tip margin"] = f"{start.tip_margin:.4g} at rest{braced} (1: safest, 0: tips)"
         if start.off_path is not None:
             away = "at the hand" if start.off_path < 1e-9 else f"{start.off_path:.4g} m from the hand"
@@ -251,13 +251,13 @@ def print_starts(console: Console, starts: Mapping[str, Start]) -> None:
         lines = [f"  {variant}{', ' if variant else ''}at the start [m]:"]
         lines += [f"    {name:<{width}}  {value}" for name, value in values.items()]
         if start.aloft:
-            lines += [f"    not all on their surfaces; they would be with  {start.aloft}"]
+            lines += [f"    some contact points are not on their surfaces; to put them there, use  {start.aloft}"]
         console.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
         _print_warnings(console, {variant: {"warnings": start.warnings}})
 
 
 def _coordinates(point: NDArray[np.float64]) -> list[float]:
-    """Return coordinates [m] that read back to the same doubles; rounding errors of zero become 0.0."""
+    """Return coordinates [m] that are read back as the same doubles; replace rounding errors around zero by 0.0."""
     return [0.0 if abs(x) <= ROUNDING else x for x in point.tolist()]
 
 
@@ -277,7 +277,8 @@ def _is_unilateral(contact: Summary) -> bool:
     return "sticking_fraction" in contact
 
 
-# Heading, format, and the law for which the row is printed: bilateral (False), unilateral (True) or both (None).
+# Heading of each row, format, and the contact law for which it is printed: bilateral (False), unilateral (True) or both
+# (None).
 _CONTACT_ROWS: tuple[tuple[str, Callable[[Summary], str], bool | None], ...] = (
     ("force, mean [N]", lambda c: _format(c["normal_force_mean_N"], ".2f"), None),
     ("  min [N]", lambda c: _format(c["normal_force_min_N"], ".2f"), None),
@@ -292,9 +293,10 @@ _CONTACT_ROWS: tuple[tuple[str, Callable[[Summary], str], bool | None], ...] = (
 
 
 def _contact_rows(name: str, contacts: Sequence[Summary | None]) -> Iterator[tuple[str, list[str]]]:
-    """Yield the rows of a contact with a cell for each run (None: the run does not have this contact).
+    """Yield the table rows for one contact, with one cell per run; None stands for a run without this contact.
 
-    A candidate that never touched has no rows; for a declared point that never touched, its smallest gap is printed.
+    A candidate contact that never closed has no rows; for a declared contact that never closed, the smallest gap is
+    printed.
     """
     having = [contact for contact in contacts if contact]
     if not any(contact["closed_fraction"] > 0.0 or "gap_min_m" in contact for contact in having):
@@ -320,7 +322,7 @@ _STOP_ROWS: tuple[tuple[str, Callable[[Summary], str]], ...] = (
 
 
 def _stop_rows(summaries: Sequence[Summary], shown: Sequence[Summary]) -> Iterator[tuple[str, list[str]]]:
-    """Yield the rows of the joint stops that any run has touched, with a cell for each run shown."""
+    """Yield the table rows for all joint stops that were hit in any run, with one cell for each run shown."""
     stops = {_stop(stop): stop for summary in summaries for stop in summary.get("joint_stops", ())}
     for key, stop in stops.items():
         cells = [{_stop(stop): stop for stop in summary.get("joint_stops", ())}.get(key) for summary in shown]
@@ -332,9 +334,9 @@ def _stop_rows(summaries: Sequence[Summary], shown: Sequence[Summary]) -> Iterat
 
 
 def _motor_rows(summaries: Sequence[Summary], shown: Sequence[Summary]) -> Iterator[tuple[str, list[str]]]:
-    """Yield the rows of rated motors (rms of nominal) with a cell for each run shown.
+    """Yield the table rows for motors with known ratings, with one cell for each run shown: rms and nominal value.
 
-    With many motors only the most loaded ones are shown.
+    If there are many motors, only the most heavily loaded ones are shown.
     """
     for quantity, unit, label in _RATED:
         rms, nominal = f"{quantity}_rms_{unit}", f"nominal_{quantity}_{unit}"
@@ -349,7 +351,7 @@ def _motor_rows(summaries: Sequence[Summary], shown: Sequence[Summary]) -> Itera
             yield escaped_line(f"{joint}: {label}"), cells
 
 
-# Ratings of motors: quantity and unit as in the keys of the summary, and label in the table.
+# Motor ratings: quantity and unit as in the keys of the summary, and label in the table.
 _RATED = (
     ("current", "A", "rms of nominal [A]"),
     ("torque", "N_m", "rms of nominal [N m]"),
@@ -380,7 +382,7 @@ errors = Terminal(stderr=True, soft_wrap=True, highlight=False, emoji=False)
 
 
 def print_line(text: str) -> None:
-    """Print text on standard output without wrapping; names in it must be :func:`escaped`."""
+    """Print text to standard output without wrapping; pass names in the text through :func:`escaped` first."""
     console.print(text, highlight=False, soft_wrap=True)
 
 
@@ -389,21 +391,21 @@ def print_written(path: Path) -> None:
     print_line(f"Written to {escaped(path)}")
 
 
-# Maximum title width of a progress bar.
+# Maximum width of the title of a progress bar [characters].
 _TITLE_WIDTH = 22
-# Expected compilation time of the kernels before their first compilation [s].
+# Expected compilation time of the kernels if they have never been compiled before [s].
 _COMPILED_S = 90.0
-# Files in the folder of a run, and in the folder of a comparison.
+# Names of the record in the folder of a run, and of the summary in the folder of a comparison.
 RECORD, COMPARISON = "record.h5", "comparison.json"
 
 
 def labelled(paths: Sequence[Path], *, trust: bool = False) -> dict[str, Record]:
-    """Load records, or those in folders, by label: their variant, with a number if it repeats.
+    """Load records from files and folders, and return them by label: the variant, numbered if it occurs repeatedly.
 
     Raises
     ------
     RecordError
-        See :meth:`dynsim.record.Record.load`.
+        As for :meth:`dynsim.record.Record.load`.
     """
     from dynsim.record import Record
     from dynsim.system.files import file_name
@@ -418,7 +420,7 @@ def labelled(paths: Sequence[Path], *, trust: bool = False) -> dict[str, Record]
 
 
 def record_files(paths: Sequence[Path]) -> list[Path]:
-    """Return the paths of records; a folder is replaced by its record, or by the records of its variants.
+    """Return the paths of records; replace each folder by the record in it, or by the records of its variants.
 
     Raises
     ------
@@ -440,7 +442,7 @@ def record_files(paths: Sequence[Path]) -> list[Path]:
 
 
 def _variant_records(folder: Path) -> list[Path]:
-    """Return the records in the subfolders of a folder: variants in the order of the comparison, then others."""
+    """Return the records in the subfolders of a folder: variants in the order of the comparison, then all others."""
     files = sorted(folder.glob(f"*/{RECORD}"))
     try:
         order = list(json.loads((folder / COMPARISON).read_text(encoding="utf-8"))["variants"])
@@ -451,13 +453,13 @@ def _variant_records(folder: Path) -> list[Path]:
 
 @contextmanager
 def drawing(folder: Path, quiet: bool) -> Iterator[None]:
-    """Show a status while figures are being drawn."""
+    """Show a status line while figures are being drawn in the block."""
     with nullcontext() if quiet else console.status(f"drawing {escaped(folder)}"):
         yield
 
 
 def _bars(*columns: str | ProgressColumn, quiet: bool) -> Progress:
-    """Create progress bars with these columns and elapsed and remaining time, removed at the end without a terminal."""
+    """Create progress bars with these columns and the elapsed and remaining time; a terminal keeps them at the end."""
     from rich import progress
     from rich.table import Column
 
@@ -473,7 +475,7 @@ def _bars(*columns: str | ProgressColumn, quiet: bool) -> Progress:
 
 
 def show_compilation(status: Status, task: str, now: Compilation | None) -> None:
-    """Show in a status what is being compiled."""
+    """Show in the status line which kernels are being compiled."""
     status.update(task if now is None else f"{task}: {escaped(now.text)}, {now.elapsed:.0f} s")
 
 
@@ -500,12 +502,12 @@ def _compilation_shown(quiet: bool, show: Callable[[Compilation | None], None] =
 
 @contextmanager
 def progress(scenarios: Sequence[Scenario], quiet: bool) -> Iterator[VariantProgress]:
-    """Show a progress bar per scenario, and one while its references take long; yields the report function."""
+    """Show a progress bar per scenario, and one more if its references take long; yield a progress callback."""
     from rich.progress import BarColumn
 
     from dynsim.engine import REFERENCES, SIMULATION
 
-    # Fits into 80 columns up to 9999 s: the bar shrinks, the times do not.
+    # The text fits into 80 columns for times up to 9999 s: the bar shrinks, but the times do not.
     done = "{task.completed:.2f} / {task.total:g} s {task.fields[what]}"
     kernels: list[TaskID] = []
 
@@ -537,7 +539,7 @@ def progress(scenarios: Sequence[Scenario], quiet: bool) -> Iterator[VariantProg
 
 @contextmanager
 def sweep_progress(runs: int, quiet: bool) -> Iterator[Callable[[int, int], None]]:
-    """Show a progress bar over all runs of a sweep, with the number of failed runs; yields the report function."""
+    """Show a progress bar for all runs of a sweep and the number of failed runs; yield a progress callback."""
     from rich.progress import BarColumn, MofNCompleteColumn
 
     bar = _bars("runs", BarColumn(), MofNCompleteColumn(), "{task.fields[failed]}", quiet=quiet)
@@ -548,7 +550,7 @@ def sweep_progress(runs: int, quiet: bool) -> Iterator[Callable[[int, int], None
             bar.update(task, failed="" if now is None else f"compiling, {now.elapsed:.0f} s")
 
     def report(done: int, failed: int) -> None:
-        # Started here, so that an error before the first run is printed without a bar.
+        # Start the bar here, so that an error before the first run is printed without a bar.
         bar.start()
         bar.update(task, completed=done, failed=f"{failed} failed" if failed else "")
 
@@ -562,7 +564,7 @@ def sweep_progress(runs: int, quiet: bool) -> Iterator[Callable[[int, int], None
 
 @contextmanager
 def plan_progress(quiet: bool) -> Iterator[Callable[[str, float], None]]:
-    """Show a progress bar over the stages of a plan; yields the report function (stage, fraction done)."""
+    """Show a progress bar for the stages of a plan; yield a callback for the stage and the fraction done."""
     from rich.progress import BarColumn
 
     with _bars("{task.description}", BarColumn(), quiet=quiet) as bar, _compilation_shown(quiet):
@@ -572,7 +574,7 @@ def plan_progress(quiet: bool) -> Iterator[Callable[[str, float], None]]:
 
 @contextmanager
 def film_progress(quiet: bool) -> Iterator[Callable[[int, int], None]]:
-    """Show a progress bar over the frames of a film; yields the report function."""
+    """Show a progress bar for the frames of an animation; yield a progress callback."""
     from rich.progress import BarColumn, MofNCompleteColumn
 
     with _bars("frames", BarColumn(), MofNCompleteColumn(), quiet=quiet) as bar:
@@ -580,12 +582,12 @@ def film_progress(quiet: bool) -> Iterator[Callable[[int, int], None]]:
         yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
-# Table of a brace plan. A brace that is in contact for a smaller fraction of the time counts as lifted off.
+# Table of a brace plan. A brace counts as lifted off if it is in contact for less than this fraction of the time.
 LIFTED = 0.999
 
 
 def print_plan(plan: BracePlan) -> None:
-    """Print a row for each number of braces, then the reasons for rejected and missing plans."""
+    """Print a table row for each number of braces, then the reasons why plans were rejected or not found."""
     table = _table(f"{plan.task.scenario.title}: braces", box=box.HEAVY_HEAD)
     heads = (
         "braces", "on", "heat [W]", "simulated [W]", "all energy [J]", "k_p [V/rad]", "forces [N]", "rounds",
@@ -597,7 +599,7 @@ def print_plan(plan: BracePlan) -> None:
         table.add_row(*_cells(size))
     console.print(table)
     if any(size.planned is not None and size.agreed == 0 for size in plan.sizes):
-        print_line("rounds: search rounds that found this heat independently; 0 if only exchanging braces found it")
+        print_line("rounds: search rounds that found this heat independently; 0 if it was found by exchanging braces")
     best = plan.best
     if best is not None:
         print_line(f"best: {escaped(best.label)}{' (rejected)' if best.survives is False else ''}")
@@ -631,13 +633,13 @@ def _cells(size: Size) -> tuple[str, ...]:
 
 
 def _tolerated(shift_m: float | None, friction: float | None) -> list[str]:
-    """Return the errors that a rejected plan tolerates, within the tested range."""
+    """Return a text about the errors that a rejected plan tolerates, within the tested range."""
     texts = []
     if shift_m is not None:
-        texts.append(f"surfaces {1e3 * shift_m:.2g} mm off" if shift_m else "no tested error of the surfaces")
+        texts.append(f"{1e3 * shift_m:.2g} mm surface error" if shift_m else "no tested surface error")
     if friction is not None:
-        texts.append(f"friction {100 * friction:.2g} % off" if friction else "no tested error of friction")
-    return [f"tolerates, one error at a time in both directions, {' and '.join(texts)}"] if texts else []
+        texts.append(f"{100 * friction:.2g} % friction error" if friction else "no tested friction error")
+    return [f"tolerates, one at a time and in both directions: {' and '.join(texts)}"] if texts else []
 
 
 def _notes(size: Size) -> list[str]:

@@ -33,11 +33,11 @@ BaseSpeedOption = Annotated[float, option("M/S", "Maximum speed of the mobile ba
 LongestOption = Annotated[float, option("S", "Maximum duration [s].", min=1.0, max=36000.0)]
 HttpPortOption = Annotated[int, option("N", "Local port of the web page; 0 picks a free one.", min=0, max=65535)]
 UntilClosedOption = Annotated[
-    bool, typer.Option("--until-closed", help="Also end when the last browser window closes.")
+    bool, typer.Option("--until-closed", help="End the drive also when the last browser window is closed.")
 ]
 OpenOption = Annotated[bool, typer.Option("--open/--no-open", help="Open the web page in a browser.")]
 
-# Ticks later than this are reported at the end [s].
+# A delay with respect to real time is reported at the end if it exceeds this value [s].
 LATE = 0.05
 
 
@@ -70,7 +70,7 @@ def teleop(
     loaded = load_scenario(scenario, variant, parsed_overrides(overrides))
     folder = out or new_folder(Path("results", loaded.name))
     check_writable(folder, RUN_FILES)
-    with console.status("loading the kernels; the first time, compiling them takes half a minute"):
+    with console.status("loading the kernels; on first use, compiling them takes half a minute"):
         session = begin(loaded, limits=SpeedLimits(speed, turn, base_speed), longest=longest)
     drive = LiveDrive(session, loaded.variant or loaded.name)
     try:
@@ -78,7 +78,7 @@ def teleop(
         print_address(address, "Ctrl-C ends the drive and saves it", open_=open_)
         drive.run(until_closed=until_closed)
     except KeyboardInterrupt:
-        # Before the first tick.
+        # The user interrupted the drive before its first tick.
         interruption.answered()
         drive.report.ended = "interrupted"
     finally:
@@ -94,7 +94,7 @@ def teleop(
         print_drive(report, session.ticks * session.period, folder)
     write_view({loaded.variant or loaded.name: record}, folder, quiet)
     if report.stop is not None:
-        errors.print(f"results up to the stop are in {escaped(folder)}, marked incomplete")
+        errors.print(f"results up to the stop are in {escaped(folder)} and are marked incomplete")
         raise report.stop
 
 
@@ -106,7 +106,7 @@ def require(extra: str, *packages: str) -> None:
 
 
 def print_address(address: str, ending: str, *, open_: bool) -> None:
-    """Print the address of the page, even with --quiet, because driving requires it."""
+    """Print the address of the page, even with --quiet, because the user needs it to drive."""
     print_line(f"Drive in a browser on this machine: {address}")
     console.print(ending, highlight=False)
     if open_:
@@ -114,7 +114,7 @@ def print_address(address: str, ending: str, *, open_: bool) -> None:
 
 
 def new_folder(parent: Path) -> Path:
-    """Return the first of ``drive_1``, ``drive_2``, … that does not exist; a drive must not overwrite another."""
+    """Return the first of ``drive_1``, ``drive_2``, … that does not exist, so that no earlier drive is overwritten."""
     return next(folder for k in itertools.count(1) if not (folder := parent / f"drive_{k}").exists())
 
 
@@ -123,7 +123,8 @@ def print_drive(report: DriveReport, driven: float, folder: Path) -> None:
     late = sorted(report.late)
     middle, most = 1e3 * late[len(late) // 2], 1e3 * late[-1 - len(late) // 100]
     text = (
-        f"Driven for {driven:.1f} s ({escaped(report.ended)}); tick delay: median {middle:.1f} ms, 99 % {most:.1f} ms"
+        f"Driven for {driven:.1f} s ({escaped(report.ended)}); "
+        f"tick delay: median {middle:.1f} ms, 99th percentile {most:.1f} ms"
     )
     behind = f"; {report.lost:.1f} s behind real time" if report.lost > LATE else ""
     print_line(text + behind)

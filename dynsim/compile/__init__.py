@@ -1,1 +1,1 @@
-"""Compilation of descriptions to kernel tables and references: model, contacts, loads, postures, equilibrium, scene."""
+"""Compilation of descriptions into kernel tables and references: model, contacts, loads, postures, statics, scene."""

@@ -1,4 +1,4 @@
-"""Braces of an arm, and their forces of least motor heat for prescribed motions."""
+"""Braces of an arm, and the brace forces that minimize the motor heat of prescribed motions."""
 
 from __future__ import annotations
 
@@ -36,19 +36,20 @@ class Brace:
     min_N : float, optional
         Minimum normal force [N].
     normal_force : float, optional
-        Commanded normal force [N]; default: the force of least heat.
+        Commanded normal force [N]; default: the force that minimizes the motor heat.
     sliding : array_like, shape (3,), optional
-        Velocity along the surface in the world frame, of which only the direction counts: f_t = μ f_n against it;
-        default: the point does not slide, |f_t| ≤ μ f_n.
+        Sliding velocity along the surface in the world frame. Only its direction matters: a friction force f_t = μ f_n
+        opposes it. Default: the point does not slide, and |f_t| ≤ μ f_n.
 
     Raises
     ------
     ModelError
-        If a vector is not three finite numbers or has no direction, a value is negative, or the commanded force pulls.
+        If a vector does not have three finite numbers, the normal is zero, sliding has no component along the surface,
+        a value is negative, or the commanded force would pull.
 
     Notes
     -----
-    Arrays are stored as read-only copies. Used by :meth:`dynsim.Model.brace_statics`.
+    Arrays are stored as read-only copies. :meth:`dynsim.Model.brace_statics` uses braces.
 
     Examples
     --------
@@ -124,7 +125,7 @@ class BraceStatics:
         Minimum and maximum normal force of each brace for which the motion is possible [N].
     certificate : (n,) ndarray or None
         If infeasible, joint rates ω that prove it: for all torques within their limits and all admissible brace forces,
-        ω·(tau + Jᵀ f) < ω·(M v̇ + h + g + losses), although both sides would have to be equal.
+        ω·(tau + Jᵀ f) < ω·(M v̇ + h + g + losses), although a possible motion requires both sides to be equal.
     """
 
     feasible: bool
@@ -137,16 +138,16 @@ class BraceStatics:
 
 
 class BracePlanner:
-    """Kernel tables of the braces of a robot, with workspace.
+    """Kernel tables for the braces of a robot, including the workspace of the solver.
 
     Parameters
     ----------
     robot : Robot
         Description of the robot.
     model : ModelArrays
-        Its kernel tables.
+        Kernel tables of the robot.
     links : (c,) sequence of int
-        Body of each brace.
+        Index of the body of each brace.
     """
 
     def __init__(self, robot: Robot, model: ka.ModelArrays, links: Sequence[int]) -> None:
@@ -168,7 +169,7 @@ class BracePlanner:
         return positions, velocities
 
     def least_heat(self, q: Array, v: Array, vdot: Array, tables: Array) -> tuple[Array, Array, int]:
-        """Compute torques and normal forces of least heat along a motion.
+        """Compute the torques and normal forces that minimize the motor heat along a motion.
 
         Parameters
         ----------
@@ -196,7 +197,7 @@ class BracePlanner:
 
 
 class PreparedBraces(BracePlanner):
-    """Braces of a robot with everything that does not change between states."""
+    """Braces of a robot, with all precomputed data that does not depend on the state."""
 
     def __init__(self, robot: Robot, model: ka.ModelArrays, braces: Mapping[str, Brace]) -> None:
         self.names, self.braces = tuple(braces), tuple(braces.values())
@@ -214,11 +215,11 @@ class PreparedBraces(BracePlanner):
         self._torques, self._normal = np.zeros((1, n)), np.zeros((1, len(braces)))
 
     def match(self, braces: Mapping[str, Brace]) -> bool:
-        """Return whether these are the same objects under the same names, so that they cannot have changed."""
+        """Return whether these are the prepared braces: the same immutable objects with the same names."""
         return self.names == tuple(braces) and all(a is b for a, b in zip(self.braces, braces.values(), strict=True))
 
     def solve(self, q: Array, v: Array, vdot: Array) -> BraceStatics:
-        """Solve the brace forces for one state."""
+        """Compute the brace forces for one state."""
         arrays = self.arrays
         self._q[0], self._v[0], self._vdot[0] = q, v, vdot
         solved = brace_statics(
@@ -246,7 +247,7 @@ def brace_rows(point: Array, normals: Array, friction: Array, least: float, comm
     Parameters
     ----------
     point : (3,) or (T, 3) ndarray
-        Point on its link [m].
+        Point in the frame of its link [m].
     normals : (T, 3) ndarray
         Surface normals of any length.
     friction : (T,) ndarray
@@ -254,7 +255,7 @@ def brace_rows(point: Array, normals: Array, friction: Array, least: float, comm
     least : float
         Minimum normal force [N].
     commanded : float
-        Commanded normal force [N]; NaN for none.
+        Commanded normal force [N]; NaN if no force is commanded.
     sliding : (T, 3) ndarray
         Slip velocities; zero if the point does not slide.
     """
@@ -273,7 +274,7 @@ def brace_rows(point: Array, normals: Array, friction: Array, least: float, comm
 
 
 def _motor_row(motor: Motor | Servo | TorqueSource | None) -> Array:
-    """Return a row of the kernel table of motors; its limits follow from the rate."""
+    """Return a motor's row of the kernel table; the kernels compute the torque limits from it and the joint rate."""
     row = np.zeros(kb.MOTOR_SIZE)
     row[kb.CONSTANT] = 1.0
     if isinstance(motor, TorqueSource):

@@ -1,4 +1,4 @@
-"""Body poses, distances of points and link axes from surfaces, and sinking, at samples of joint positions."""
+"""Body poses, distances of points and link axes from surfaces, and sunken bodies, at sampled joint positions."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import numpy as np
 from dynsim.model.description import Array, Link, Quadric, Robot
 from dynsim.model.surfaces import Surface
 
-# Depth beyond its radius at which a body does not yet count as sinking [m]: the tolerance of contacts at the start.
+# Depth in addition to its radius up to which a body does not count as sunken [m]; equals the contact start tolerance.
 SLACK = 1e-6
-# Number of parts of an axis for computing its depth in a box or a height field.
+# Number of segments into which an axis is divided to compute its depth in a box or a height field.
 POINTS = 16
 
 
@@ -44,7 +44,8 @@ class Sinking:
 def poses(robot: Robot, q: Array) -> Iterator[tuple[Link, Array, Array]]:
     """Yield each body with R_WB, (3, 3, T), and p_WB, (3, T) [m], at joint positions q, (T, nq).
 
-    Vectorized over the samples, which are contiguous in memory: thousands of samples cost a millisecond.
+    The computation is vectorized over the samples, which are contiguous in memory: thousands of samples take a
+    millisecond.
     """
     q = np.ascontiguousarray(q.T)
     last_child = {link.parent: link.name for link in robot.links}
@@ -66,9 +67,10 @@ def poses(robot: Robot, q: Array) -> Iterator[tuple[Link, Array, Array]]:
 
 
 def axis_ends(robot: Robot) -> dict[str, list[Array]]:
-    """Return the end points of the axes of each link, (3,) in its frame [m]; the axes start at its joint.
+    """Return the end points of the axes of each link, (3,) in its frame [m]; the axes start at the link's joint.
 
-    The end is :attr:`Link.tip` if it is set, otherwise the joints that the link carries, and the hand.
+    If :attr:`Link.tip` is set, it is the only end point. Otherwise the end points are the joints that the link carries
+    and the hand.
     """
     tips: dict[str, list[Array]] = {link.name: [] if link.tip is None else [link.tip] for link in robot.links}
     open_ended = {link.name for link in robot.links if link.tip is None}
@@ -95,7 +97,7 @@ def gaps(
 def sinking(robot: Robot, surfaces: Mapping[str, Surface], q: Array) -> list[Sinking]:
     """Return the bodies whose axes are below a surface by more than their radius, at samples q, (T, nq).
 
-    The axes are defined by :func:`axis_ends`. A body of unknown radius has radius zero.
+    The axes are defined by :func:`axis_ends`. A body whose radius is unknown is treated as if its radius were zero.
     """
     sunk: list[Sinking] = []
     if not surfaces or not len(q):
@@ -113,7 +115,7 @@ def sinking(robot: Robot, surfaces: Mapping[str, Surface], q: Array) -> list[Sin
 
 
 def by_surface(sunk: Sequence[Sinking]) -> dict[str, list[Sinking]]:
-    """Return the sinking bodies for each surface that has any."""
+    """Return the sunken bodies grouped by surface."""
     return {surface: [s for s in sunk if s.surface == surface] for surface in dict.fromkeys(s.surface for s in sunk)}
 
 
@@ -129,11 +131,11 @@ def _axis_gaps(robot: Robot, surfaces: Mapping[str, Surface], q: Array) -> Itera
 
 
 def _segment_gap(surface: Surface, start: Array, along: Array) -> Array:
-    """Return the minimum signed distance of the lines from ``start`` to ``start + along``, (T, 3), without the start
-    points.
+    """Return the minimum signed distance of the segments from ``start`` to ``start + along``, (T, 3).
 
-    Exact for plane, sphere and cylinder, whose distance increases with C: along a line C is a parabola. For other
-    surfaces, the minimum over some points on the lines.
+    The start points are not examined. The result is exact for planes, spheres and cylinders, because their distance
+    increases with C, and C is a parabola along a line. For other surfaces, the result is the minimum over some points
+    on the segments.
     """
     gap = surface.gaps(start + along)
     if not isinstance(surface, Quadric):

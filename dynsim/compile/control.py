@@ -23,16 +23,16 @@ from dynsim.system.memo import recall
 if TYPE_CHECKING:
     from dynsim.snake.description import TaskSpaceController
 
-# Samples per segment of the reference splines, and segments that are sampled together.
+# Samples per segment of the reference splines, and number of segments that are sampled at once.
 _PER_SEGMENT = 4
 _PIECE = 4096
-# Knots spanned by the longest steps of an implicit method (20 ms; 55 ms for the published arm).
+# Number of knots that the longest steps of an implicit method span (20 ms; 55 ms for the published arm).
 _STRADDLED = 3.0
 
-# Times within this of the end of the references count as at the end, relative to that time.
+# Times within this distance of the end of the references, relative to the end time, count as the end.
 END_SLACK = 1e-12
 
-# Controller keys that plan for a whole run and are not available with an operator.
+# Controller keys that prescribe a whole run in advance and are not available with an operator.
 PLANNED = ("hand", "base", "joints", "torques", "feed_forward", "brace")
 
 # Positions of a joint: samples, (T,) [rad or m], or a function of times, (T,) [s].
@@ -49,14 +49,14 @@ class HandPath(Protocol):
 
 @runtime_checkable
 class BasePath(Protocol):
-    """A motion of a mobile base without side slip; its position follows from it."""
+    """A motion of a mobile base without side slip: distance and turn, which determine its position."""
 
     def motion(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return distance ahead [m] and turn to the left [rad] since the start at times t [s], shape (T,) → (T, 2)."""
+        """Return distance forward [m] and turn to the left [rad] since the start, at times t [s], (T,) → (T, 2)."""
 
 
 def held_values(robot: Robot) -> NDArray[np.float64]:
-    """Return the references of motors that do not move, (na,): initial joint positions; zero for torque sources."""
+    """Return references, (na,), with which the motors hold: initial joint positions, or zero for torque sources."""
     initial = dict(zip(robot.joint_names, robot.initial[list(robot.position_index)], strict=True))
     return np.array([0.0 if isinstance(m, TorqueSource) else initial[m.joint] for m in robot.motors])
 
@@ -68,9 +68,9 @@ class JointControl:
     Attributes
     ----------
     k_p, k_d : (na,) ndarray
-        Gains [V/rad, V s/rad]; only DC motors use them, but ``k_p`` of a servo shows whether it follows its position.
+        Gains [V/rad, V s/rad]. Only DC motors use them, but the ``k_p`` of a servo shows whether it controls position.
     reference : ReferenceArrays
-        Joint references; for a torque source its torques [N m].
+        Joint references; for a torque source, its commanded torques [N m].
     path : HandPath or None
         Path that the hand is to follow.
     sample_time : float or None
@@ -94,7 +94,7 @@ class JointControl:
 
     @classmethod
     def absent(cls, robot: Robot, targets: Mapping[str, float] | None = None) -> JointControl:
-        """Return a control without controller: DC motors at zero volts, servos at their start, torque sources at zero.
+        """Return the control if no controller is set: zero voltages and torques; servos hold their initial positions.
 
         ``targets`` replaces the references of some joints [rad or m].
         """
@@ -115,11 +115,10 @@ class JointControl:
         sample_time: float | None = None,
         voltages: ArrayLike | None = None,
     ) -> JointControl:
-        """Return the voltage PD controller u = k_p (q_d − q) + k_d (v_d − v) for joint positions given as samples or
-        functions.
+        """Return the voltage PD controller u = k_p (q_d − q) + k_d (v_d − v) for prescribed joint positions.
 
-        q_d is a quintic spline through the samples, v_d its derivative. Joints without positions keep their initial
-        position.
+        The positions are samples or functions. q_d is a quintic spline through the samples, and v_d is its derivative.
+        Joints without positions keep their initial positions.
 
         Parameters
         ----------
@@ -132,7 +131,7 @@ class JointControl:
         positions : mapping of str to array_like or callable, optional
             Positions, (T,) [rad or m], for each joint, or a function that returns them for ``times``.
         path : HandPath, optional
-            Path of the hand, for tracking errors in summary and figures.
+            Path of the hand, used for tracking errors in the summary and figures.
         sample_time : float, optional
             Period of a zero-order hold of the voltages [s]; default: continuous.
         voltages : array_like, shape (T, na), optional
@@ -141,7 +140,7 @@ class JointControl:
         Raises
         ------
         ModelError
-            If a joint has no motor, or shape or values of samples, times or gains are invalid.
+            If a joint has no motor, or the shape or values of the samples, times or gains are invalid.
         """
         positions = positions or {}
         driven = [motor.joint for motor in robot.motors]
@@ -181,17 +180,17 @@ class JointControl:
 
     @property
     def end(self) -> float:
-        """Time up to which the moving references are defined [s]; infinite if none moves."""
+        """Time up to which the moving references are defined [s]; infinite if no reference moves."""
         begin, spacing = self.reference.grid
         moving = bool((self.reference.spline >= 0).any())
         return float(begin + spacing * len(self.reference.coefficients)) if moving else np.inf
 
     def bends(self, rtol: float, atol: float) -> NDArray[np.float64]:
-        """Return the knots at which references bend within a long step [s], increasing: error control samples them too
-        coarsely.
+        """Return the times of knots [s], increasing, where references bend too sharply for the longest steps.
 
-        The fifth derivative jumps there: three knots later, the polynomials of the adjacent segments differ by more
-        than ``atol`` + ``rtol`` × the span of the spline. Sampled commands do not bend.
+        The samples of error control are too coarse to detect these bends. The fifth derivative jumps at such a knot:
+        three knots later, the polynomials of the adjacent segments differ by more than ``atol`` + ``rtol`` × the span
+        of the spline. Sampled commands have no such knots.
         """
         spacing, times = float(self.reference.grid[1]), []
         for splines in (self.reference.coefficients, self.reference.voltage):
@@ -206,10 +205,10 @@ class JointControl:
         return np.asarray(self.reference.grid[0] + spacing * (knots + 1.0))
 
     def positions(self, robot: Robot) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-        """Yield times, (T,) [s], and coordinates, (T, nq), of the references, in pieces of some thousand samples.
+        """Yield times, (T,) [s], and coordinates, (T, nq), of the references, in pieces of a few thousand samples.
 
-        Sampled at the knots and at three times between adjacent knots. Joints without a moving reference stay at their
-        start; a base moves as its wheels roll.
+        The samples are at the knots and at three times between adjacent knots. Joints without a moving reference keep
+        their initial positions; a mobile base moves as its wheels roll.
 
         Parameters
         ----------
@@ -236,9 +235,7 @@ class JointControl:
             yield times.ravel(), positions
 
     def _wheels(self, robot: Robot, segments: slice) -> NDArray[np.float64]:
-        """Return the wheel references of a mobile base as splines, (segments, 2, 6); constant for a wheel that does not
-        move.
-        """
+        """Return the wheel references of a mobile base as splines, (segments, 2, 6); constant for a wheel at rest."""
         assert robot.base is not None
         k, _ = base_row(robot)
         driven = [motor.joint for motor in robot.motors]
@@ -274,13 +271,14 @@ class JointControl:
         if self.path is None:
             return None
         end = self.end
-        # References of a whole run may end earlier by rounding; the target there is the one at their last sample.
+        # Because of rounding, the references may end just before the end of the run. The target then stays at the
+        # target of their last sample.
         ended = t > end + END_SLACK * max(1.0, abs(end))
         return targets_on(self.path, np.where(ended, end, t) if ended.any() else t)
 
 
 def targets_on(path: HandPath, t: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return positions on a path at times t [s], (T,) → (T, 3) [m], computed only once."""
+    """Return positions on a path at times t [s], (T,) → (T, 3) [m]; repeated calls return a cached result."""
     return recall("targets", lambda: path.position(t), path, t)
 
 
@@ -298,7 +296,10 @@ def _reference(
     grid: tuple[float, float] = (0.0, 1.0),
     coefficients: NDArray[np.float64] | None = None,
 ) -> ReferenceArrays:
-    """Return references for the kernels: ``values``, (na,), if ``spline`` is HELD_POSITION, otherwise this column."""
+    """Return references for the kernels: for each motor its value in ``values`` or the spline in this column.
+
+    ``spline`` contains the column of each motor, or HELD_POSITION for a constant reference.
+    """
     return ReferenceArrays(
         spline=integers(np.full(len(values), ka.HELD_POSITION) if spline is None else spline),
         held=reals(values),

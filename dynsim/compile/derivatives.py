@@ -1,9 +1,9 @@
 """Derivatives of inverse dynamics in closed form, after Singh, Russo and Wensing (2022).
 
-Six-vectors at the world origin: motions (ω, v), forces (n, f). × is the cross product of motions, ×* of a motion and a
-force, and (F ×̄*) V = V ×* F. S is the axis of a joint, V and A (minus gravity) are velocity and acceleration of its
-body, V_p and A_p of the body it is mounted on; I and f are spatial inertia and wrench of a body; I_c, f_c and B_c are
-sums of I, f and B over a subtree:
+All six-vectors refer to the world origin: motions (ω, v) and forces (n, f). × is the cross product of two motions, ×*
+the cross product of a motion and a force, and (F ×̄*) V = V ×* F. S is the axis of a joint, V and A (minus gravity) are
+the velocity and acceleration of its body, and V_p and A_p those of the body on which the joint is mounted. I and f are
+the spatial inertia and wrench of a body; I_c, f_c and B_c are the sums of I, f and B over a subtree:
 
     S' = V_p × S,   S'' = A_p × S + V_p × S',   Ṡ = V × S
     2 B = (V ×*) I − I (V ×) + (I V) ×̄*
@@ -81,19 +81,17 @@ def inverse_dynamics_derivatives(arrays: ModelArrays, links: Array) -> InverseDy
 
 
 def _joint_bodies(parent: NDArray[np.int64], base: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return for each row the link of the body that its joint carries: the link of the joint's last row."""
+    """Return, for each row, the link of the body that its joint carries: the link of the joint's last row."""
     body = np.arange(len(parent), dtype=np.int64)
     for i in range(len(parent) - 1, 0, -1):
-        # A later row of a joint has the same mounting as its parent, the row before it.
+        # Every later row of a joint is mounted on the same body as the row before it, which is its parent.
         if parent[i] >= 0 and base[i] == base[parent[i]] and base[i] != parent[i]:
             body[parent[i]] = body[i]
     return body
 
 
 def _composites(arrays: ModelArrays, links: Array, V: Array, A: Array) -> tuple[Array, Array, Array]:
-    """Return inertia (n, 6, 6), 2 B (n, 6, 6) and wrench I A + V ×* I V (n, 6) of each single body, at the world
-    origin.
-    """
+    """Return the inertia (n, 6, 6), 2 B (n, 6, 6) and wrench I A + V ×* I V (n, 6) of each body at the world origin."""
     tables = arrays.body
     n = len(tables)
     R, p = links[:, ka.R : ka.R + 9].reshape(n, 3, 3), links[:, ka.P : ka.P + 3]
@@ -114,7 +112,7 @@ def _composites(arrays: ModelArrays, links: Array, V: Array, A: Array) -> tuple[
 
 
 def _skew(a: Array) -> Array:
-    """Return [a]× of vectors (…, 3), (…, 3, 3)."""
+    """Return the cross-product matrices [a]×, (…, 3, 3), of vectors (…, 3)."""
     zero = np.zeros(a.shape[:-1])
     x, y, z = a[..., 0], a[..., 1], a[..., 2]
     rows = [zero, -z, y, z, zero, -x, -y, x, zero]
@@ -122,7 +120,7 @@ def _skew(a: Array) -> Array:
 
 
 def _motion_matrix(V: Array) -> Array:
-    """Return (V ×) on motions, (…, 6, 6); on forces it is −(V ×)ᵀ."""
+    """Return the matrices (V ×) that act on motions, (…, 6, 6); the matrices that act on forces are −(V ×)ᵀ."""
     out = np.zeros((*V.shape, 6))
     out[..., :3, :3] = out[..., 3:, 3:] = _skew(V[..., :3])
     out[..., 3:, :3] = _skew(V[..., 3:])
@@ -130,7 +128,7 @@ def _motion_matrix(V: Array) -> Array:
 
 
 def _force_matrix(F: Array) -> Array:
-    """Return (F ×̄*) with (F ×̄*) V = V ×* F, (…, 6, 6)."""
+    """Return the matrices (F ×̄*), (…, 6, 6), defined by (F ×̄*) V = V ×* F."""
     out = np.zeros((*F.shape, 6))
     out[..., :3, :3] = -_skew(F[..., :3])
     out[..., :3, 3:] = out[..., 3:, :3] = -_skew(F[..., 3:])

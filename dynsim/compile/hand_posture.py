@@ -12,14 +12,14 @@ from dynsim.errors import ModelError, UnreachableReference
 from dynsim.model.description import Array, Contact, Robot
 
 ITERATIONS = 200
-# Largest change of a coordinate in one iteration [rad or m]; prevents jumps to another solution branch.
+# Maximum change of a coordinate in one iteration [rad or m]; it prevents jumps to another solution branch.
 STEP_MAX = 0.3
-# Maximum damping, far from the target; it vanishes near the target.
+# Maximum damping, which applies far from the target; the damping vanishes near the target.
 DAMPING = 1e-2
 
 
 class Kinematics(Protocol):
-    """The part of :class:`dynsim.Model` required to compute postures."""
+    """Methods of :class:`dynsim.Model` that are required to compute postures."""
 
     robot: Robot
     n: int
@@ -31,14 +31,14 @@ class Kinematics(Protocol):
 
 def turn_error(R: Array, wanted: Array) -> Array:
     """Return the rotation vector that rotates R to ``wanted``, (3,) [rad]."""
-    from scipy.spatial.transform import Rotation  # import takes a third of a second
+    from scipy.spatial.transform import Rotation  # imported here because it takes a third of a second
 
     return np.asarray(Rotation.from_matrix(wanted @ R.T).as_rotvec())
 
 
 def hand_turns(model: Kinematics, q: Array, orientation: Array) -> Array:
     """Return the angles between the hand's orientation and a target orientation, postures (T, nq) → (T,) [rad]."""
-    from scipy.spatial.transform import Rotation  # import takes a third of a second
+    from scipy.spatial.transform import Rotation  # imported here because it takes a third of a second
 
     body, axes = model.robot.attach(*model.robot.hand)[0], model.robot.hand_axes
     R = np.array([model.body_pose(body, row)[0] for row in q]).reshape(-1, 3, 3)
@@ -54,7 +54,10 @@ def hand_posture(
     tolerance: float,
     moving: Sequence[str] | None = None,
 ) -> Array:
-    """Find a posture, see :meth:`dynsim.Model.inverse_kinematics`; only the joints ``moving`` change, default: all."""
+    """Find a posture by changing only the joints in ``moving`` (default: all joints).
+
+    See :meth:`dynsim.Model.inverse_kinematics`.
+    """
     robot = model.robot
     if robot.couplings or model.nq != model.n:
         raise ModelError("inverse_kinematics: coupled joints and joints with several coordinates are not supported")
@@ -86,7 +89,7 @@ def hand_posture(
     stuck = f"; at their limits: {', '.join(at)}" if at else ""
     left = float(np.abs(error).max())
     raise UnreachableReference(
-        f"no posture found for hand, orientation and braces near the start: residual {left:.3g} [m or rad]{stuck}; "
+        f"no posture near the start satisfies all targets for hand and braces: residual {left:.3g} [m or rad]{stuck}; "
         "change the start or relax a target"
     )
 

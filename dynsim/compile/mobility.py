@@ -19,9 +19,9 @@ from dynsim.errors import ModelError
 from dynsim.model.description import Array, Contact, Robot
 from dynsim.model.surfaces import Quadric
 
-# Number of configurations at which points are compared and rows examined: a property common to all is structural.
+# Number of configurations at which points are compared and rows examined; a property that holds at all is structural.
 CONFIGURATIONS = 6
-# Points closer than this at all configurations are identical [m]; rows smaller than this at all of them are zero.
+# Points closer than this [m] at all configurations count as identical, and rows smaller than this at all as zero.
 SAME = 1e-9
 # Positions along the axis of a capsule at which its row is examined, as fractions of its length.
 SHARES = (0.0, 0.3, 0.7, 1.0)
@@ -33,7 +33,7 @@ KNOWN = 1e-3
 
 
 def random_configurations(robot: Robot, braked: Collection[int] = (), at: Array | None = None) -> list[Array]:
-    """Return random coordinates with unit quaternions, the same in every call.
+    """Return random coordinates with unit quaternions; they are the same in every call.
 
     ``braked`` joints keep their coordinates ``at``. A ball joint with a brake on one or two of its three rates still
     reaches every attitude.
@@ -67,9 +67,9 @@ def moves(
     anywhere: bool = False,
     braked: Collection[int] = (),
 ) -> bool:
-    """Return whether any joint moves any part of a candidate along the normal.
+    """Return whether any joint moves any part of a contact candidate along the surface normal.
 
-    With ``anywhere``, motion along the surface also counts; ``braked`` joints do not count.
+    With ``anywhere``, motion along the surface also counts. Joints in ``braked`` are ignored.
     """
     free = [i for i in range(model.n) if i not in braked]
     points = [contact.point]
@@ -97,7 +97,7 @@ def immobile(
     for contact in contacts:
         try:
             model.robot.attach(contact.body, contact.point)
-        except ModelError:  # unknown or fixed body: reported by the start check
+        except ModelError:  # the check at the start reports an unknown or fixed body
             still.append(False)
             continue
         anywhere = not isinstance(contact.surface, Quadric)
@@ -106,9 +106,9 @@ def immobile(
 
 
 def immobile_at(model: Model, link: int, point: Array, normal: Array, q: Array) -> bool:
-    """Return whether the motion of a link's point along a normal is only rounding error in a posture.
+    """Return whether the motion of a link's point along a normal is only a rounding error in a posture.
 
-    The same limit as :func:`dynsim.dynamics.contact.mobility.moves_along_normal`.
+    The limit is the same as in :func:`dynsim.dynamics.contact.mobility.moves_along_normal`.
     """
     position, jacobian = model.point_position_and_jacobian(link, point, q)
     places = np.vstack([model.joint_positions(q), position])
@@ -121,8 +121,8 @@ def mobility_floors(
 ) -> Array:
     """Return for each contact the mobility along its normal below which a bilateral contact has no force, (c,) [1/kg].
 
-    This is the fraction of a typical mobility below which a row counts as dependent. The typical mobility is the
-    largest of random postures, with the diagonal of the mass matrix instead of the matrix, which overestimates it by a
+    It is the fraction of a typical mobility below which a row counts as dependent. The typical mobility is the largest
+    mobility over random postures. It is computed with only the diagonal of the mass matrix, which overestimates it by a
     factor of up to n. ``braked`` joints keep their coordinates ``at``; their armature in the model includes the brake.
     """
     floors = np.zeros(len(contacts))
@@ -138,7 +138,7 @@ def mobility_floors(
 
 
 def without_inertia(model: Model, q: Array) -> list[int]:
-    """Return the indices of joints that move no inertia at coordinates q (nq,); in a series only the last one."""
+    """Return the indices of joints that move no inertia at coordinates q (nq,); only the last one in a series."""
     links = model.robot.links
     felt = model.articulated_inertia(q)
     mass = np.array([link.inertia.mass for link in links])
@@ -156,7 +156,7 @@ def without_inertia(model: Model, q: Array) -> list[int]:
     about_joint = np.where(slides, behind @ mass, (behind * (mass * lever + own)).sum(axis=1)) + model.armature
     about_origin = behind @ (mass * (centres**2).sum(axis=1))
     rounding = np.where(slides, 0.0, CANCELLED * about_origin)
-    # Undefined for bodies that have diverged.
+    # If bodies have diverged, rounding errors dominate and the inertia is unknown.
     known = rounding <= KNOWN * about_joint
     none = (felt <= np.maximum(NOTHING * about_joint, rounding)) & (known | (about_joint == 0.0))
     return [k for k in np.flatnonzero(none).tolist() if np.count_nonzero(none & behind[k]) == 1]
@@ -172,7 +172,7 @@ def moving_nothing(model: Model, q: Array) -> str:
     joints = listed([model.robot.links[k].joint for k in none])
     bodies = listed([model.robot.links[k].name for k in none])
     return (
-        f"joint {joints} moves no inertia in this posture: the mass behind it ({bodies}) is zero or on its axis "
+        f"joint {joints} moves no inertia in this posture: the mass behind it ({bodies}) is zero, or on its axis "
         "without moments of inertia; add moments of inertia or a rotor inertia, change the posture, or lock the joint"
     )
 

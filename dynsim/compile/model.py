@@ -1,4 +1,4 @@
-"""The rigid-body model for use from Python: one method per quantity, with numpy arrays."""
+"""Rigid-body model for use in Python, with one method per quantity and numpy arrays."""
 
 from __future__ import annotations
 
@@ -48,13 +48,13 @@ class Model:
     Raises
     ------
     ModelError
-        If the description is not a physically valid tree of bodies. Every method raises it for vectors of wrong length,
-        values that are not finite numbers, and unknown bodies.
+        If the description is not a physically valid tree of bodies. Every method raises it for vectors of the wrong
+        length, values that are not finite numbers, and unknown bodies.
 
     Notes
     -----
     ``M(q) v̇ + h(q, v) + g(q) = tau`` ([WM] eqs 42–44, 54–55): ``mass_matrix`` is M, ``bias_forces`` h + g. Rotor
-    inertia, gear and joint losses and contacts are not included (they belong to motors and scenario); see ``armature``
+    inertia, gear and joint losses and contacts are not included (they are set in motors and scenario); see ``armature``
     and ``damping``. The wheels of a mobile base are included except for their spin, which is in ``armature`` like the
     inertia of a rotor. Motor masses are included: they are attached to the links (:meth:`Robot.with_motors_mounted`).
 
@@ -79,9 +79,9 @@ class Model:
         self.n, self.nq = len(robot.links), robot.nq
         self._workspace = ka.workspace(self.n, 0, 0)
         self._q = np.zeros(self.nq)
-        self._braces: PreparedBraces | None = None  # braces of the last call of brace_statics
+        self._braces: PreparedBraces | None = None  # braces in the last call of brace_statics
         self._position_names = robot.position_names  # cached, because it is computed from every link's kind
-        # Without rotor inertia, for forward_dynamics and mass_matrix of the bodies alone.
+        # Tables without rotor inertia, used by forward_dynamics and mass_matrix.
         self._bodies = self.arrays._replace(body=self.arrays.body.copy())
         self._bodies.body[:, ka.ARMATURE] = 0.0
 
@@ -133,7 +133,7 @@ class Model:
         Raises
         ------
         ModelError
-            If the file is invalid; the message contains file, line, link or joint, and fix, see
+            If the file is invalid. The message contains the file, the line, the link or joint, and a fix; see
             :func:`dynsim.model.urdf.reader.read_urdf`.
 
         Examples
@@ -176,8 +176,7 @@ class Model:
         return write_urdf(with_shapes(self.robot))
 
     def to_mjcf(self, contacts: Sequence[Contact] = (), surfaces: Mapping[str, Surface] | None = None) -> str:
-        """Return the tree of bodies as MJCF text, the format of MuJoCo, including rotor inertia and losses of the
-        motors.
+        """Return the tree of bodies as MJCF text (MuJoCo's format), including the motors' rotor inertia and losses.
 
         Parameters
         ----------
@@ -218,14 +217,14 @@ class Model:
 
     @property
     def geometry(self) -> ka.ModelArrays:
-        """Tables without masses, inertias and losses: together with q they determine the poses of bodies."""
+        """Tables without masses, inertias and losses; together with q, they determine the poses of the bodies."""
         body = self.arrays.body.copy()
         body[:, ka.MASS : ka.PARAMETER] = 0.0
         return self.arrays._replace(body=body, gravity=np.zeros(3))
 
     @property
     def armature(self) -> Array:
-        """Inertia that only rotates with each joint: reflected rotor inertia J_m, spin of a wheel [kg m²], (n,)."""
+        """Inertia that only spins with each joint: reflected rotor inertia J_m or wheel spin inertia [kg m²], (n,)."""
         return self.arrays.body[:, ka.ARMATURE].copy()
 
     @property
@@ -373,7 +372,7 @@ class Model:
 
         Notes
         -----
-        Articulated-body algorithm; rotor inertia is not included.
+        The method is the articulated-body algorithm; rotor inertia is not included.
 
         Examples
         --------
@@ -388,7 +387,7 @@ class Model:
         return self._workspace.joints[:, ka.QDD].copy()
 
     def articulated_inertia(self, q: ArrayLike) -> Array:
-        """Compute the inertia that each joint moves if all joints behind it are free, including rotors.
+        """Compute the inertia, including rotors, that each joint moves if all joints beyond it are free.
 
         Parameters
         ----------
@@ -407,8 +406,8 @@ class Model:
 
         Notes
         -----
-        These are the pivots of the mass matrix, from the articulated sweep. For a joint that moves no inertia the pivot
-        is zero up to rounding, and the pivots of the joints before it are undefined.
+        These are the pivots of the mass matrix, computed by the articulated-body sweep. For a joint that moves no
+        inertia, the pivot is zero up to rounding, and the pivots of the joints before it are undefined.
 
         Examples
         --------
@@ -447,8 +446,9 @@ class Model:
 
         Notes
         -----
-        After Singh, Russo and Wensing (2022). The derivatives of forward dynamics follow, at v̇ = M⁻¹ (tau − h − g):
-        ∂v̇/∂q = −M⁻¹ ∂tau/∂q, ∂v̇/∂v = −M⁻¹ ∂tau/∂v. Rotor inertia, losses and contacts are not included;
+        Method of Singh, Russo and Wensing (2022). The derivatives of forward dynamics follow from them at
+        v̇ = M⁻¹ (tau − h − g): ∂v̇/∂q = −M⁻¹ ∂tau/∂q, ∂v̇/∂v = −M⁻¹ ∂tau/∂v. Rotor inertia, losses and contacts are not
+        included;
         :meth:`dynsim.Simulation.linearize` includes them all.
 
         Examples
@@ -462,7 +462,7 @@ class Model:
         return inverse_dynamics_derivatives(self.arrays, self._workspace.links)
 
     def brace_statics(self, q: ArrayLike, v: ArrayLike, vdot: ArrayLike, braces: Mapping[str, Brace]) -> BraceStatics:
-        """Compute the torques and brace forces of least heat for an acceleration, or prove that none exist.
+        """Compute the torques and brace forces that minimize motor heat for an acceleration, or prove that none exist.
 
         Parameters
         ----------
@@ -491,8 +491,8 @@ class Model:
 
         subject to |f_t| ≤ μ f_n, f_n ≥ min_N (or f_n as commanded, or f_t opposing the slip), the motor limits at a
         steady current, and tau = 0 for joints without motors. The optimum uses friction up to the limit of the cone;
-        the friction force of a real brace depends on its history. Torques are unique; brace forces that no motor
-        affects are one possible split inside the cones.
+        the friction force of a real brace depends on its history. The torques are unique. Brace forces that do not
+        affect any motor are not unique; the result is one possible split inside the cones.
 
         Examples
         --------
@@ -532,7 +532,7 @@ class Model:
         braces : sequence of Contact, optional
             Points to keep on their surfaces, see :func:`dynsim.scenario.build.contacts`.
         tolerance : float, optional
-            Largest residual of position, gaps [m] and angles [rad].
+            Maximum residual of the position and the gaps [m] and of the angles [rad].
 
         Returns
         -------
@@ -548,8 +548,8 @@ class Model:
 
         Notes
         -----
-        Damped Gauss–Newton steps of minimum norm, dq = Jᵀ (J Jᵀ + λ 1)⁻¹ e, with λ decreasing with the error. Joints at
-        their limits stay there, and the other joints take over.
+        The search takes damped Gauss–Newton steps of minimum norm, dq = Jᵀ (J Jᵀ + λ 1)⁻¹ e, with λ decreasing with the
+        error. Joints at their limits stay there, and the other joints take over.
 
         Examples
         --------
@@ -634,7 +634,7 @@ class Model:
         return self.point_position_and_jacobian(body, point, q)[1]
 
     def point_position_and_jacobian(self, body: str | int, point: ArrayLike, q: ArrayLike) -> tuple[Array, Array]:
-        """Compute world position and Jacobian of a body-fixed point from a single sweep.
+        """Compute the world position and the Jacobian of a body-fixed point in a single sweep.
 
         Parameters
         ----------
@@ -672,7 +672,7 @@ class Model:
         return position, jacobian
 
     def body_pose(self, body: str | int, q: ArrayLike) -> tuple[Array, Array]:
-        """Compute rotation and origin of a body.
+        """Compute the rotation and the origin of a body.
 
         Parameters
         ----------
@@ -706,7 +706,7 @@ class Model:
         return row[ka.R : ka.R + 9].reshape(3, 3).copy(), row[ka.P : ka.P + 3].copy()
 
     def joint_positions(self, q: ArrayLike, *further: tuple[str | int, ArrayLike]) -> Array:
-        """Compute the world origins of all bodies, followed by the hand: the points of a drawn posture.
+        """Compute the world positions of all body origins, followed by the hand, e.g. to draw a posture.
 
         Parameters
         ----------
@@ -770,7 +770,7 @@ class Model:
         return float(ledger.kinetic_energy(self._bodies, self._workspace))
 
     def potential_energy(self, q: ArrayLike) -> float:
-        """Compute the potential energy −Σ m g·c, zero with all masses at the world origin.
+        """Compute the potential energy −Σ m g·c, which is zero if all masses are at the world origin.
 
         Parameters
         ----------
@@ -843,7 +843,7 @@ class Model:
     def _set(self, q: ArrayLike, v: ArrayLike | None = None) -> None:
         positions = self._vector(q, "q", self._position_names)
         if self.nq == self.n:
-            # One coordinate per rate: most robots need not load the kernel that distinguishes joint kinds.
+            # With one coordinate per rate, as for most robots, the kernel that distinguishes joint kinds is not needed.
             self._workspace.joints[:, ka.Q] = positions
         else:
             self._q[:] = positions
@@ -855,7 +855,7 @@ class Model:
         if array.shape != (len(labels),):
             names = "joints" if self.nq == self.n else "coordinates" if name == "q" else "rates"
             raise ModelError(f"{name} must have {len(labels)} values ({names} of this model), got shape {array.shape}")
-        # Sum up Python numbers first: this neither warns nor takes as long as a numpy check of every element.
+        # Sum Python numbers first: unlike a numpy check of every element, this is fast and emits no warning.
         if not math.isfinite(sum(array.tolist())) and not np.isfinite(array).all():
             k = int(np.flatnonzero(~np.isfinite(array))[0])
             raise ModelError(f"{name} must be finite, got {array[k]} at {labels[k]}")
@@ -863,7 +863,7 @@ class Model:
 
     @staticmethod
     def _point(point: ArrayLike) -> Array:
-        # A copy, because an array with another memory layout would be compiled for again.
+        # Copy the array, because kernels would be compiled again for another memory layout.
         array = np.array(_numbers(point, "point"))
         if array.shape != (3,):
             raise ModelError(f"point must have shape (3,): x, y, z in the body's frame [m], got {array.shape}")
@@ -873,7 +873,7 @@ class Model:
 
 
 def _numbers(values: ArrayLike, name: str) -> Array:
-    """Return real numbers as float64; texts, complex numbers and rows of unequal length raise ModelError."""
+    """Return real numbers as float64; raise ModelError for strings, complex numbers and rows of unequal length."""
     if type(values) is np.ndarray and values.dtype is _FLOAT64:
         return values
     try:

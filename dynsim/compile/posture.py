@@ -22,11 +22,11 @@ HAND = "hand"
 TOLERANCE = 1e-13
 REACHED = 1e-12
 ITERATIONS = 300
-# A point that no joint moves along its normal must start this close to its surface [m].
+# A point that no joint moves along the surface normal must start this close to its surface [m].
 START_TOLERANCE = 1e-6
 # Amount by which a joint may exceed its limit due to rounding [rad or m].
 BEYOND = 1e-9
-STEP_MAX = 0.3  # [rad or m] per iteration; prevents jumps to another solution branch
+STEP_MAX = 0.3  # maximum step per iteration [rad or m]; prevents jumps to another solution branch
 
 
 def gaps_and_rates(model: Model, contacts: Sequence[Contact], q: Array) -> tuple[Array, Array]:
@@ -39,13 +39,12 @@ def gaps_and_rates(model: Model, contacts: Sequence[Contact], q: Array) -> tuple
 
 
 def on_surfaces(model: Model, contacts: Mapping[str, Contact], names: Sequence[str], keep: Sequence[str]) -> Array:
-    """Find the posture nearest to the initial one, with minimum |q − q_0|, that puts the named points on their
-    surfaces.
+    """Find the posture nearest to the initial one, by |q − q_0|, that puts the named points on their surfaces.
 
-    Joints that would exceed their limits stay there, the worst joint first, and the other joints continue.
+    Joints that would exceed their limits are stopped there, the worst joint first, and the other joints continue.
 
-    Gauss–Newton steps q ← q_0 + J⁺ (J (q − q_0) − e), then Newton steps without the pull towards q_0 for the last
-    digits.
+    The search takes Gauss–Newton steps q ← q_0 + J⁺ (J (q − q_0) − e), and then Newton steps without the pull towards
+    q_0 to gain the last digits.
 
     Parameters
     ----------
@@ -56,7 +55,7 @@ def on_surfaces(model: Model, contacts: Mapping[str, Contact], names: Sequence[s
     names : sequence of str
         Contacts to put on their surfaces.
     keep : sequence of str
-        Joints that do not move; ``hand``: the hand keeps its position.
+        Joints that do not move; with the entry ``hand``, the hand keeps its position.
 
     Returns
     -------
@@ -66,7 +65,7 @@ def on_surfaces(model: Model, contacts: Mapping[str, Contact], names: Sequence[s
     Raises
     ------
     ModelError
-        If a name is unknown or denotes an axis, or the points cannot reach their surfaces.
+        If a name is unknown or refers to a link axis, or the points cannot reach their surfaces.
     """
     robot = model.robot
     for name in names:
@@ -95,7 +94,7 @@ def on_surfaces(model: Model, contacts: Mapping[str, Contact], names: Sequence[s
         if not worst <= REACHED:
             within = f" with {', '.join(robot.joint_names[k] for k in stopped)} at the limit" if stopped else ""
             raise ModelError(
-                f"initial: cannot bring {', '.join(names)} onto their surfaces{within}: {worst:.3g} m remain; "
+                f"initial: cannot bring {', '.join(names)} onto their surfaces{within}: {worst:.3g} m short; "
                 "list fewer joints in initial.keep or start closer"
             )
         beyond = _furthest_beyond(robot, columns, q)
@@ -131,7 +130,7 @@ def _nearest(
 
 
 def _furthest_beyond(robot: Robot, columns: Sequence[int], q: Array) -> tuple[int, float] | None:
-    """Return the joint that exceeds its limit most, and this limit; joints that start beyond are reported elsewhere."""
+    """Return the joint that exceeds its limit most, and the limit; other code reports joints that start beyond it."""
     worst, furthest = BEYOND, None
     for k in columns:
         link, at, start = robot.links[k], q[robot.position_index[k]], robot.initial[robot.position_index[k]]
@@ -141,15 +140,15 @@ def _furthest_beyond(robot: Robot, columns: Sequence[int], q: Array) -> tuple[in
     return furthest
 
 
-# Motor torques of least heat that hold a posture at rest against weight, loads and braces.
+# Motor torques that hold a posture at rest against weight, loads and braces with the least motor heat.
 
 
-# Contacts with a gap below this are closed at the start [m].
+# Contacts with a gap below this [m] count as closed at the start.
 TOUCHING = 1e-6
 KEYS = ("initial", "equilibrium")
 # A contact, its link, the point on it [m], the normal in the world, and the gap [m].
 Touching = tuple[Contact, int, Array, Array, float]
-# Fraction of the static friction that an equilibrium uses if it can.
+# Fraction of the static friction that an equilibrium uses at most, unless it needs the full friction.
 RESERVED = 0.9
 
 
@@ -184,7 +183,7 @@ def holding_torques(
     real: bool,
     springs: Mapping[str, float] | None = None,
 ) -> Rest:
-    """Return the torques of least heat that hold a posture.
+    """Return the motor torques that hold a posture with the least heat.
 
     Parameters
     ----------
@@ -201,8 +200,9 @@ def holding_torques(
     real : bool
         True for the unilateral law.
     springs : mapping of str to float, optional
-        Spring force of each contact that carries [N], NaN for a rigid contact. Compliant contacts get these forces if
-        possible, otherwise the nearest forces, with any torques; default: all touching contacts, rigid.
+        Spring force of each contact that carries load [N]; NaN for a rigid contact. Compliant contacts get these forces
+        if possible, otherwise the nearest possible forces, whatever torques they require. Default: all touching
+        contacts carry load and are rigid.
 
     Returns
     -------
@@ -219,8 +219,8 @@ def holding_torques(
     if robot.couplings:
         raise ModelError("initial.equilibrium: coupled joints are not supported, because they share a motor", keys=KEYS)
     touching = touching_contacts(model, contacts, q, real, springs)
-    # First frictionless, then with a reserve, then with the full Coulomb friction; each first with a minimum force, so
-    # that contacts that press continue to press.
+    # Try without friction, then with a friction reserve, then with the full Coulomb friction. Try each first with a
+    # minimum force, so that contacts that press continue to press.
     attempts = [(0.0, 0.0, False)]
     if real and touching:
         ways = (False,) if springs is None else (True, False)
@@ -238,7 +238,7 @@ def holding_torques(
     for share, least, follow_springs in attempts:
         rows = []
         for contact, link, point, normal, _ in touching:
-            # The force of the spring is prescribed, or a force near it is searched for.
+            # The force of the spring is either prescribed or the target of a search.
             spring = np.nan if springs is None else springs[contact.name]
             commanded = spring if follow_springs else np.nan
             rows.append(_row(link, point, normal, share * contact.friction_at_rest, least, commanded))
@@ -297,7 +297,7 @@ def _touching_point(model: Model, contact: Contact, q: Array) -> tuple[int, Arra
 def _row(
     link: int, point: Array, normal: Array, friction: float, least: float, force: float = np.nan
 ) -> tuple[int, Array]:
-    """Return a non-sliding brace for the kernels: its link and its table row."""
+    """Return a brace that does not slide, for the kernels: its link and its table row."""
     return link, brace_rows(point, normal[None], np.array([friction]), least, force, np.zeros((1, 3)))[0]
 
 
@@ -312,7 +312,7 @@ def load_torques(model: Model, q: Array, loads: Sequence[Load]) -> Array:
 def load_forces(model: Model, q: Array, loads: Sequence[Load]) -> list[tuple[int, Array, Array]]:
     """Return the loads at t = 0 as pure forces: link, point in its frame [m], force in the world [N].
 
-    A torque M is the couple of M × d and −M × d at ±d/2, with d a unit vector across M.
+    A torque M is replaced by the couple of M × d and −M × d at ±d/2, with d a unit vector perpendicular to M.
     """
     forces = []
     for load in loads:
@@ -357,7 +357,7 @@ def _describe_weak_joints(model: Model, limits: Array, needed: Array, braces: Se
 
 
 def static_margin(model: Model, q: Array, forces: Sequence[tuple[int, Array, Array]] = ()) -> float:
-    """Return the tip margin of a base at rest: 1 at the incentre, 0 tips, −1 lifted.
+    """Return the tip margin of a base at rest: 1 at the incentre of its support, 0 if it tips, −1 if it lifts.
 
     See :mod:`dynsim.dynamics.tree.support`.
 

@@ -1,17 +1,17 @@
 """Postures in which compliant contacts are pressed into their surfaces as deeply as an equilibrium requires.
 
-At rest a compliant contact carries its stiffness times its depth, f_n = −k g. Bodies displaced by d change the gaps by
-J d; the generalised forces of an equilibrium with normal forces f equal the generalised forces of the springs if
+At rest, the force of a compliant contact is its stiffness times its depth, f_n = −k g. A displacement d of the bodies
+changes the gaps by J d. The generalised forces of an equilibrium with normal forces f equal those of the springs if
 
-    Jᵀ K J d = Jᵀ (f + K g),    the least squares of K^½ J d = −K^(−½) (f + K g)
+    Jᵀ K J d = Jᵀ (f + K g),    the least-squares solution of K^½ J d = −K^(−½) (f + K g)
 
-so that supports that rigid bodies do not determine share their load as the springs do. Rigid contacts stay closed; a
-rigid contact that need not carry load may open if compliant contacts cannot be pressed in otherwise.
+so that statically indeterminate supports share the load as their springs do. Rigid contacts stay closed; a rigid
+contact that need not carry load may open if compliant contacts cannot be pressed in otherwise.
 
-The first forces have the least heat in the initial posture. If motors can hold different forces, the next forces are
-nearest to the forces that the springs already carry. The heat criterion may determine forces only to few digits or not
-at all, and may require more depth than is possible, for example if an arm is wedged between a rigid and a compliant
-brace.
+The search starts with the forces that minimize the motor heat in the initial posture. If the motors can hold different
+forces, the next forces are those nearest to the forces that the springs already carry. The heat criterion may determine
+the forces to only a few digits or not at all, and it may require more depth than is possible, for example if an arm is
+wedged between a rigid and a compliant brace.
 """
 
 from __future__ import annotations
@@ -29,34 +29,36 @@ from dynsim.dynamics.tree.joints import normalise, positions_along, rates_across
 from dynsim.errors import ModelError, first_few
 from dynsim.model.description import Array, Contact, Load
 
-# Displacement that counts as zero [rad or m]: with a stiffness of 1e5 N/m, a force of 1e-8 N.
+# Displacement that counts as zero [rad or m]; with a stiffness of 1e5 N/m it changes a force by 1e-8 N.
 DONE = 1e-13
-# Displacement that may remain if the equilibrium forces are not known more accurately: 1e-4 N at 1e5 N/m [rad or m].
+# Displacement that may remain if the equilibrium forces are not known more accurately [rad or m]; it corresponds to
+# 1e-4 N at 1e5 N/m.
 NEARLY = 1e-9
 ITERATIONS = 50
 # A step is damped more if a gap differs from its linear prediction by more than this fraction of the largest change.
 AGREES = 0.5
-# Maximum number of repeated searches, as long as each ends nearer to the initial posture by this factor.
+# Maximum number of repeated searches; a search is repeated only if it reduces the distance to the initial posture by
+# this factor.
 REPEATS, NEARER = 4, 0.9
-# Damping of the springs' least squares, relative to its largest singular value. The last step is accepted unchanged.
+# Damping of the least-squares problem of the springs, relative to its largest singular value; values are tried in this
+# order, and a step with the last value is always accepted.
 DAMPINGS = (0.0, *4.0 ** np.arange(-5, 7))
-# Row singular values below this fraction of the largest are zero.
+# Singular values of the rows below this fraction of the largest one count as zero.
 RANK = 1e-10
 
 
 def pressed_in(
     model: Model, contacts: Sequence[Contact], loads: Sequence[Load], able: Sequence[str], real: bool
 ) -> Model:
-    """Return the model in the posture nearest to the initial one whose compliant contacts carry their equilibrium
-    forces.
+    """Return the model in the nearest posture in which compliant contacts carry their equilibrium forces.
 
-    Returns the model itself if no compliant contact touches. For the parameters see
-    :func:`dynsim.compile.posture.holding_torques`.
+    The nearest posture is the one closest to the initial posture. If no compliant contact touches, the model itself is
+    returned. For the parameters, see :func:`dynsim.compile.posture.holding_torques`.
 
     Raises
     ------
     ModelError
-        If no torques hold the posture, or if no near posture is found in which the contacts carry their forces.
+        If no torques hold the posture, or if no nearby posture is found in which the contacts carry their forces.
     """
     touching = touching_contacts(model, contacts, model.robot.initial, real)
     names = [contact.name for contact, *_ in touching]
@@ -72,7 +74,7 @@ def pressed_in(
 
     forces = holding_torques(model, model.robot.initial, contacts, loads, able, real).normal_forces
     if (balance := _search(model, contacts, real, names, forces, holding)) is None:
-        # A rigid contact that need not carry load may prevent a compliant contact from being pressed in: it may open.
+        # A rigid contact that need not carry load may prevent a compliant contact from being pressed in. Let it open.
         for name in [name for name in names if name not in compliant]:
             others = [other for other in names if other != name]
             if (without := holding(model.robot.initial, dict.fromkeys(others, np.nan))) is not None:
@@ -84,8 +86,8 @@ def pressed_in(
             "require; raise contacts.stiffness_N_per_m, or remove initial.equilibrium",
             keys=KEYS,
         )
-    # Steps for forces that were abandoned, or for contacts that have opened, leave displacements that the equilibrium
-    # does not need. A search from the initial posture that starts with the final forces avoids them.
+    # Steps towards forces that were later abandoned, or for contacts that have opened, leave displacements that the
+    # equilibrium does not need. A search from the initial posture that starts with the final forces avoids them.
     q, forces = balance
     for _ in range(REPEATS):
         again = _search(model, contacts, real, list(forces), forces, holding)
@@ -125,7 +127,7 @@ def _search(
     forces : mapping of str to float
         Their normal forces [N].
     holding : callable
-        Returns forces of an equilibrium near the forces of springs, or None, see
+        Function that returns the forces of an equilibrium near given spring forces, or None; see
         :func:`dynsim.compile.posture.holding_torques`.
     """
     q, before = model.robot.initial, np.inf
@@ -143,7 +145,7 @@ def _search(
         else:
             return None
         forces = next_forces
-        # If friction shares the load with normal forces, the split between them is as accurate as its search.
+        # If friction shares the load with normal forces, the split between them is only as accurate as the search.
         if size <= DONE or before <= size <= NEARLY:
             lacking = [abs(forces[c.name] / c.stiffness + gap) for c, *_, gap in touching if c.stiffness > 0.0]
             # Rigid contacts or limits may prevent joints from pressing springs in further.
@@ -156,7 +158,7 @@ def _search(
 
 
 def spring_forces(touching: Sequence[Touching]) -> dict[str, float]:
-    """Return normal forces keyed by contact: from the depth for compliant contacts [N], NaN for rigid contacts."""
+    """Return the normal force of each contact [N]: computed from the depth if it is compliant, NaN if it is rigid."""
     return {
         contact.name: max(-contact.stiffness * gap, 0.0) if contact.stiffness > 0.0 else np.nan
         for contact, *_, gap in touching
@@ -164,10 +166,10 @@ def spring_forces(touching: Sequence[Touching]) -> dict[str, float]:
 
 
 def _step(model: Model, q: Array, touching: Sequence[Touching], forces: Mapping[str, float]) -> tuple[Array, float]:
-    """Return the posture in which these forces press contacts in, by the Jacobian, and the largest displacement to it.
+    """Return the posture to which these forces press the contacts in, to first order, and the largest displacement.
 
-    The step is damped until the gaps change approximately as the Jacobian predicts: a spring that requires a large
-    rotation, for example at a wedged arm, is pressed in less.
+    The step is damped until the gaps change approximately as the Jacobian predicts. A spring that can only be pressed
+    in by a large rotation, for example at a wedged arm, is then pressed in less.
     """
     rigid = np.array([contact.stiffness == 0.0 for contact, *_ in touching])
     roots = np.sqrt([contact.stiffness for contact, *_ in touching])
@@ -210,7 +212,10 @@ def _within_limits(
 
 
 def _displacement(rows: Array, wanted: Array, rigid: NDArray[np.bool_], roots: Array, damping: float) -> Array:
-    """Return the smallest displacement of the free joints: rigid contacts exactly, springs by damped least squares."""
+    """Return the smallest displacement of the free joints that solves the contacts.
+
+    Rigid contacts are satisfied exactly, springs by damped least squares.
+    """
     particular, null = np.zeros(rows.shape[1]), np.eye(rows.shape[1])
     if rigid.any():
         particular[:] = np.linalg.lstsq(rows[rigid], wanted[rigid], rcond=RANK)[0]

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class BuildContext:
-    """Data of the scenario for the ``build`` of a member.
+    """Scenario data that is passed to a member's ``build``.
 
     Attributes
     ----------
@@ -30,9 +30,9 @@ class BuildContext:
     machine : Model, SnakeDescription or None
         Machine that a controller or a base path is built for; None for other families.
     joint : str
-        Joint of a motor; "" for other families.
+        Joint that a motor drives; "" for other families.
     progress : callable or None
-        Called with the time [s] that slowly computed references have reached.
+        Called during slow computations of references with the reference time reached so far [s].
     contacts : mapping of str to Contact
         Contacts of the scenario, including disabled points.
     declared : sequence of str
@@ -76,7 +76,7 @@ class Member(Protocol):
 
     @property
     def Config(self) -> type[StrictConfig]:
-        """Configuration class of its section; ``type`` is ``Literal["name of the member"]``."""
+        """Configuration class of the member's section; ``type`` is ``Literal["name of the member"]``."""
 
     def build(self, config: Any, context: BuildContext) -> Any:
         """Build the object that the section describes.

@@ -24,7 +24,7 @@ def path_arrays(
     """
     columns = [model.joint_names.index(name) for name in joints]
     link, point = model.robot.attach(*model.robot.hand)
-    # Remove friction, which has no effect here, so that sweeps over it have the same path.
+    # Remove friction, which has no effect here, so that the runs of a sweep over friction share the same path.
     points = [replace(contact, tip=None, friction=0.0) for contact in braces]
     rows = 3 + len(braces)
     links = [model.robot.links[column] for column in columns if limited]

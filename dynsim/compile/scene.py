@@ -32,7 +32,7 @@ from dynsim.record.scene import (
 if TYPE_CHECKING:
     from dynsim.snake.description import SnakeDescription
 
-# Grid lines of a drawn height field in each direction.
+# Maximum number of grid lines of a drawn height field in each direction.
 GRID_LINES = 61
 # Width of a wheel relative to its radius; the description of a snake contains no width.
 WHEEL_WIDTH = 0.48
@@ -75,7 +75,7 @@ def robot_scene(robot: Robot, contacts: Sequence[Contact], surfaces: Mapping[str
 
 
 def _shared(values: Iterable[float]) -> float | None:
-    """Return the finite value that all have in common, or None."""
+    """Return the finite value that all values equal, or None."""
     different = set(values)
     value = different.pop() if len(different) == 1 else math.inf
     return float(value) if math.isfinite(value) else None
@@ -132,14 +132,14 @@ def _wheels(base: MobileBase, body: int) -> list[Body]:
 
 
 def _supports(base: MobileBase, body: int) -> tuple[Point, ...]:
-    """Return the ground points of wheels and caster, with the names of their loads."""
+    """Return the ground contact points of the wheels and the caster, with the names of their loads."""
     left, right = (vector3((0.0, side * base.track, 0.0)) for side in (0.5, -0.5))
     places = zip(SUPPORTS, (left, right, vector3(base.caster)), strict=True)
     return tuple(Point(name, "support", body, position) for name, position in places)
 
 
 def _joint(link: Link, kind: JointKind) -> Joint:
-    if link.kind == "left_wheel":  # wheel angles do not determine its pose
+    if link.kind == "left_wheel":  # the wheel angles do not determine the pose of the base
         position, columns = (0.0, 0.0, 0.0), ("x", "y", "heading")
         return Joint(
             link.joint, kind, (0.0, 0.0, 1.0), position, HERE, "base_pose", columns, part_of=link.joint_of_rows or ""
@@ -163,7 +163,7 @@ def _limit(value: float) -> float | None:
 
 
 def shapes(link: Link) -> tuple[Shape, ...]:
-    """Return the shapes of a link's body, or the cylinder about its axis if that is known."""
+    """Return the shapes of a link's body or, if it has no shapes, the cylinder about its axis."""
     return link.shapes or _rod(link)
 
 
@@ -184,7 +184,7 @@ def _rod(link: Link) -> tuple[Shape, ...]:
 
 
 def turn_from_z(direction: Array) -> Quaternion:
-    """Return a rotation that takes z to a unit vector."""
+    """Return a rotation that maps the z axis to a unit vector."""
     axis = np.cross([0.0, 0.0, 1.0], direction)
     size = float(np.linalg.norm(axis))
     if size == 0.0:
@@ -196,9 +196,9 @@ def turn_from_z(direction: Array) -> Quaternion:
 def snake_scene(description: SnakeDescription) -> Scene:
     """Return the scene of an articulated mobile robot on the ground z = 0.
 
-    Its base part starts at wheel pair 1, which is placed by the signal ``base_pose``. Joints follow ``phi``; a joint of
-    the head part rotates its head side by −phi. Active wheels rotate by ``rho``. Lifted pairs are drawn on the ground
-    because the model has no height for them ([T] II.A).
+    The base part starts at wheel pair 1, whose pose is the signal ``base_pose``. Joint angles are in ``phi``; a joint
+    of the head part rotates the bodies on its head side by −phi. Active wheels rotate by ``rho``. Lifted pairs are
+    drawn on the ground, because the model has no height for them ([T] II.A).
     """
     d, l, n_h = description, description.link_length, description.head_joints
     base = Joint("base", "planar", (0.0, 0.0, 1.0), (0.0, 0.0, d.wheel_radius), HERE, "base_pose", ("x", "y", "yaw"))
@@ -230,7 +230,7 @@ def _snake_joint(d: SnakeDescription, j: int, axis: tuple[float, float, float], 
 
 
 def snake_tube(d: SnakeDescription, start: float, end: float) -> Shape:
-    """Return the body of a snake along x of a link, from start to end [m]."""
+    """Return the tube that represents the snake's body along the x axis of a link, from start to end [m]."""
     return Shape("cylinder", (BODY_RADIUS * d.wheel_radius, end - start), (0.5 * (start + end), 0.0, 0.0), _ALONG_X)
 
 
@@ -242,7 +242,7 @@ def _passive_wheels(d: SnakeDescription, pair: int, x: float) -> tuple[Shape, ..
 
 
 def snake_wheel(d: SnakeDescription) -> Shape:
-    """Return a wheel of a snake about y of its body."""
+    """Return a wheel of a snake; its axle is the y axis of its body."""
     return Shape("cylinder", (d.wheel_radius, WHEEL_WIDTH * d.wheel_radius), orientation=_ALONG_Y)
 
 

@@ -19,7 +19,7 @@ def compile_shapes(robot: Robot, contacts: Sequence[Contact]) -> kd.ShapeArrays 
     Raises
     ------
     ModelError
-        If a candidate with a radius or an axis touches a surface without exact distance.
+        If a candidate with a radius or an axis touches a surface whose distance function is not exact.
     """
     entries = []
     for contact in contacts:
@@ -41,7 +41,7 @@ def compile_shapes(robot: Robot, contacts: Sequence[Contact]) -> kd.ShapeArrays 
 
 
 def moves(contact: Contact) -> bool:
-    """Return whether the contact point can move along the axis: on a sphere, a cylinder or a box, from outside.
+    """Return whether the contact point can move along the axis: on the outside of a sphere, cylinder or box.
 
     On other surfaces the nearest point is one of the ends, which are separate candidates.
     """
@@ -49,7 +49,7 @@ def moves(contact: Contact) -> bool:
 
 
 def bends_outward(surface: Surface) -> bool:
-    """Return whether a straight axis can be nearest to a surface between its ends, on the free side."""
+    """Return whether the point of a straight axis nearest to a surface, on its free side, can be between the ends."""
     if isinstance(surface, Quadric):
         return surface.drawn.kind in ("sphere", "cylinder") and (surface.drawn.radius or 0.0) > 0.0
     return isinstance(surface, Box)
@@ -71,9 +71,7 @@ def contact_gap(contact: Contact, start: Array, end: Array | None = None) -> flo
 
 
 def share_of_axis(contact: Contact, start: Array, end: Array) -> float:
-    """Return the position, 0 to 1, on the axis from ``start`` to ``end``, (3,), where a capsule is nearest to its
-    surface.
-    """
+    """Return where the axis of a capsule is nearest to its surface: 0 at ``start`` to 1 at ``end``, (3,)."""
     if not moves(contact):
         return 0.0
     along = np.asarray(end) - start
@@ -86,7 +84,7 @@ def share_of_axis(contact: Contact, start: Array, end: Array) -> float:
 def touching_points(contact: Contact, starts: Array, ends: Array | None = None) -> Array:
     """Return the points where a surface touches a sphere or capsule and its force acts, (T, 3) [m].
 
-    See dynamics.contact.shapes.
+    See dynsim.dynamics.contact.distance.
 
     Parameters
     ----------

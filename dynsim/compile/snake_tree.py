@@ -4,9 +4,9 @@
                      ├ pair2 (theta4) ─ plate2 (psi4) ─ pair3 (theta5) ─ …   tail branch
                      └ wheel1L, wheel1R on pair1, wheel2L, wheel2R on pair2, …
 
-The root is the body behind the axle of wheel pair 1, at that axle. Towards the tail a joint rotates by Rz(θ) or Ry(ψ),
-so a joint of the head branch, which rotates its head side, has the axis −e_z or −e_y. Joint angles are defined as in
-:mod:`dynsim.snake.kinematics`. Pitch joints on the axles of the base part, ψ4 … ψ8, lift wheel pairs
+The root is the body behind the axle of wheel pair 1, at that axle. Towards the tail, a joint rotates by Rz(θ) or Ry(ψ).
+A joint of the head branch rotates the bodies on its head side and therefore has the axis −e_z or −e_y. Joint angles are
+defined as in :mod:`dynsim.snake.kinematics`. Pitch joints on the axles of the base part, ψ4 … ψ8, lift wheel pairs
 (:mod:`dynsim.snake.lifting`).
 
 All wheels are bodies with spherical contacts: a driven wheel has a servo in velocity mode, the other wheels rotate
@@ -48,14 +48,14 @@ class SnakeTree(Robot):
     description : SnakeDescription
         Description of the snake.
     base_part : BasePart
-        Its base part, as folded along its axles.
+        Base part of the snake, as it is folded about its axles.
     lifts : Lifts
         Height and timing of lifted wheel pairs.
     sag_compensation : bool
         If True, commands of the pitch joints of lifted pairs compensate the sag of their servos.
     raised : bool
-        If True, a run starts after raising the head from below; if False, with the head released in its posture, before
-        anything sags.
+        If True, a run starts after the head has been raised from below. If False, the head is released in its posture
+        at the start, before anything has sagged.
     gripper : Gripper
         Gripper on its head.
     """
@@ -84,13 +84,14 @@ class SnakeTree(Robot):
 
 
 def wheel_joint(pair: int, side: int) -> str:
-    """Return the joint name of a wheel: pair from 0, side 1 left, −1 right."""
+    """Return the joint name of a wheel; ``pair`` counts from 0, and ``side`` is 1 for left and −1 for right."""
     return f"wheel{pair + 1}{'L' if side > 0 else 'R'}"
 
 
 def lifting_joints(d: SnakeDescription) -> tuple[str, ...]:
-    """Return the names of the pitch joints on the axles of pairs 1, 2, …, except the last; pair 1's joint carries the
-    head.
+    """Return the names of the pitch joints on the axles of pairs 1, 2, …, except the last pair.
+
+    The joint on the axle of pair 1 carries the head.
     """
     first = d.head_joints // 2
     return tuple(f"psi{first + k}" for k in range(d.pairs - 1))
@@ -111,22 +112,22 @@ def snake_tree(
     raised: bool,
     gripper: Gripper,
 ) -> SnakeTree:
-    """Return the tree of a snake in its initial posture, all wheels on the ground z = 0.
+    """Return the tree of a snake in its initial posture, with all wheels on the ground z = 0.
 
     Parameters
     ----------
     d : SnakeDescription
         Description of the snake.
     joint_servo, wheel_servo : callable
-        Return the servo of a joint, given its name.
+        Functions that return the servo of a joint, given the name of the joint.
     yaw_stop, pitch_stop : float
-        Mechanical stops of the joints, on both sides of zero [rad].
+        Mechanical stops of the joints, symmetric about zero [rad].
     wheel_inertia : float
         Inertia of each wheel about its axle, without its servo [kg m²].
     bearing_drag : float
         Viscous drag of each wheel [N m s/rad].
     massless_wheels : bool
-        If True, wheels without servo are not bodies: they have no friction in the rolling direction, and no drag.
+        If True, wheels without a servo are not bodies: they have no friction in the rolling direction and no drag.
     lifts : Lifts
         Height and timing of lifted wheel pairs.
     sag_compensation, raised : bool
@@ -232,11 +233,11 @@ def snake_tree(
 
 
 def configuration(robot: SnakeTree, phi: Array, height: Array) -> Array:
-    """Return the coordinates (nq,) of the tree on its wheels, at angles phi (n_phi,) [rad] and pair heights (pairs,)
-    [m].
+    """Return the coordinates (nq,) of the tree on its wheels, for joint angles and heights of wheel pairs.
 
-    Pair 1 is flat on the ground. The heights are computed for thin discs; if a bent base twists, spheres next to them
-    would be lower, and the robot is raised until the lowest one touches.
+    ``phi``, (n_phi,), contains the angles [rad] and ``height``, (pairs,), the heights [m]. Pair 1 is flat on the
+    ground. The heights are computed for thin discs. If a bent base twists, some contact spheres of the wheels would be
+    lower than these discs; the robot is then raised until the lowest sphere touches the ground.
     """
     d = robot.description
     hinge = robot.base_part.fold(phi[None, d.head_joints :], height[None]).hinge[0]
@@ -247,10 +248,10 @@ def configuration(robot: SnakeTree, phi: Array, height: Array) -> Array:
 
 
 def at_angles(robot: SnakeTree, angles: Mapping[str, float], tilt: float = 0.0) -> Array:
-    """Return the coordinates (nq,) of the tree with its lowest wheel on the ground and the body behind pair 1 tilted
-    [rad].
+    """Return the coordinates (nq,) of the tree with its lowest wheel on the ground.
 
-    A positive tilt raises the tail. ``angles`` contains joint angles [rad]; other joints stay at their start.
+    ``tilt`` [rad] tilts the body behind pair 1; a positive tilt raises the tail. ``angles`` contains joint angles
+    [rad]; the other joints keep their initial positions.
     """
     d = robot.description
     q = robot.initial.copy()
@@ -277,7 +278,7 @@ def _link_inertia(mass: float, length: float, ahead: float) -> Inertia:
 def lifted_moments(robot: SnakeTree, lifted: NDArray[np.bool_]) -> Array:
     """Return the weight moments at the pitch joints of lifted pairs, (pairs − 1,) [N m], for a straight base part.
 
-    Between two grounded pairs the base part is treated as simply supported, behind the last one as a cantilever.
+    Between two grounded pairs, the base part is treated as simply supported; behind the last one, as a cantilever.
     Positive moments lower the part behind the joint.
     """
     d = robot.description

@@ -1,4 +1,4 @@
-"""Kernel tables of bodies, drives, contacts and contact laws, loads, couplings and base; checks of descriptions."""
+"""Kernel tables for bodies, drives, contacts, contact laws, loads, couplings and a base; checks of descriptions."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ from dynsim.model.surfaces import shape_arrays
 
 # A joint may start this far beyond its stop [rad or m].
 START_TOLERANCE = 1e-6
-# After an impact a point that separates more slowly than this stays closed, which ends a series of ever smaller bounces
-# [m/s]. It exceeds 6e-5 m/s, the speed gained by falling through the depth at which a point counts as landed: with a
-# lower bound two points of a rocking body would land alternately without end.
+# A point that separates more slowly than this after an impact stays closed, which ends a series of ever smaller bounces
+# [m/s]. The value exceeds 6e-5 m/s, the speed gained by falling through the depth at which a point counts as landed.
+# With a lower value, two points of a rocking body would land alternately and indefinitely.
 SETTLE_SPEED = 1e-4
 
 
 @dataclass(frozen=True)
 class JointStop:
-    """A joint stop: side 1 keeps q ≥ position, side −1 q ≤ position [rad or m]."""
+    """A joint stop: side 1 keeps q ≥ position, and side −1 keeps q ≤ position [rad or m]."""
 
     joint: str
     side: float
@@ -45,7 +45,7 @@ class JointStop:
 
 @dataclass(frozen=True)
 class DryFriction:
-    """Dry friction of a joint that can hold it at rest, from its gear and its bearing [N m or N]."""
+    """Dry friction in the gear and bearing of a joint [N m or N], which can hold the joint at rest."""
 
     joint: str
     gear: float
@@ -60,7 +60,7 @@ def dry_frictions(robot: Robot) -> list[DryFriction]:
 
 
 def format_quantity(value: float, unit: str, digits: int = 5) -> str:
-    """Return a joint coordinate as text; angles in degrees, as in scenarios, and radians."""
+    """Return a joint coordinate as text; angles in degrees, as in scenarios, and in radians."""
     if unit != "rad":
         return f"{value:.{digits}g} {unit}"
     return f"{np.degrees(value):.{digits}g}° ({value:.{min(digits, 4)}g} rad)"
@@ -139,7 +139,7 @@ def _compile_tie(robot: Robot, tie: Tie, table: NDArray[np.int64], row: NDArray[
     """Fill the table rows of a tie."""
     where = f"tie {tie.name}"
     if not (tie.stiffness >= 0.0 and tie.damping >= 0.0 and tie.stiffness + tie.damping > 0.0 and tie.bound > 0.0):
-        raise ModelError(f"{where}: stiffness or damping must be positive, neither negative, and the bound positive")
+        raise ModelError(f"{where}: stiffness or damping and the bound must be positive, and none may be negative")
     a, point = robot.attach(tie.body, tie.point)
     b, other = (-1, tie.other_point) if tie.other == WORLD else robot.attach(tie.other, tie.other_point)
     if a == b:
@@ -164,8 +164,8 @@ def contact_laws(robot: Robot, contacts: Sequence[Contact]) -> NDArray[np.float6
         If static friction is below kinetic friction, a value is negative, or restitution is above one.
     """
     law = np.ones((len(contacts), ka.CONTACT_LAW_SIZE))
-    # Isotropic friction has no axis: tangents that rotate with the body would rotate the rates of a step, including
-    # rates that friction has stopped.
+    # Isotropic friction must not have an axis. With an axis, the tangents would rotate with the body and would rotate
+    # the rates of a step, including rates that friction has stopped.
     law[:, [ka.FLOOR, ka.GRIP_AXIS, ka.GRIP_AXIS + 1, ka.GRIP_AXIS + 2]] = 0.0
     for row, contact in zip(law, contacts, strict=True):
         where = f"contact {contact.name}"
@@ -198,12 +198,12 @@ def contact_laws(robot: Robot, contacts: Sequence[Contact]) -> NDArray[np.float6
 def joint_stops(
     robot: Robot, q: NDArray[np.float64] | None = None, tolerance: float = START_TOLERANCE
 ) -> list[JointStop]:
-    """Return the stops of a robot's joints: their finite limits, the lower one first.
+    """Return the joint stops of a robot, one for each finite limit; the lower stop of a joint comes first.
 
     Parameters
     ----------
     q : (nq,) ndarray
-        Start [rad or m]; default: the robot's initial positions.
+        Joint positions at the start [rad or m]; default: the robot's initial positions.
     tolerance : float
         A joint may start this far beyond its stop [rad or m].
 
@@ -229,7 +229,7 @@ def joint_stops(
     return stops
 
 
-# Largest initial angle [rad]: beyond it the reduction to a quarter turn loses too many digits
+# Maximum initial angle [rad]; for larger angles, the reduction to a quarter turn loses too many digits
 # (dynsim.dynamics.tree.joints.sine_cosine).
 ANGLE_LIMIT = 1e6
 # Tolerance of the initial position of a follower with respect to its leader [rad or m].
@@ -244,9 +244,9 @@ def compile_model(robot: Robot) -> ka.ModelArrays:
     Raises
     ------
     ModelError
-        If names are duplicate, a parent does not come first, an inertia is impossible, a joint cannot be accelerated,
-        the hand is on an unknown body, a coupling is impossible or violated by the initial configuration, or a vector
-        has the wrong shape or a value that is not finite.
+        If names are duplicated, a parent does not precede its child, an inertia is physically impossible, a joint
+        cannot be accelerated, the hand is on an unknown body, a coupling is impossible or violated by the initial
+        configuration, or a vector has the wrong shape or a value that is not finite.
     """
     links = robot.links
     if not links:
@@ -288,7 +288,7 @@ def compile_model(robot: Robot) -> ka.ModelArrays:
         tree[i, ka.PARENT] = parent
         tree[i, ka.KIND] = _joint_kind(link)
         tree[i, ka.POSITION_INDEX] = position[i]
-        # Later rows of a joint have the same mounting as its first row.
+        # Later rows of a joint are mounted on the same body as its first row.
         tree[i, ka.BASE] = parent if link.row.neutral else tree[parent, ka.BASE]
         tree[i, ka.TURNED] = int(turned)
         if parent >= 0 and parent != i - 1:
@@ -316,7 +316,7 @@ def compile_model(robot: Robot) -> ka.ModelArrays:
         i = joints[motor.joint]
         if len(links[i].row.neutral) != 1 and not links[i].row.own_position:
             raise ModelError(
-                f"motor of {motor.joint}: this is one of several rates of a joint, without a position to control"
+                f"motor of {motor.joint}: this is one of several rates of a joint and has no position to control"
             )
         if not isinstance(motor, TorqueSource):
             body[i, ka.ARMATURE] += motor.armature
@@ -413,7 +413,7 @@ def compile_contacts(robot: Robot, contacts: Sequence[Contact], floors: np.ndarr
         link[k, ka.LINK], link[k, ka.FRICTION_LAW] = body, _FRICTION[contact.pulling_friction]
         link[k, ka.LEFT_OUT] = contact.left_out
         point[k, ka.POINT : ka.POINT + 3] = on_body
-        if not isinstance(surface, Quadric):  # any plane: its rows are overwritten
+        if not isinstance(surface, Quadric):  # use any plane, because its rows are overwritten
             point[k, ka.QUADRIC + 8] = 1.0
             continue
         curved = bool(surface.Q.any())
@@ -523,7 +523,7 @@ def _check_couplings(robot: Robot) -> None:
             joint = leads[joint].leader
         if joint in circle:
             raise ModelError(
-                f"coupling of {start}: joints follow each other in a circle: {' → '.join([*circle, joint])}"
+                f"coupling of {start}: joints follow each other in a cycle: {' → '.join([*circle, joint])}"
             )
 
 
@@ -615,7 +615,7 @@ def _check_motor(motor: Drive, joints: dict[str, Link]) -> None:
 
 
 def _check_movable(robot: Robot, tree: np.ndarray, body: np.ndarray) -> None:
-    """Raise ModelError for a joint without motor inertia and without mass beyond it: it has no equation of motion."""
+    """Raise ModelError for a joint that has no equation of motion: no motor inertia, and no mass beyond it."""
     carried = np.abs(body[:, ka.MASS]) + np.abs(body[:, ka.INERTIA : ka.INERTIA + 6]).sum(axis=1)
     for i in range(len(tree) - 1, -1, -1):
         if carried[i] + body[i, ka.ARMATURE] <= 0.0:
@@ -631,9 +631,10 @@ def _check_movable(robot: Robot, tree: np.ndarray, body: np.ndarray) -> None:
 
 
 def with_shapes(system: System) -> System:
-    """Return the system with shape tables; added tables treat all contacts as points on quadrics.
+    """Return the system with shape tables, which are added if they are missing.
 
-    The results are the same up to rounding, and the speed within 2 %.
+    Added tables treat all contacts as points on quadrics. The results are the same up to rounding, and the speed is the
+    same within 2 %.
     """
     if system.shapes is not None:
         return system

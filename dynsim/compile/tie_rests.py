@@ -1,7 +1,7 @@
-"""Rest values of ties in a run that starts from a state: measured at the start of the scenario, not at the state.
+"""Rest values of ties in a run that starts from a given state; they are measured at the start of the scenario.
 
-In a run from the scenario's start the first step does this, in ``begin_tie`` in
-:mod:`dynsim.integrators.stepping.contacts`, with the same formulas.
+In a run that begins at the scenario's start, the first step sets them: ``begin_tie`` in
+:mod:`dynsim.integrators.stepping.contacts` uses the same formulas.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def may_have_slid(tie: Tie) -> bool:
 
 
 def deflection(model: Model, unilateral: UnilateralArrays, k: int, q: Array) -> float:
-    """Return x − x_0 of tie k at coordinates (nq,); for a torsion within half a turn [m or rad]."""
+    """Return x − x_0 of tie k at coordinates (nq,) [m or rad]; a torsion is within half a turn."""
     row = unilateral.tie[k]
     (A, at), (B, other) = _ends(model, unilateral, k, q)
     axis = row[ku.TIE_AXIS : ku.TIE_AXIS + 3]
@@ -68,6 +68,6 @@ def deflection(model: Model, unilateral: UnilateralArrays, k: int, q: Array) -> 
 
 
 def _ends(model: Model, unilateral: UnilateralArrays, k: int, q: Array) -> tuple[tuple[Array, Array], ...]:
-    """Return rotation and origin of both bodies of tie k; the second body may be the world."""
+    """Return the rotation and origin of both bodies of tie k; the second body may be the world."""
     a, b = unilateral.tie_table[k, [ku.TIE_A, ku.TIE_B]].tolist()
     return model.body_pose(a, q), (np.eye(3), np.zeros(3)) if b < 0 else model.body_pose(b, q)

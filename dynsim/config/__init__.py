@@ -1,1 +1,1 @@
-"""Base classes of configurations, messages of validation errors, and shell completion."""
+"""Base classes for configurations, messages for validation errors, and shell completion."""

@@ -1,4 +1,4 @@
-"""Base classes of configurations in scenarios and servo maps; types and checks of numbers, vectors and waypoints."""
+"""Base classes for configurations in scenarios and servo maps; types and checks for numbers, vectors and waypoints."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ Limits = Annotated[Pair, AfterValidator(_ordered)]
 def _forbid_conversion(schema: Any) -> None:
     """Make all numbers of a pydantic core schema strict.
 
-    Otherwise ``true`` would be read as 1 and the string "1_9.2" as 19.2. Keys are strings and stay as they are.
+    Otherwise ``true`` would be read as 1 and the string "1_9.2" as 19.2. Keys are strings and are not changed.
     """
     if isinstance(schema, dict):
         if schema.get("type") in ("float", "int"):
@@ -63,7 +63,7 @@ def _forbid_conversion(schema: Any) -> None:
 
 
 class StrictModel(BaseModel):
-    """Base class of mappings in files: unknown keys are errors; strings and Booleans are not accepted as numbers."""
+    """Base class for mappings in files: unknown keys are errors; strings and Booleans are not accepted as numbers."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -75,7 +75,7 @@ class StrictModel(BaseModel):
 
 
 class StrictConfig(StrictModel):
-    """Base class of mappings in scenario files: numbers must also be finite."""
+    """Base class for mappings in scenario files: as :class:`StrictModel`, but numbers must also be finite."""
 
     model_config = ConfigDict(allow_inf_nan=False, validate_default=True, defer_build=True)
 
@@ -90,19 +90,19 @@ class StrictConfig(StrictModel):
 
 
 class BodyPoint(StrictConfig):
-    """Point fixed on a body."""
+    """Point fixed to a body."""
 
     body: str = Field(description="name of the body, or of a frame fixed to a body")
     point_m: Vector3 = default([0.0, 0.0, 0.0], "coordinates in the axes of the body or frame")
 
 
 def error_at(key: str, message: str) -> PydanticCustomError:
-    """Return the error that a validator of a whole mapping raises for one dotted ``key`` of the mapping."""
+    """Return an error about one dotted ``key``, to be raised by a validator that checks a whole mapping."""
     return PydanticCustomError("value_error", "{message}", {"message": message, "key": key})
 
 
 def check_waypoints(times: Sequence[float], values: Sequence[Any], key: str) -> None:
-    """Check the times of waypoints.
+    """Check that waypoints have one value per time, and that their times increase.
 
     Parameters
     ----------
@@ -111,21 +111,21 @@ def check_waypoints(times: Sequence[float], values: Sequence[Any], key: str) -> 
     values : sequence
         Values of the waypoints.
     key : str
-        Key of the values, for the error message.
+        Key of the values in the file, for the error message.
 
     Raises
     ------
     ValueError
-        If the numbers of times and values differ, or the times do not increase.
+        If there are more times than values or vice versa, or the times do not increase.
     """
     if len(times) != len(values):
-        raise ValueError(f"{len(times)} times_s and {len(values)} {key}: the numbers must be equal")
+        raise ValueError(f"{len(times)} times_s and {len(values)} {key}: both lists must have the same length")
     if np.any(np.diff(times) <= 0.0):
         raise ValueError("times_s must increase")
 
 
 def unit_vector(values: list[float], name: str) -> NDArray[np.float64]:
-    """Return ``values`` scaled to length one; raises ValueError if their length is zero."""
+    """Return the vector ``values`` scaled to length one; raise ValueError if it is the zero vector."""
     array = np.array(values, dtype=np.float64)
     length = float(np.linalg.norm(array))
     if length < 1e-12:

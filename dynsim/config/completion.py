@@ -1,4 +1,4 @@
-"""Shell completion of scenario and variant names; imports no large packages because it runs at every press of Tab."""
+"""Shell completion of scenario and variant names; it runs at every press of Tab and imports no large packages."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ def scenarios(incomplete: str) -> list[str]:
 
 def variants(ctx: typer.Context, incomplete: str) -> list[str]:
     """Return the variants of the scenario on the command line whose names start with ``incomplete``."""
-    # Imported here because the command line loads this module.
+    # Imported here because the command line loads this module at every start.
     from dynsim.system.inputs import YamlMapping, is_file, parse_yaml, read_text
 
-    # While the option has no value yet, the arguments before it are not parsed.
+    # As long as the option has no value, the arguments before it have not been parsed.
     path = Path(ctx.params.get("scenario") or next(iter(ctx.args), ""))
     try:
         path = path if is_file(path, ScenarioError) else shipped_scenario(path) or path

@@ -1,4 +1,4 @@
-"""One-line error messages from pydantic's validation errors: file, line, key, value and fix.
+"""Conversion of pydantic's validation errors to one-line messages with file, line, key, value and fix.
 
 Scenarios and servo maps share this module, so their errors have the same form.
 """
@@ -24,13 +24,13 @@ from dynsim.errors import ModelError
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
 
-# Limits of a message: number of unknown keys, number of other problems, characters of a value or key.
+# Limits for one message: number of unknown keys, number of other problems, length of a value or key [characters].
 UNKNOWN_SHOWN = 20
 OTHERS_SHOWN = 4
 SHOWN_LIMIT = 80
-# Keys whose value selects the configuration class of a mapping.
+# Keys whose value selects the configuration class for a mapping.
 TAGS = ("type", "kind")
-# A list index in a dotted key.
+# Pattern for a list index in a dotted key.
 INDEX = re.compile("[0-9]{1,9}")
 
 
@@ -45,18 +45,18 @@ def errors_at(*keys: int | str) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Origin:
-    """Origin of the values of a scenario; messages use it to show the line of a key.
+    """Origin of the values of a scenario or servo map, from which messages determine the line of a key.
 
     Attributes
     ----------
     file : Path or str
-        The file, or another name of the source.
+        The file, or a name for another source.
     mappings : tuple
-        Merged mappings as read from the file: the changes of the variant first, then the rest of the file.
+        Mappings that were read from the file and merged: first the changes of the variant, then the rest of the file.
     overrides : tuple of str
         Dotted keys that were overridden.
     overriding : str
-        Means by which they were overridden, for example a command-line option.
+        How these keys were overridden, for example the name of a command-line option.
     """
 
     file: Path | str
@@ -70,13 +70,13 @@ class Origin:
         return any(own == key or own.startswith(key + ".") or key.startswith(own + ".") for key in self.overrides)
 
     def line(self, keys: Sequence[int | str]) -> int:
-        """Return the line of the last of ``keys`` that is in the file; 0 if the file contains none of the keys."""
-        # The mapping that matches the most keys wins; on a tie the first, because the variant overrides the rest.
+        """Return the line of the deepest of the nested ``keys`` found in the file; 0 if not even the first is found."""
+        # Use the mapping that matches the most keys; on a tie, the first one, because the variant overrides the rest.
         lines = [_line(mapping, keys) for mapping in self.mappings]
         return max(lines, key=lambda depth_and_line: depth_and_line[0], default=(0, 0))[1]
 
     def location(self, keys: Sequence[int | str]) -> str:
-        """Return ``file:line`` of a key, or the means by which it was overridden."""
+        """Return ``file:line`` of a key; if the key was overridden, return how, see :attr:`overriding`."""
         if self.sets(keys):
             return self.overriding
         return f"{self.file}:{line}" if (line := self.line(keys)) else str(self.file)
@@ -90,7 +90,7 @@ def unknown_keys(
     Parameters
     ----------
     error : ValidationError
-        Error of pydantic.
+        Validation error raised by pydantic.
     data : Any
         Data that were validated.
     origin : Origin
@@ -98,7 +98,7 @@ def unknown_keys(
     schema : type of BaseModel
         Schema that the data violate.
     also : sequence of str
-        Further keys that are known at the top level.
+        Further keys that are allowed at the top level.
     """
     texts: list[str] = []
     for problem in error.errors(include_url=False, include_input=False):
@@ -114,7 +114,7 @@ def unknown_keys(
 
 
 def explain(error: ValidationError, data: Any, origin: Origin, unknown: Sequence[str]) -> str:
-    """Return one line with file:line, key, value and fix of each problem; unknown keys come first."""
+    """Return one line that states the location, key, value and fix of each problem, starting with the unknown keys."""
     texts = list(dict.fromkeys(unknown))
     shown = texts[:UNKNOWN_SHOWN] + (["and more"] if len(texts) > UNKNOWN_SHOWN else [])
     problems = error.errors(include_url=False, include_input=False)
@@ -126,10 +126,10 @@ def explain(error: ValidationError, data: Any, origin: Origin, unknown: Sequence
             continue
         keys, value, text = _problem(problem, data, siblings[problem["type"], problem["loc"][:-1]])
         key = dotted(keys)
-        # A misspelt key also makes the right one missing.
+        # A misspelt key causes a second problem, because the correct key is missing; do not report it.
         misspelt = problem["type"] == "missing" and any(f"did you mean {str(keys[-1])!r}?" in other for other in texts)
         if not misspelt:
-            # pydantic reports one problem for each type of a union: show only the first.
+            # pydantic reports one problem for each type in a union; show only the first.
             others.setdefault(key, f"{origin.location(keys)}: {key and f'{key}{value}: '}{text}")
     shown += itertools.islice(others.values(), OTHERS_SHOWN)
     if (more := len(others) - OTHERS_SHOWN) > 0:
@@ -138,7 +138,7 @@ def explain(error: ValidationError, data: Any, origin: Origin, unknown: Sequence
 
 
 def _problem(problem: ErrorDetails, data: Any, siblings: int) -> tuple[list[int | str], str, str]:
-    """Return the keys of a value, " = value" (empty for mappings and lists), and the problem.
+    """Return the keys of an invalid value, the text " = value" (empty for a mapping or list), and the problem.
 
     ``siblings`` is the number of problems of the same type in the same list.
     """
@@ -171,7 +171,7 @@ def _problem(problem: ErrorDetails, data: Any, siblings: int) -> tuple[list[int 
 
 
 def _wrong_tag(keys: list[int | str], value: Any, context: Mapping[str, Any]) -> tuple[list[int | str], str, str]:
-    """Return keys, value and problem of a mapping whose ``type`` (or ``kind``) is unknown, misspelt or missing."""
+    """Return the keys, value and problem if the ``type`` (or ``kind``) of a mapping is unknown, misspelt or missing."""
     tag = context["discriminator"].strip("'")
     known = context.get("expected_tags", "").replace("'", "")
     entries = value if isinstance(value, Mapping) else {}
@@ -185,7 +185,7 @@ def _wrong_tag(keys: list[int | str], value: Any, context: Mapping[str, Any]) ->
 
 
 def key_text(key: object) -> str:
-    """Return a key for a message, on one line and of limited length."""
+    """Return a key as text for a message: on one line and of limited length."""
     text = str(key)
     text = text if len(text) <= SHOWN_LIMIT else text[:SHOWN_LIMIT] + "…"
     return text if text.isprintable() else repr(text)[1:-1]
@@ -196,9 +196,9 @@ def dotted(keys: Sequence[int | str]) -> str:
 
 
 def value_text(value: object) -> str:
-    """Return a value for a message, on one line and of limited length."""
+    """Return a value as text for a message: on one line and of limited length."""
     if isinstance(value, str):
-        # The name of a file is at the end of its path.
+        # Keep both ends of a long text: a path ends with the name of the file.
         half = SHOWN_LIMIT // 2
         return repr(value if len(value) <= SHOWN_LIMIT else f"{value[:half]}…{value[-half:]}")
     text = repr(value)
@@ -207,13 +207,13 @@ def value_text(value: object) -> str:
 
 def suggest(word: str, known: Any) -> str:
     if len(word) > SHOWN_LIMIT:
-        return ""  # the time of the comparison grows with the square of the length
+        return ""  # the comparison time grows with the square of the length
     near = difflib.get_close_matches(word, [str(k) for k in itertools.islice(known, 1000)], n=1, cutoff=0.6)
     return f"; did you mean {near[0]!r}?" if near else ""
 
 
 def _locate(data: Any, loc: tuple[int | str, ...]) -> tuple[list[int | str], Any, bool]:
-    """Return the keys of a pydantic location without its union tags, the value there, and whether it exists."""
+    """Return the keys of a pydantic location without its union tags, the value at this location, and if it exists."""
     keys: list[int | str] = []
     node, exists = data, True
     for part in loc:
@@ -226,7 +226,7 @@ def _locate(data: Any, loc: tuple[int | str, ...]) -> tuple[list[int | str], Any
         elif isinstance(node, Mapping) and part in (node.get(tag) for tag in TAGS):
             continue
         elif exists and isinstance(node, (int, float, str, list)):
-            # Branches of a union of plain types, such as "float" and "list[float]".
+            # Skip parts that name a branch of a union of plain types, such as "float" or "list[float]".
             continue
         else:
             exists = False
@@ -235,7 +235,7 @@ def _locate(data: Any, loc: tuple[int | str, ...]) -> tuple[list[int | str], Any
 
 
 def _line(mapping: Any, keys: Sequence[int | str]) -> tuple[int, int]:
-    """Return how many of ``keys`` exist in a mapping of a YAML file, and the line of the last; (0, 0) if none does."""
+    """Return how many of the nested ``keys`` a YAML mapping contains, and the line of the last one; (0, 0) if none."""
     depth = line = 0
     node = mapping
     for key in keys:
@@ -261,7 +261,7 @@ def _fields(schema: type[BaseModel], loc: tuple[int | str, ...]) -> list[str]:
 
 
 def _models(annotation: Any) -> list[type[BaseModel]]:
-    """Return the configuration classes in an annotation; ``families.MemberField`` lists them in ``models``."""
+    """Return the configuration classes in an annotation; for ``families.MemberField``, ``models`` returns them."""
     if isinstance(annotation, type) and not isinstance(annotation, types.GenericAlias):
         return [annotation] if issubclass(annotation, BaseModel) else []
     if callable(choices := getattr(annotation, "models", None)):
@@ -275,5 +275,5 @@ def _literals(model: type[BaseModel]) -> tuple[Any, ...]:
 
 
 def listed(names: Sequence[str]) -> str:
-    """Return up to four names joined by commas; of more names only the first, the last and their number."""
+    """Join up to four names with commas; for more names, return only the first, the last and their number."""
     return ", ".join(names) if len(names) <= 4 else f"{names[0]} … {names[-1]} ({len(names)})"

@@ -7,7 +7,7 @@ from dynsim.jit.kernel import kernel
 
 @kernel
 def solve_banded(band, lower, upper, right):
-    """Solve A x = b by elimination with row exchanges, which fill up to ``lower`` more diagonals above the band.
+    """Solve A x = b by elimination with row exchanges, which fill up to ``lower`` additional diagonals above the band.
 
     Parameters
     ----------
@@ -16,7 +16,7 @@ def solve_banded(band, lower, upper, right):
     lower, upper : int
         Numbers of diagonals below and above the main diagonal.
     right : (n, m) ndarray
-        Right side b; overwritten with x.
+        Right-hand side b; overwritten with x.
     """
     n, m = right.shape
     for k in range(n):

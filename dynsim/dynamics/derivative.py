@@ -1,4 +1,4 @@
-"""The coupled system of bodies, motors and contacts as one right-hand side dy/dt ([WM] eqs 28–35).
+"""Right-hand side dy/dt of the coupled system of bodies, motors and contacts ([WM] eqs 28–35).
 
 The layout of y (positions, rates, currents, integrals) is in dynsim.dynamics.state.
 """
@@ -44,7 +44,7 @@ class System(NamedTuple):
     reference: ReferenceArrays
     contacts: ContactArrays
     loads: LoadArrays
-    dense: np.ndarray | None  # scratch for M* and b, see dynsim.dynamics.contact.m_star; None: articulated solve only
+    dense: np.ndarray | None  # scratch for M* and b, see dynsim.dynamics.contact.m_star; None: only articulated solve
     couplings: CouplingArrays = CouplingArrays(
         integers(np.zeros((0, ka.COUPLING_JOINT_SIZE))), reals(np.zeros((0, ka.COUPLING_SIZE)))
     )
@@ -53,9 +53,10 @@ class System(NamedTuple):
 
 
 def new_workspace(system: System) -> Workspace:
-    """Allocate the workspace of a system with closed couplings and sliding candidates; unilateral law: open candidates.
+    """Allocate the workspace of a system, with all couplings closed.
 
-    Candidates marked LEFT_OUT are open under both laws.
+    Candidates slide at first under the bilateral law and are open under the unilateral law. Candidates marked LEFT_OUT
+    are open under both laws.
     """
     contacts, couplings, unilateral = system.contacts, system.couplings, system.unilateral
     c, joint_rows = contacts.link.shape[0], couplings.joint.shape[0]
@@ -70,7 +71,7 @@ def new_workspace(system: System) -> Workspace:
 
 @internal_kernel
 def constrained_acceleration(model: ModelArrays, unilateral: UnilateralArrays | None, ws: Workspace):
-    """Compute vdot and row forces of the applied forces by the articulated solve, in ``ws.joints`` and ``ws.rows``."""
+    """Compute vdot in ``ws.joints`` and the forces in ``ws.rows`` from the applied forces by the articulated solve."""
     factor(model, ws)
     p, passes = ws.counts[ka.ROWS], 0
     while p > 0:
@@ -94,8 +95,8 @@ def m_star_acceleration(
 ):
     """Compute the same unknowns from the dense M*, if ``dense`` is allocated.
 
-    The articulated solve runs first, because projection uses its factors. Dependent rows are not counted twice:
-    ``dependent`` is their number before that solve.
+    The articulated solve runs first, because projection uses its factors. ``dependent`` is the count of dependent rows
+    before that solve, so that they are not counted twice.
     """
     if dense is None:  # resolved at compile time; the default program then excludes M*
         return
@@ -112,7 +113,7 @@ def derivative(system: System, t, y, ws: Workspace, dy):
     model, drives, contacts, layout = system.model, system.drives, system.contacts, system.layout
     joints, motors = ws.joints, ws.motors
     n, na = joints.shape[0], motors.shape[0]
-    # Most robots have one position per rate; the others read and write their positions by kind of joint.
+    # Most robots have one position per rate; for the other robots, reading and writing depends on the kind of joint.
     plain = layout.extra == 0
     if not plain:
         read_positions(model, y, layout.q, ws)
@@ -120,7 +121,7 @@ def derivative(system: System, t, y, ws: Workspace, dy):
         if plain:
             joints[i, ka.Q] = y[layout.q + i]
         joints[i, ka.QD] = y[layout.v + i]
-        # The sweep multiplies it by zero, which would propagate a NaN of a state without solution indefinitely.
+        # The sweep multiplies vdot by zero; a NaN from a state without a solution would therefore persist indefinitely.
         joints[i, ka.QDD] = 0.0
         joints[i, ka.APPLIED] = -(model.body[i, ka.DAMPING] + model.body[i, ka.GEAR_DAMPING]) * joints[i, ka.QD]
     drive(drives, system.reference, t, y, layout, ws)

@@ -18,11 +18,11 @@ from dynsim.dynamics.tree.sweep import kinematics
 from dynsim.jit.kernel import internal_kernel, kernel
 
 ITERATIONS = 200
-STEP_MAX = 0.3  # [rad or m] per iteration; prevents jumps to another branch of solutions
+STEP_MAX = 0.3  # maximum step per iteration [rad or m]; prevents jumps to another branch of solutions
 
 
 class PathArrays(NamedTuple):
-    """Point, joints and braces that follow a path, and scratch. r = 3 + braces, c moving joints, n joints."""
+    """Point, joints and braces that follow a path, and scratch: r = 3 + number of braces, c moving joints, n joints."""
 
     link: int  # link that carries the point
     point: np.ndarray  # (3,) point in the frame of the link [m]
@@ -56,7 +56,7 @@ def follow_path(
     base, carried : (T, 4) ndarray, int
         Coordinates of a mobile base, and their first index in q; (T, 0) without a base.
     tolerance : float
-        Distance that counts as reached [m].
+        Distance from a target at which it counts as reached [m].
     q : (nq,) ndarray
         Previous solution; overwritten with the last one.
     result : (T, c) ndarray
@@ -74,8 +74,8 @@ def follow_path(
         for e in range(base.shape[1]):
             q[carried + e] = base[k, e]
         if k >= 3 and moving <= rows:
-            # The parabola through the last three solutions leaves one iteration to do. Not for redundant joints: the
-            # motion that the hand does not determine would run away.
+            # Start from the parabola through the last three solutions, which leaves only one iteration. Do not do this
+            # for redundant joints, because the motion that the hand does not determine would run away.
             for j in range(moving):
                 q[path.place[j]] = 3.0 * result[k - 1, j] - 3.0 * result[k - 2, j] + result[k - 3, j]
         clip_to_limits(path, q)
@@ -83,7 +83,7 @@ def follow_path(
         for _ in range(ITERATIONS):
             left = errors(model, ws, path, targets[k], q)
             best = min(best, left)
-            # Two orders below the tolerance: the references must be smooth, not just close.
+            # Iterate far below the tolerance, because the references must be smooth, not just close.
             if left < 1e-4 * tolerance:
                 break
             exclude_limited(path, q)
@@ -98,7 +98,7 @@ def follow_path(
 
 @internal_kernel
 def exclude_limited(path: PathArrays, q):
-    """Zero the rates of joints at limits that a step downhill would move beyond them."""
+    """Zero the rates of joints at a limit that a descent step would move beyond it."""
     for j in range(path.column.shape[0]):
         pull = 0.0
         for e in range(path.error.shape[0]):
@@ -111,14 +111,14 @@ def exclude_limited(path: PathArrays, q):
 
 @internal_kernel
 def clip_to_limits(path: PathArrays, q):
-    """Put joints beyond a limit on it."""
+    """Move joints that are beyond a limit back to it."""
     for j in range(path.column.shape[0]):
         q[path.place[j]] = max(min(q[path.place[j]], path.upper[j]), path.lower[j])
 
 
 @internal_kernel
 def errors(model: ModelArrays, ws: Workspace, path: PathArrays, target, q):
-    """Compute the errors to the target and the surfaces and their derivatives; return the length of the error [m]."""
+    """Compute the distances from the target and surfaces, with derivatives; return the norm of the distances [m]."""
     read_positions(model, q, 0, ws)
     for j in range(ws.joints.shape[0]):
         ws.joints[j, ka.QD] = 0.0

@@ -17,7 +17,7 @@ from dynsim.jit.kernel import internal_kernel, kernel
 
 @internal_kernel
 def drive_powers(drives: DriveArrays, ws: Workspace):
-    """Return electrical, drawn, Joule, mechanical and drag power of all drives [W]; see :func:`ledger_rates`."""
+    """Return the total electrical, drawn, Joule, mechanical and drag powers of all drives [W]; see `ledger_rates`."""
     joints, motors, motor = ws.joints, ws.motors, drives.motor
     electrical, drawn, joule, mechanical, drag = 0.0, 0.0, 0.0, 0.0, 0.0
     for a in range(motors.shape[0]):
@@ -53,10 +53,10 @@ def damping_powers(model: ModelArrays, ws: Workspace):
 def ledger_rates(model: ModelArrays, drives: DriveArrays, ws: Workspace, out, layout):
     """Write the rates of all integrals to the blocks ledger and contact of ``out`` [W; N, m/s], and the normal forces.
 
-    Electrical Σ u i; drawn Σ max(u i, 0), one supply per motor; supply max(Σ u i, 0), one supply for all; Joule Σ R i²;
-    gear Σ D_m v² and the drag of servos; joint Σ D v²; friction −Σ f_n (d − n)·v of sliding contacts, with the force
-    direction d; constraint Σ f J v of all rows (zero on the constraint); mechanical Σ tau v with
-    tau = K_m i − J_m vdot − D_m v − drag ([WM] eq 25).
+    The powers are: electrical, Σ u i; drawn, Σ max(u i, 0), with one supply per motor; supply, max(Σ u i, 0), with one
+    supply for all motors; Joule, Σ R i²; gear, Σ D_m v² and the drag of servos; joint, Σ D v²; friction,
+    −Σ f_n (d − n)·v of sliding contacts, with the force direction d; constraint, Σ f J v of all rows (zero if the
+    constraints are satisfied); mechanical, Σ tau v with tau = K_m i − J_m vdot − D_m v − drag ([WM] eq 25).
     """
     state = ws.contacts
     electrical, drawn, joule, mechanical, drag = drive_powers(drives, ws)
@@ -66,12 +66,12 @@ def ledger_rates(model: ModelArrays, drives: DriveArrays, ws: Workspace, out, la
     rows = ws.rows
     for k in range(state.shape[0]):
         m, mode, slip = ws.active[k, ka.FIRST_ROW], ws.active[k, ka.MODE], 0.0
-        # Zero for a candidate off its surface: no solve writes to its row.
+        # The force of a candidate off its surface is zero, because no solve writes to its row.
         f, rate = rows[m, ka.FORCE], state[k, ka.GAP_RATE]
         state[k, ka.NORMAL_FORCE] = f
         if mode == ka.SLIDING:
             x, y, z = state[k, ka.SLIP_VELOCITY], state[k, ka.SLIP_VELOCITY + 1], state[k, ka.SLIP_VELOCITY + 2]
-            # The slip velocity has no component along n, so d·v_t is only friction.
+            # The slip velocity has no component along n, so d·v_t contains only friction.
             friction -= f * (
                 rows[m, ka.DIRECTION + 3] * x + rows[m, ka.DIRECTION + 4] * y + rows[m, ka.DIRECTION + 5] * z
             )
@@ -112,7 +112,7 @@ def dry_losses(unilateral: UnilateralArrays | None, ws: Workspace, out, start):
 
 @kernel
 def kinetic_energy(model: ModelArrays, ws: Workspace):
-    """Return ½ Σ V·I V + ½ Σ J_m v² [J], from the poses and axes of the last sweep; overwrites V."""
+    """Return the kinetic energy ½ Σ V·I V + ½ Σ J_m v² [J] from the poses and axes of the last sweep; overwrites V."""
     tree, links, joints = model.tree, ws.links, ws.joints
     total = 0.0
     for i in range(tree.shape[0]):
@@ -133,7 +133,7 @@ def kinetic_energy(model: ModelArrays, ws: Workspace):
 
 @kernel
 def potential_energy(model: ModelArrays, ws: Workspace):
-    """Return −Σ m g·c [J], zero at the world origin, after ``forward_sweep``."""
+    """Return the potential energy −Σ m g·c [J], relative to the world origin; call after ``forward_sweep``."""
     total = 0.0
     for i in range(ws.links.shape[0]):
         m, c, _ = body_inertia(model, ws, i)
@@ -143,7 +143,7 @@ def potential_energy(model: ModelArrays, ws: Workspace):
 
 @internal_kernel
 def magnetic_energy(drives: DriveArrays, ws: Workspace):
-    """Return ½ Σ L i² [J]."""
+    """Return the magnetic energy ½ Σ L i² [J]."""
     total = 0.0
     for a in range(ws.motors.shape[0]):
         total += 0.5 * drives.motor[a, ka.INDUCTANCE] * ws.motors[a, ka.CURRENT] * ws.motors[a, ka.CURRENT]

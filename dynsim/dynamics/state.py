@@ -1,6 +1,6 @@
 """Layout of the state vector and of a row of recorded outputs; no other file defines it.
 
-State y, all in one vector, blocks in this order:
+The state y is one vector with these blocks, in this order:
 
     q        (nq,)  joint positions [rad or m; quaternions]
     v        (n,)   joint rates
@@ -13,7 +13,7 @@ State y, all in one vector, blocks in this order:
     elastic  (2,)   energy stored by contacts and ties since the start, and dissipated by their dampers [J];
                     only with compliant contacts or ties, see dynsim.integrators.stepping.contacts
 
-Error control covers the first three; the others are integrals on which the motion does not depend.
+Error control covers the first three blocks; the other blocks are integrals on which the motion does not depend.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-# Integrals of the ledger, all in joules. DRAWN, MECHANICAL and SUPPLY are reported, not part of the balance.
+# Integrals of the ledger, all in joules. DRAWN, MECHANICAL and SUPPLY are reported, but are not part of the balance.
 ELECTRICAL, DRAWN, JOULE, GEAR, JOINT, FRICTION, CONSTRAINT, MECHANICAL, SUPPLY = 0, 1, 2, 3, 4, 5, 6, 7, 8
 LEDGER_SIZE = 9
 # Per contact: impulse of the normal force [N s], slip distance [m].
@@ -51,7 +51,7 @@ class StateLayout(NamedTuple):
     size: int
     tracked: int  # number of leading entries under error control: all entries that derivatives depend on
     extra: int  # nq − n
-    circuits: int  # currents among the states
+    circuits: int  # number of currents in the state
 
 
 def state_layout(
@@ -88,7 +88,7 @@ class OutputLayout(NamedTuple):
 
 
 def block(layout: StateLayout | OutputLayout, name: str) -> slice:
-    """Return the slice of the block ``name``: up to the start of the next block."""
+    """Return the slice of the block ``name``, which extends to the start of the next block."""
     names = layout._fields
     return slice(getattr(layout, name), getattr(layout, names[names.index(name) + 1]))
 

@@ -1,11 +1,12 @@
 """Tables of the right-hand side: columns, constants and arrays of model, drives, contacts and workspace, in SI units.
 
-n links (one rate each), na drives (motors), c contact points, p constraint rows. A link is one row of a joint and the
-body that it carries; parents come before their children. Spatial vectors are (angular, linear) in W at the world
-origin, so inertias and wrenches of different bodies simply add.
+The dimensions are n links (one rate each), na drives (motors), c contact points and p constraint rows. A link is one
+row of a joint and the body that it carries; parents come before their children. W is the world frame and B the frame of
+a body. Spatial vectors are (angular, linear) in W about the world origin, so the inertias and wrenches of different
+bodies can simply be added.
 
-A table is one array whose columns are named by the constants below. Arrays are few because each one costs time in every
-compiled call, and because the columns of one link are then adjacent in memory.
+A table is one array whose columns are named by the constants below. There are only a few arrays, because each one costs
+time in every compiled call, and because the columns of one link are then adjacent in memory.
 """
 
 from __future__ import annotations
@@ -16,19 +17,19 @@ import numpy as np
 
 # Joint kinds. The three axis-aligned revolute joints are special cases of REVOLUTE, for speed.
 REVOLUTE_X, REVOLUTE_Y, REVOLUTE_Z, REVOLUTE, PRISMATIC = 0, 1, 2, 3, 4
-# Rows of joints with several velocities, or with a special motion: dynsim.dynamics.tree.joints.
+# Rows of joints with several velocities or a special motion, see dynsim.dynamics.tree.joints.
 BALL_X, BALL_Y, BALL_Z, ROLL, TURN, LEFT_WHEEL, RIGHT_WHEEL = 5, 6, 7, 8, 9, 10, 11
 # Friction of a contact under a negative (pulling) normal force, see dynsim.dynamics.contact.rows.
 FRICTION_SIGNED, FRICTION_DISSIPATIVE = 0, 1
-# Mode of a candidate: off its surface (no row), sliding (one row, friction in its direction), or held at its anchor
-# (three rows). Constant within a step.
+# Mode of a candidate: off its surface (no row), sliding (one row, whose force includes friction), or held at its anchor
+# (three rows). The mode is constant within a step.
 OPEN, SLIDING, STICKING = 0, 1, 2
-MOST_ROWS = 3  # rows of a candidate
+MOST_ROWS = 3  # maximum number of rows of a candidate
 
 # ModelArrays.tree, int
 PARENT = 0  # index of the parent link, -1 for the world
 KIND = 1  # joint kind
-TURNED = 2  # 0 if R_PJ is the identity, so that one product can be skipped
+TURNED = 2  # 0 if R_PJ is the identity, so that a matrix product can be skipped
 BRANCHES = 3  # number of children other than link i + 1
 POSITION_INDEX = 4  # start of the row's coordinates in the block of positions
 BASE = 5  # link on which the row's joint is mounted: the parent of the joint's first row, -1 for the world
@@ -43,18 +44,18 @@ INERTIA = 19  # 6: about the centre of mass, in B, xx xy xz yy yz zz [kg m^2]
 ARMATURE = 25  # reflected motor inertia J_m, or BRAKED if a brake is closed [kg m^2 or kg]
 DAMPING = 26  # viscous joint loss D [N m s/rad or N s/m]
 GEAR_DAMPING = 27  # viscous gear loss D_m, reflected [N m s/rad or N s/m]
-PARAMETER = 28  # extra parameter of some kinds of joint, such as the lead of a screw
+PARAMETER = 28  # additional parameter of some kinds of joints, such as the lead of a screw
 BODY_SIZE = 29
-# So heavy that loads do not change the joint's position even by rounding, and a contact point carried by braked joints
-# only does not move.
+# Inertia so large that loads do not change the joint's position even by rounding, and that a contact point carried only
+# by braked joints does not move.
 BRAKED = 1e30
 # Drive kinds, see dynsim.dynamics.drive.
 DC_MOTOR, POSITION_SERVO, OPEN_TORQUE = 0, 1, 2
 # DriveArrays.table, int
 DRIVEN = 0  # index of the link whose joint the drive moves
 DRIVE_KIND = 1
-CIRCUIT = 2  # index of its current in the currents of the state, -1 for none
-SAMPLED = 3  # CONTINUOUS: the command follows the state; otherwise it is held: taken AT_TICKS or GIVEN by the caller
+CIRCUIT = 2  # index of the drive's current among the currents of the state, -1 without a circuit
+SAMPLED = 3  # CONTINUOUS: the command follows the state; AT_TICKS: sampled and held; GIVEN: set by the caller and held
 SERVO_MODE = 4  # POSITION_MODE, VELOCITY_MODE or OFF; may be written between steps
 CURRENT_LIMITED = 5  # 1: DC motor whose driver limits the current to I_MAX
 DRIVE_SIZE = 6
@@ -67,22 +68,22 @@ J_M = 3  # I_m k^2 [kg m^2]
 D_M = 4  # d_m k^2 [N m s/rad]
 K_P = 5  # [V/rad]
 K_D = 6  # [V s/rad]
-U_MAX = 7  # voltage limit [V], inf for none
-I_MAX = 8  # current limit of a servo or DC motor [A], limit of an open torque [N m]; inf for none
+U_MAX = 7  # voltage limit [V], inf if none
+I_MAX = 8  # current limit of a servo or DC motor [A], torque limit of an open torque [N m]; inf if none
 K_V = 9  # gain of a servo's velocity loop [V s/rad]
-COULOMB = 10  # gear friction of a servo at speed [N m]
-COULOMB_SPEED = 11  # speed below which it fades [rad/s]
+COULOMB = 10  # Coulomb friction in a servo's gear [N m]
+COULOMB_SPEED = 11  # speed below which the Coulomb friction fades [rad/s]
 FREE_DRAG = 12  # viscous drag of a servo's gear while it is off [N m s/rad]
-MOTOR_SIZE = 16  # whole cache lines
+MOTOR_SIZE = 16  # padded to whole cache lines
 # DriveArrays.input
 COMMAND = 0  # command of a sampled drive between ticks [V; N m for an open torque]
 LINE_START = 1  # rewritten reference: its value [rad; N m for an open torque]
 LINE_RATE = 2  # [rad/s; N m/s]
-LINE_SINCE = 3  # time at which it has that value [s]
+LINE_SINCE = 3  # time at which the reference has the value LINE_START [s]
 INPUT_SIZE = 4
 # Modes of a servo
 POSITION_MODE, VELOCITY_MODE, OFF = 0, 1, 2
-# ReferenceArrays.spline, instead of a row of coefficients: held, or the line of DriveArrays.input
+# Values of ReferenceArrays.spline in place of a row of coefficients: held, or the line in DriveArrays.input
 HELD_POSITION, REWRITTEN = -1, -2
 # Linear block of a drive, see dynsim.dynamics.drive.law.drive_block
 TORQUE_Q, TORQUE_V, TORQUE_I, RATE_Q, RATE_V, RATE_I = 0, 1, 2, 3, 4, 5
@@ -91,7 +92,7 @@ BLOCK_SIZE = 6
 LINK = 0
 FRICTION_LAW = 1
 CURVED = 2  # 0 for a plane: Q = 0, and then b is its unit normal
-LEFT_OUT = 3  # 1: no joint moves it along the normal in any posture; it never has an active row
+LEFT_OUT = 3  # 1: no joint moves the point along the normal in any posture, so that it never has an active row
 CONTACT_LINK_SIZE = 4
 # ContactArrays.point
 POINT = 0  # 3: in the body's frame [m]
@@ -102,11 +103,11 @@ MU = 0  # kinetic coefficient μ
 V_S = 1  # smoothing speed of the slip direction [m/s]
 STATIC = 2  # static coefficient μ_s ≥ μ
 STRIBECK = 3  # speed v_s [m/s] of μ + (μ_s − μ) exp(−(s/v_s)²); 0: μ as soon as it slips
-VISCOUS = 4  # [s/m]: adds c s to the coefficient
+VISCOUS = 4  # viscous friction c [s/m], which adds c s to the coefficient
 RESTITUTION = 5
-GRIP = 6  # time stepping: ratio of friction along GRIP_AXIS to friction across; 1: isotropic
+GRIP = 6  # time stepping: ratio of friction along GRIP_AXIS to friction across it; 1: isotropic
 GRIP_AXIS = 7  # 3: in the body's frame; zero for isotropic friction
-CONTACT_STIFFNESS = 10  # time stepping: stiffness of surface and body along the normal [N/m]; 0: rigid
+CONTACT_STIFFNESS = 10  # time stepping: combined stiffness of surface and body along the normal [N/m]; 0: rigid
 CONTACT_DAMPING = 11  # [N s/m]
 FLOOR = 12  # bilateral law: no force if the mobility along the normal is at most this [1/kg]
 CONTACT_LAW_SIZE = 13
@@ -125,7 +126,7 @@ P = 9  # 3: p_WB [m]
 S = 12  # 6: joint axis as a motion vector at the world origin
 V = 18  # 6: spatial velocity
 A = 24  # 6: spatial acceleration minus gravity
-F = 30  # 6: wrench through the joint; scratch of the solves
+F = 30  # 6: wrench transmitted by the joint; scratch of the solves
 U_OVER_D = 36  # 6: IA S / D, D = S.IA S + J_m
 INVERSE_D = 42  # 1 / D
 IA = 43  # 21: articulated inertia passed down by branches: angular block 6, coupling 9 row-major, linear block 6
@@ -136,7 +137,7 @@ QD = 1  # v [rad/s or m/s]
 QDD = 2  # vdot
 BIAS = 3  # h + g, or the result of newton_euler
 APPLIED = 4  # applied generalised force
-EXTRA = 5  # second coordinate of a row with two
+EXTRA = 5  # second coordinate of a row that has two
 JOINT_SIZE = 6
 # Workspace.motors
 CURRENT = 0  # [A]
@@ -144,7 +145,7 @@ VOLTAGE = 1  # [V]
 Q_REF = 2  # [rad; N m for an open torque]
 V_REF = 3  # [rad/s]
 DIDT = 4  # [A/s]
-DRAG = 5  # gear friction that is not part of GEAR_DAMPING, against v [N m]
+DRAG = 5  # gear friction that is not part of GEAR_DAMPING, opposing v [N m]
 DRY_DRAG = 6  # drag of a gear with dry friction: positive against v > 0 [N m or N]
 MOTOR_STATE_SIZE = 7
 # Workspace.contacts: geometry and forces of each candidate, with or without rows
@@ -166,10 +167,10 @@ DIRECTION = 6  # 6: wrench of a unit force on A, its negative on B; for a joint 
 TARGET = 12  # J vdot must equal this [m/s^2]
 RHS = 13  # right-hand side of the small system
 FORCE = 14  # [N]
-SIGN = 15  # sign of the force that DIRECTION was built for
-ROW_MU = 16  # friction that DIRECTION carries
-ROW_GAP = 17  # error of positions that projection removes [m or rad], see dynsim.dynamics.contact.rows
-ROW_RATE = 18  # error of rates that projection removes [m/s or rad/s]
+SIGN = 15  # sign of the force for which DIRECTION was computed
+ROW_MU = 16  # friction coefficient included in DIRECTION
+ROW_GAP = 17  # position error that projection removes [m or rad], see dynsim.dynamics.contact.rows
+ROW_RATE = 18  # rate error that projection removes [m/s or rad/s]
 ROW_OFFSET = 19  # joint row: required sum of its two joints times its coefficients [rad or m]
 ROW_FLOOR = 20  # the row has no force if its mobility is at most this
 ROW_STATE_SIZE = 21
@@ -179,7 +180,7 @@ OWNER = 1  # candidate, tie, coupling or, numbered after the couplings, joint st
 BODY_A = 2  # link, or the following joint of a joint row
 BODY_B = 3  # link at the other end, -1 for the world; the leading joint of a joint row
 LAW = 4  # FRICTION_SIGNED unless DIRECTION depends on the sign of the force
-# and, in the same array, for each candidate
+# Columns of the same array for each candidate
 MODE = 5  # OPEN, SLIDING or STICKING
 FIRST_ROW = 6
 ACTIVE_SIZE = 7
@@ -203,7 +204,7 @@ class ModelArrays(NamedTuple):
 
 
 class DriveArrays(NamedTuple):
-    """Drives of the joints by kind, with the law of each command. ``input`` may be written between steps."""
+    """Tables of the drives of the joints; ``input`` may be written between steps."""
 
     table: np.ndarray  # (na, DRIVE_SIZE) int
     motor: np.ndarray  # (na, MOTOR_SIZE)
@@ -222,7 +223,7 @@ class ReferenceArrays(NamedTuple):
 
 
 class ContactArrays(NamedTuple):
-    """Candidates: points on bodies, each with the surface that may hold it, a quadric C(r) = r.Q r / 2 + b.r + c."""
+    """Contact candidates: points on bodies, each with its surface, the quadric C(r) = r.Q r / 2 + b.r + c."""
 
     link: np.ndarray  # (c, CONTACT_LINK_SIZE) int
     point: np.ndarray  # (c, POINT_SIZE)
@@ -230,24 +231,24 @@ class ContactArrays(NamedTuple):
 
 
 class CouplingArrays(NamedTuple):
-    """Joints that follow others, q_follower = ratio q_leader + offset."""
+    """Joints that follow other joints, q_follower = ratio q_leader + offset."""
 
     joint: np.ndarray  # (couplings, COUPLING_JOINT_SIZE) int
     law: np.ndarray  # (couplings, COUPLING_SIZE)
 
 
 class Workspace(NamedTuple):
-    """Intermediate results of a right-hand side; allocated once. p is the largest possible number of rows."""
+    """Intermediate results of the right-hand side, allocated once; p is the largest possible number of rows."""
 
     links: np.ndarray  # (n, LINK_SIZE)
     joints: np.ndarray  # (n, JOINT_SIZE)
-    trig: np.ndarray  # (3, n or more) sine, cosine and q; padded to whole vectors of four to avoid a slow remainder
+    trig: np.ndarray  # (3, n or more) sine, cosine and q; padded to a multiple of four to avoid a slow remainder loop
     motors: np.ndarray  # (na, MOTOR_STATE_SIZE)
     contacts: np.ndarray  # (c, CONTACT_STATE_SIZE)
-    rows: np.ndarray  # (p, ROW_STATE_SIZE) the active rows first: couplings, then contacts
+    rows: np.ndarray  # (p, ROW_STATE_SIZE); the active rows come first: couplings, then contacts
     active: np.ndarray  # (p, ACTIVE_SIZE) int
     column: np.ndarray  # (n, 1 + 2p) eliminated right-hand sides: applied force, then each row and its direction
-    small: np.ndarray  # (4, p, p) the system J M^-1 F of the active rows and the scratch of its solve
+    small: np.ndarray  # (4, p, p) matrix J M^-1 F of the active rows, and scratch for its solution
     counts: np.ndarray  # (COUNTS_SIZE,) int
 
 
@@ -257,7 +258,7 @@ def row_limit(c: int, couplings: int) -> int:
 
 
 def workspace(n: int, na: int, c: int, couplings: int = 0) -> Workspace:
-    """Allocate a :class:`Workspace` for n links, na motors, c candidates and ``couplings`` couplings; no row active."""
+    """Allocate a :class:`Workspace` without active rows for n links, na motors, c candidates and some couplings."""
     p = row_limit(c, couplings)
     return Workspace(
         links=np.zeros((n, LINK_SIZE)),

@@ -1,4 +1,4 @@
-"""Simulation and check of a scenario with the engine of its plant; types for progress and the start state."""
+"""Functions that simulate or check a scenario with the engine for its plant; types for progress and the start."""
 
 from __future__ import annotations
 
@@ -21,11 +21,12 @@ from dynsim.system import interruption
 from dynsim.system.arguments import names_wrong_types
 from dynsim.system.memo import remembering
 
-# No log output unless the caller configures it. Here, not in dynsim/__init__.py: every module that logs imports this.
+# Nothing is logged unless the caller configures logging. This line is here and not in dynsim/__init__.py, because every
+# module that logs imports this package.
 logging.getLogger("dynsim").addHandler(logging.NullHandler())
 log = logging.getLogger(__name__)
 
-# Modules of the engines.
+# Module that implements each engine.
 ENGINES = {"dynamics": "dynsim.engine.simulation", "kinematic": "dynsim.engine.kinematic"}
 REFERENCES, SIMULATION = "references", "simulation"
 
@@ -52,17 +53,17 @@ class Start:
     gaps : dict of str to float
         Distance of each of these points from its surface [m]; negative: below the surface.
     aloft : str
-        Scenario line that would put all declared points onto their surfaces; empty if all touch.
+        Scenario line that would put all declared contact points onto their surfaces; empty if all of them touch.
     solved : dict of str to (float, float, str)
         Joints that ``initial.on_surface`` moved: new position, previous position and unit [deg or m].
     tip_margin : float or None
         Tip margin of a mobile base at rest under weight and loads; None for a fixed or floating base.
     tip_margin_braced : float or None
-        Tip margin including the contacts that touch, with forces of least motor heat; None without such contacts, or if
-        they do not hold the arm.
+        Tip margin if the touching contacts support the arm with the forces that minimise motor heat; None if no contact
+        touches, or if the contacts cannot hold the arm.
     warnings : sequence of str
-        Keys without effect, bodies below surfaces, contact points that no joint moves along the normal, an unstable
-        sampled loop, and jumps at a start in equilibrium.
+        Warnings about keys without effect, bodies below surfaces, contact points that no joint moves along the normal,
+        an unstable sampled control loop, and jumps at a start in equilibrium.
     off_path : float or None
         Distance of the hand from the start of its path [m]; None without a path.
     scene : Scene or None
@@ -104,7 +105,7 @@ def simulate(scenario: Scenario, progress: Progress | None = None, *, pictured: 
     SimulationStopped
         If the run diverges or has no solution; ``error.record`` contains the results up to the stop.
     SimulationInterrupted
-        On Ctrl-C; ``error.record`` likewise.
+        On Ctrl-C; ``error.record`` contains the results up to the interruption.
     ModelError
         If the scenario does not define a valid physical model.
     UnreachableReference
@@ -114,8 +115,8 @@ def simulate(scenario: Scenario, progress: Progress | None = None, *, pictured: 
 
     Notes
     -----
-    The equations of motion are [WM] eqs 42–44 and 54–55 with motors and contacts, see docs/physics.md. Runs within one
-    ``dynsim.system.memo.remembering`` block, as in a sweep, share intermediate results.
+    The equations of motion are [WM] eqs 42–44 and 54–55, extended by motors and contacts, see docs/physics.md. Runs
+    within one ``dynsim.system.memo.remembering`` block, as in a sweep, share intermediate results.
 
     Examples
     --------
@@ -145,17 +146,17 @@ def note_warnings(scenario: Scenario, record: Record | None) -> None:
 
 @names_wrong_types
 def check(scenario: Scenario, started: Callable[[Start], None] | None = None) -> Start:
-    """Validate a scenario up to the first step and return its start positions and contact gaps.
+    """Validate a scenario without integrating it, and return its start positions and contact gaps.
 
-    Builds the model, solves the start posture and the contact forces, prepares the references and checks the record
-    size.
+    The check builds the model, solves for the start posture and the contact forces, prepares the references, and checks
+    the size of the record.
 
     Parameters
     ----------
     scenario : Scenario
         Scenario to check.
     started : callable, optional
-        Called with the :class:`Start`, still without ``off_path``, before contacts and references are checked.
+        Called with the :class:`Start` before contacts and references are checked; its ``off_path`` is not yet set.
 
     Returns
     -------
@@ -171,11 +172,11 @@ def check(scenario: Scenario, started: Callable[[Start], None] | None = None) ->
     ScenarioError
         If the record would exceed its size limit, or options conflict.
     SimulationStopped
-        If contact forces at the start do not exist or cannot last (Painlevé's paradox).
+        If no consistent contact forces exist at the start, or if they break down immediately (Painlevé's paradox).
 
     Notes
     -----
-    Nothing is integrated. Criteria for the existence of contact forces: docs/physics.md.
+    Nothing is integrated. docs/physics.md states when contact forces exist.
 
     Examples
     --------

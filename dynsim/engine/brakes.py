@@ -1,4 +1,4 @@
-"""Brakes of a stepped simulation: joints with a very large armature, and the contacts they block."""
+"""Brakes of a stepped simulation: braked joints have a very large armature, contacts they block are left out."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from dynsim.scenario import Scenario, build
 
 
 def projection_loss(prepared: Prepared, time: float) -> float:
-    """Project rates onto the rows of the bilateral law and return the kinetic energy lost [J].
+    """Project joint rates onto the constraints of the bilateral law and return the kinetic energy lost [J].
 
-    Steps also project rates, by their own error; the ledger must show this loss separately.
+    Steps also project rates, to remove their integration errors. The ledger must show the loss at a brake separately.
     """
     system, workspace, y = prepared.system, prepared.workspace, prepared.run.y
     if workspace.counts[ka.ROWS] == 0:

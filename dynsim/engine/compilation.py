@@ -1,7 +1,8 @@
 """Messages about kernel compilation: which kernels, the reason, and the expected duration.
 
 Each compilation writes one log line. On a terminal without progress bars, lines on stderr mark its start and end.
-Commands show it in their progress bars, also for worker processes, which announce it in a file next to the kernels.
+Commands show compilations in their progress bars, including compilations in worker processes, which announce them in a
+file next to the kernels.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ LAST = "compiled_in_s.json"
 # Suffix of the file that announces a compilation in progress; the file name is the process id.
 MARK = ".compiling"
 # Expected duration as text if no earlier compilation is known.
-USUAL = "seconds to two minutes on two cores"
+USUAL = "a few seconds to two minutes on two cores"
 # Interval at which displays read these files [s].
 LOOK_S = 0.5
 
@@ -64,14 +65,14 @@ def shown_by_caller() -> None:
 
 @contextmanager
 def kernels_logged(log: logging.Logger, kind: str = "", loads: bool = True) -> Iterator[None]:
-    """Log the time that loading or compiling kernels takes.
+    """Log how long it takes to load or compile kernels.
 
     Parameters
     ----------
     log : logging.Logger
         Logger to write to.
     kind : str, optional
-        Kind of system that the kernels are for.
+        Kind of system for which the kernels are compiled.
     loads : bool, optional
         If False, log nothing when the kernels were only loaded.
     """
@@ -110,14 +111,14 @@ def _beginning(kind: str) -> Compilation:
     folder = cache_folder()
     others = any(folder.glob("*.kernel"))
     why = (
-        "the first of this kind since dynsim was installed, updated or edited"
+        "the first compilation of this kind since dynsim was installed, updated or edited"
         if others
-        else "the first since dynsim, numba or numpy were installed, updated or edited"
+        else "the first compilation since dynsim, numba or numpy was installed, updated or edited"
     )
     expected = _durations().get(kind)
-    last = USUAL if expected is None else f"the last time took {expected:.0f} s"
+    last = USUAL if expected is None else f"the last compilation took {expected:.0f} s"
     purpose = f" for {kind}" if kind else ""
-    return Compilation(f"compiling the kernels{purpose}, {why}: {last}, later runs load them", clock.time(), expected)
+    return Compilation(f"compiling the kernels{purpose}, {why}: {last}; later runs load them", clock.time(), expected)
 
 
 @contextmanager
@@ -153,7 +154,7 @@ def under_way() -> Compilation | None:
 
 @contextmanager
 def watched(show: Callable[[Compilation | None], None]) -> Iterator[None]:
-    """Call ``show`` regularly while a compilation is in progress, and once with None when it ends."""
+    """Call ``show`` at regular intervals while a compilation is in progress, and once with None when it ends."""
     shown_by_caller()
     over, folder = threading.Event(), Path(cache_folder())
 

@@ -5,8 +5,8 @@ except for external loads. The missing part is added as a shift of each motor's 
 
     DC motor, position servo: q_d + R i / k_p        torque source: τ_d + τ
 
-The shift cancels the sag under gravity at the start. Compliant contacts that carry load are pressed in: the references
-move with the joints. Errors, tracking and ledger refer to the original references.
+The shift cancels the sag under gravity at the start. Compliant contacts that carry load are pressed in. This moves the
+joints, and the references move with them. Errors, tracking and ledger refer to the original references.
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ from dynsim.model.drives import Motor, Servo, TorqueSource
 
 # A reference starts at rest and without offset if offset and rate are below this [rad or m, rad/s or m/s].
 AT_REST = 1e-4
-# Joints that pressing moves by more than this [rad, m] start in a different posture from the requested one.
+# If pressing contacts in moves a joint by more than this [rad or m], a warning reports that the start posture differs
+# from the requested posture.
 MOVED = {"rad": math.radians(1.0), "m": 5e-3}
 # A normal force below this fraction of the robot's weight counts as zero; spline references leave forces of this size.
 NO_FORCE = 1e-4
@@ -37,7 +38,7 @@ NO_FORCE = 1e-4
 
 @dataclass(frozen=True)
 class Balance:
-    """A start at rest.
+    """Currents, reference shifts and contact forces of a start at rest.
 
     Attributes
     ----------
@@ -48,9 +49,9 @@ class Balance:
     heat : float
         Motor heat Σ R i² [W].
     normal_forces : dict of str to float
-        Normal force of each contact that touches [N]; empty if the controller plans them.
+        Normal force of each contact that touches [N]; empty if the controller plans these forces.
     warnings : tuple of str
-        Jumps that remain at the start.
+        Warnings about jumps that remain at the start.
     on_edge : bool
         True if the posture requires the full static friction.
     """
@@ -96,7 +97,7 @@ def balanced(
     control : JointControl
         Controller with its references.
     real : bool
-        True for the unilateral law.
+        True under the unilateral contact law.
     requested : (nq,) ndarray
         Posture before :func:`pressed`, in which references start.
 
@@ -136,7 +137,7 @@ def balanced(
                 force = robot.links[i].units[3]
                 jumps.append(
                     f"the {'torque' if force == 'N m' else 'force'} of {motor.joint} starts at {begin[a]:.4g} "
-                    f"{force}, at rest it would be {torques[i]:.4g}"
+                    f"{force}, but would be {torques[i]:.4g} at rest"
                 )
             continue
         drop = motor.resistance * torques[i] / motor.joint_constant
@@ -163,7 +164,7 @@ def balanced(
 
 
 def _moved(model: Model, requested: Array) -> tuple[str, ...]:
-    """Return a warning that names the joints which pressing moves far, or an empty tuple."""
+    """Return a warning that lists the joints that move far as contacts are pressed in, or an empty tuple."""
     robot = model.robot
     moved = []
     for link, k in zip(robot.links, robot.position_index, strict=True):
@@ -174,15 +175,15 @@ def _moved(model: Model, requested: Array) -> tuple[str, ...]:
     if not moved:
         return ()
     return (
-        f"initial.equilibrium: moves {first_few(moved)} from the requested posture, so that compliant contacts carry "
-        "load: they are soft or have short lever arms; raise contacts.stiffness_N_per_m or change the posture",
+        f"initial.equilibrium: moves {first_few(moved)} away from the requested posture so that compliant contacts "
+        "carry load; they are soft or have short lever arms; raise contacts.stiffness_N_per_m or change the posture",
     )
 
 
 def _relied_on(
     model: Model, contacts: Sequence[Contact], voltages: Array, index: Sequence[int], real: bool
 ) -> list[str]:
-    """Return the compliant contacts on which planned voltages, (na,), rely for part of the weight.
+    """Return the compliant contacts that the planned voltages, (na,), assume to carry part of the weight.
 
     ``index`` is the joint of each motor.
     """

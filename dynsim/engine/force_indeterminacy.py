@@ -1,8 +1,8 @@
 """Contact forces that are not unique: Painlevé's paradox, dependent rows, contacts wedged by friction.
 
-The check during a run is compiled (dynsim.dynamics.contact.delassus). This module locates its result in time and
-describes it in texts for warnings and stops. It also computes the range of accelerations that dependent frictional rows
-allow. docs/physics.md derives the criteria.
+The check during a run is compiled (dynsim.dynamics.contact.delassus). When that check fails, this module finds the time
+of the failure and writes the text of the warning or stop message. It also computes the range of accelerations that
+dependent frictional rows allow. docs/physics.md derives the criteria.
 """
 
 from __future__ import annotations
@@ -32,17 +32,18 @@ Array = NDArray[np.float64]
 NEAR_ZERO = 1e-3
 # A friction factor that avoids the paradox is reported if it is below this.
 WORTH_SAYING = 0.99
-# Halvings of the interval in which forces stop being unique.
+# Number of bisections of the interval in which forces stop being unique.
 BISECTIONS = 50
 # Recorded samples at which the acceleration range of dependent rows is computed.
 SPREAD_SAMPLES = 5
-# Singular values of A below this fraction of the largest are null: well above rounding, well below those of braces.
+# Singular values of A below this fraction of the largest one count as zero. The fraction is well above rounding errors
+# and well below the singular values of braces.
 NULL_TOLERANCE = 1e-9
-# A spread below this fraction of the accelerations is rounding error of the null space.
+# A spread below this fraction of the accelerations is a rounding error of the null space.
 SPREAD_TOLERANCE = 1e-7
 # Maximum number of mode sets examined, each by a singular value decomposition of the rows of all closed contacts.
 MOST_SETS = 50
-# Singular values of unit rows below this count as zero; the square is the tolerance of the elimination of A.
+# Singular values of normalised rows below this count as zero. Its square is the tolerance in the elimination of A.
 DEPENDENT = 1e-6
 
 
@@ -61,7 +62,7 @@ class MotionSpread:
     low, high : float
         Minimum and maximum acceleration.
     taken : float
-        Acceleration in the run, from the least-norm split.
+        Acceleration in the run, which uses the least-norm split of the forces.
     """
 
     joint: str
@@ -74,7 +75,7 @@ class MotionSpread:
 
 @dataclass(frozen=True)
 class ContactMatrices:
-    """A(σ) = A0 − B diag(σ) of one state, A(σ) f = rhs, for the p active rows.
+    """Matrices of the equation A(σ) f = rhs of the p active rows at one state, with A(σ) = A0 − B diag(σ).
 
     Attributes
     ----------
@@ -85,13 +86,13 @@ class ContactMatrices:
     rhs : (p,) ndarray
         Right-hand side.
     force : (p,) ndarray
-        f in the run.
+        Forces f in the run.
     signs : (p,) ndarray
-        σ in the run.
+        Signs σ in the run.
     free : (p,) ndarray of bool
         True for dissipative contacts with friction, whose σ is the sign of f.
     owner : (p,) ndarray of int
-        Contact of each sliding row, −1 for other rows.
+        Index of the contact of each sliding row, −1 for other rows.
     """
 
     frictionless: Array
@@ -112,7 +113,7 @@ class ContactMatrices:
         return vectors[:, values > RANK_TOLERANCE * values.max(initial=0.0)]
 
     def determinant(self, signs: Array) -> float:
-        """Return det A(σ) / det A0; with dependent rows, both are taken on the range of A0."""
+        """Return det A(σ) / det A0; with dependent rows, both determinants are restricted to the range of A0."""
         Q = self.basis()
         return float(np.linalg.det(Q.T @ self.matrix(signs) @ Q) / np.linalg.det(Q.T @ self.frictionless @ Q))
 
@@ -134,7 +135,7 @@ class ContactMatrices:
         return result
 
     def solutions(self) -> list[Array]:
-        """Return the forces (p,) of every sign choice that is consistent with them, without duplicates.
+        """Return the forces (p,) for every choice of signs that agrees with these forces, without duplicates.
 
         Requires independent rows.
         """
@@ -151,7 +152,7 @@ class ContactMatrices:
         return solutions
 
     def critical_friction(self) -> float | None:
-        """Return the smallest factor s ≤ 1 on all friction for which det(A0 − s B diag(σ)) = 0, or None."""
+        """Return the smallest factor s ≤ 1 that, applied to all friction, makes det(A0 − s B diag(σ)) zero, or None."""
         Q, largest = self.basis(), 0.0
         frictionless = Q.T @ self.frictionless @ Q
         for signs in self.choices():
@@ -163,8 +164,8 @@ class ContactMatrices:
     def described(self, solution: Array) -> str:
         """Describe the normal forces of one of the ``solutions`` at the sliding points.
 
-        A solution appears where the determinant for its signs passes through zero, with unbounded forces: there only
-        their signs are meaningful.
+        A solution first appears where the determinant for its signs passes through zero. Its forces are unbounded
+        there, so only their signs are meaningful.
         """
         sliding = solution[self.owner >= 0]
         signs = np.where(self.free, np.copysign(1.0, solution), self.signs)
@@ -173,16 +174,16 @@ class ContactMatrices:
         return f"({', '.join(f'{force:.4g}' for force in sliding)}) N"
 
     def reversed(self) -> NDArray[np.bool_]:
-        """Return the rows, (p,), whose own force alone would accelerate them against it: negative diagonal entries."""
+        """Return a mask, (p,), of rows with a negative diagonal entry: they accelerate against their own force."""
         own = np.diag(self.frictionless)
         return (own > 0.0) & (np.diag(self.matrix(self.signs)) < -kq.DIAGONAL_TOLERANCE * own)
 
     def finite(self) -> bool:
-        """Return False for a state that has diverged."""
+        """Return False if the state has diverged."""
         return bool(np.isfinite(self.frictionless).all() and np.isfinite(self.friction).all())
 
     def unique(self) -> bool:
-        """Return False if the compiled watch would stop the run."""
+        """Return False if the compiled check would stop the run."""
         if not self.finite() or self.determinant(self.signs) <= 0.0 or self.reversed().all():
             return False
         if not self.free.any() or self.basis().shape[1] < len(self.rhs):
@@ -215,9 +216,9 @@ def contact_matrices(system: System, ws: ka.Workspace, t: float, y: Array) -> Co
 
 
 def locate(system: System, ws: ka.Workspace, run: ki.Run) -> tuple[float, Array]:
-    """Return time [s] and state at which forces stopped being unique, by bisection of the rejected step.
+    """Find the time [s] and state at which the forces stopped being unique, by bisection of the rejected step.
 
-    The state is taken as linear over that step, so the time is second-order accurate in the step size.
+    The state is interpolated linearly over that step, so the time is second-order accurate in the step size.
     """
     start, end = float(run.clock[ki.TIME]), float(run.clock[ki.NOT_UNIQUE])
     low, high = 0.0, 1.0
@@ -236,10 +237,10 @@ def locate(system: System, ws: ka.Workspace, run: ki.Run) -> tuple[float, Array]
 def paradox(
     system: System, ws: ka.Workspace, run: ki.Run, contacts: Sequence[Contact]
 ) -> tuple[float, Array, str] | None:
-    """Return time [s], state and message of a stop by Painlevé's paradox, or None if the run ended for another reason.
+    """Return time [s], state and message if Painlevé's paradox ended the run, or None if it ended for another reason.
 
-    A collapsed step size or a diverged state counts if the determinant has nearly vanished: the forces grow without
-    bound before any step can pass the singularity.
+    A collapsed step size or a diverged state counts as the paradox if the determinant has nearly vanished, because
+    forces grow without bound before any step can pass the singularity.
     """
     status, near = int(run.count[ki.STATUS]), False
     if status in (ki.FORCES_REVERSED, ki.SEVERAL_FORCES):
@@ -314,7 +315,7 @@ def motion_spread(
     Returns
     -------
     MotionSpread or None
-        None if only forces are indeterminate and the motion is not.
+        None if only the forces are indeterminate, not the motion.
     """
     worst: MotionSpread | None = None
     for row in np.unique(np.linspace(0, len(times) - 1, SPREAD_SAMPLES).astype(int)):
@@ -332,9 +333,10 @@ def motion_spread(
 def acceleration_range(system: System, t: float, y: Array) -> tuple[Array, Array, Array]:
     """Return accelerations at (t, y), (n,) each: the least-norm split, and minimum and maximum over admissible splits.
 
-    Admissible are all f with A f = rhs whose normal forces have the same signs as in the least-norm split (a support
-    that pushes never pulls); friction keeps its direction. f = f0 + N z with the null space N of A, and the
-    accelerations are linear in z: one linear program per joint and bound. Unbounded sets give infinite values.
+    A force vector f is admissible if A f = rhs and its normal forces have the same signs as in the least-norm split (a
+    support that pushes never pulls); friction keeps its direction. With the null space N of A, f = f0 + N z, and the
+    accelerations are linear in z. Each bound of each joint is therefore a linear program. Unbounded sets give infinite
+    values.
     """
     ws = new_workspace(system)
     matrices = contact_matrices(system, ws, t, np.array(y))
@@ -359,7 +361,7 @@ def acceleration_range(system: System, t: float, y: Array) -> tuple[Array, Array
     for direction in (1.0, -1.0):
         change = np.zeros(n)
         for j in range(n):
-            # In units of the largest force, to match the absolute tolerances of the solver.
+            # Scale the forces by the largest one to match the absolute tolerances of the solver.
             optimum = linprog(
                 direction * slope[j],
                 A_ub=-signs[:, None] * N,
@@ -375,10 +377,11 @@ def acceleration_range(system: System, t: float, y: Array) -> tuple[Array, Array
 def sharing(
     model: Model, contacts: Sequence[Contact], q: Array, modes: Array, rests: NDArray[np.bool_]
 ) -> tuple[list[str], list[str]]:
-    """Find contacts and joints whose rows depend on each other, in one sample of each set of modes.
+    """Find contacts and joints whose rows depend on each other, in one sample for each combination of modes.
 
-    The sample is the first with the most joints at rest: dependent rows stay dependent when rows are added. Contacts
-    may share forces with each other and with joints that dry friction keeps at rest; joints alone share nothing.
+    For each set, the first sample with the most joints at rest is used, because dependent rows stay dependent when rows
+    are added. Contacts may share forces with each other and with joints that dry friction keeps at rest; joints without
+    a contact are not reported.
 
     Zero rows, such as the row across a planar arm, and rows that depend on each other within one contact, as with only
     two joints before it, leave no choice between contacts: each contact is represented by an orthonormal basis of its
@@ -448,7 +451,7 @@ def touching_rows(model: Model, contact: Contact, q: Array, sticks: bool) -> Arr
     """Return the Jacobian rows of the contact forces that rigid bodies would have to determine, (r, n).
 
     A sticking point has three rows, a sliding point one (its normal force). The depth of a compliant contact determines
-    its normal force: only the tangential rows remain, or none.
+    its normal force, so only its tangential rows remain if it sticks, and none if it slides.
     """
     normal, jacobian = contact_point(model, contact, q)
     if contact.stiffness > 0.0:
@@ -459,11 +462,11 @@ def touching_rows(model: Model, contact: Contact, q: Array, sticks: bool) -> Arr
 def row_basis(rows: Array) -> Array:
     """Return an orthonormal basis of the row space, (r, n)."""
     _, sizes, basis = np.linalg.svd(rows, full_matrices=False)
-    # A zero row contains rounding errors of this size.
+    # Rounding errors in a zero row can reach this size.
     return basis[sizes > max(DEPENDENT * sizes.max(initial=0.0), 1e-9)]
 
 
-# Contacts wedged by friction alone: forces of one contact, inside its cone, that push against no joint.
+# Contacts wedged by friction alone: a force inside the friction cone of such a contact acts on no joint.
 
 
 # Number of samples in which a contact is examined, evenly spaced over the samples in which it is closed.
@@ -483,7 +486,7 @@ class Wedge:
     least : float
         Smallest friction coefficient that wedges it.
     friction : float
-        Its friction coefficient at rest.
+        Static friction coefficient of the contact.
     time : float
         Time of the sample [s].
     """
@@ -532,7 +535,7 @@ def wedges(model: Model, contacts: Sequence[Contact], record: Record) -> list[We
             if mode[t] == ka.SLIDING or not _holds(moving, normal, friction, record["contact_force"][t, k]):
                 own.append(Wedge(contact, least, friction, float(record.time[t])))
         if own:
-            # The first of several values that are equal up to rounding.
+            # Use the first of several values that are equal up to rounding.
             result.append(min(own, key=lambda wedge: float(f"{wedge.least:.4g}")))
     return result
 
@@ -545,7 +548,7 @@ def least_coefficient(jacobian: Array, normal: Array) -> tuple[float, Array]:
     moving = row_basis(jacobian.T).T
     along = normal @ moving
     own, other = float(np.linalg.norm(along)), float(np.linalg.norm(normal - moving @ along))
-    # Blocked directions are known up to DEPENDENT; smaller parts count as zero.
+    # Blocked directions are accurate to DEPENDENT; smaller components count as zero.
     if own <= DEPENDENT or other <= DEPENDENT:
         return np.inf, moving
     return own / other, moving
@@ -554,7 +557,8 @@ def least_coefficient(jacobian: Array, normal: Array) -> tuple[float, Array]:
 def _holds(moving: Array, normal: Array, friction: float, force: Array) -> bool:
     """Return whether the contact would stick even without the wedging force; ``force`` (3,) is its total force."""
     along = normal @ moving
-    # Two directions include one along the surface; a single direction, not across the normal, does not.
+    # Two directions of motion always include one along the surface. A single direction that is not perpendicular to the
+    # normal does not.
     slips = np.array([[-along[1]], [along[0]]]) / np.linalg.norm(along) if len(along) == 2 else np.zeros((1, 0))
     needed = np.linalg.solve(np.column_stack([along, slips]), moving.T @ force)
     slack = ON_CONE * (1.0 + float(np.linalg.norm(force)))

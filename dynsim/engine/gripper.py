@@ -1,4 +1,4 @@
-"""Gripper during a run: soft, hardening, hardened, softening; capture, slip and loss of objects, and stops.
+"""Gripper during a run: its hardening and softening, the capture, slip and loss of objects, and the resulting stops.
 
 A close command hardens the gripper. The captured object is held in its present position: the springs start without
 force, and stiffness added by hardening starts undeflected.
@@ -23,16 +23,17 @@ from dynsim.model.gripper import DIRECTIONS, Gripper, grasp_frame, tie_name
 from dynsim.record import Event, Record
 from dynsim.record.measures import GRIPPER_STATES
 
-# Kind of an event: this word and one of the following.
+# The kind of a gripper event is this word followed by one of the words below.
 EVENT, EVENT_KINDS = "gripper", ("captures", "slips", "loses", "releases")
 SOFT, HARDENING, HARDENED, SOFTENING = range(4)
-# Minimum share of the springs while an object is held: a tie needs a stiffness.
+# Minimum share of the spring stiffness while an object is held, because a tie requires some stiffness.
 LEAST_SHARE = 0.01
-# Smaller slips are not recorded [m, rad].
+# Slips smaller than this [m, rad] are not recorded.
 SLIPPED = np.array([1e-3, 2e-2])
-# A tie is at its bound if less than this fraction of the bound is missing.
+# A tie is at its bound if its force is below the bound by less than this fraction.
 AT_BOUND = 1e-3
-# A held object on a hinge or rails slower than this is at rest [rad/s or m/s], and stuck after this time [s].
+# A held object on a hinge or rails counts as at rest if it is slower than this speed [rad/s or m/s], and as stuck after
+# it has been at rest for this time [s].
 AT_REST, STUCK_FOR = 1e-3, 1.0
 
 
@@ -49,7 +50,7 @@ class GripperControl(Stateful):
     mode : int
         SOFT, HARDENING, HARDENED or SOFTENING.
     share : float
-        Present share of the hardened springs, 0 to 1.
+        Present stiffness of the springs as a fraction of their hardened stiffness, 0 to 1.
     held : str or None
         Name of the object in the gripper.
     slipping : bool
@@ -76,7 +77,7 @@ class GripperControl(Stateful):
 
     def __post_init__(self) -> None:
         self._body = self.model.body_index(self.gripper.body)
-        # Rate index of each object on a hinge or rails.
+        # Index of the rate of each object on a hinge or rails.
         joints = [link.joint for link in self.model.robot.links]
         self._rate = {name: joints.index(name) for name in self.objects if name in joints}
 
@@ -96,8 +97,8 @@ class GripperControl(Stateful):
         Raises
         ------
         SimulationStopped
-            ``too_far``: the gripper closes and no object is within capture; ``lost``: an object has slipped out;
-            ``too_stiff``: an object on a hinge or rails does not move.
+            ``too_far``: the gripper closes and no object is within its capture range; ``lost``: an object has slipped
+            out; ``too_stiff``: an object on a hinge or rails does not move.
         """
         if closed and self.mode in {SOFT, SOFTENING}:
             if self.held is None:
@@ -119,7 +120,7 @@ class GripperControl(Stateful):
             simulation.set_tie(tie_name(name, direction), holds=True)
 
     def _harden(self, time: float, simulation: Referenced) -> None:
-        """Increase or decrease the spring share, and release the object when it reaches zero."""
+        """Increase or decrease the spring stiffness, and release the object when the stiffness reaches zero."""
         before = self.share
         if self.mode == HARDENING:
             self.share = min(self.share + self.period / self.gripper.hardening, 1.0)
@@ -167,7 +168,7 @@ class GripperControl(Stateful):
             worst = DIRECTIONS[int((loads / bounds).argmax())]
             direction = f"along {worst}" if len(worst) == 1 else f"about {worst[1]}"
             raise SimulationStopped(
-                f"too_stiff: {name} has not moved since t = {self.stuck_since:g} s, the gripper is at its bound "
+                f"too_stiff: {name} has not moved since t = {self.stuck_since:g} s and the gripper is at its bound "
                 f"{direction}; {slipped} (plant.gripper)",
                 time=time,
                 kind="too_stiff",
@@ -187,14 +188,14 @@ class GripperControl(Stateful):
         ticks = np.floor(record.time / self.period + 1e-6).astype(int)
         rows = np.array(self.trace or [(SOFT, 0.0)])
         state, share = rows[np.minimum(ticks, len(rows) - 1)].T
-        record.add("gripper_share", share, "1", description="share of the hardened gripper's springs")
+        record.add("gripper_share", share, "1", description="spring stiffness relative to the hardened gripper")
         distance = np.array([self.nearest(q)[1] for q in record["q"]])
         add_gripper(record, state.astype(np.int64), distance, self.events)
         record.summary = {**record.summary, "gripper": gripper_summary(record, self.objects)}
 
 
 def gripper_event(time: float, kind: str, name: str, value: float | None = None) -> Event:
-    """Return an event of one of the :data:`EVENT_KINDS` for an object."""
+    """Create a gripper event of one of the :data:`EVENT_KINDS` for an object."""
     return Event(time, f"{EVENT} {kind}", name, value)
 
 
@@ -204,7 +205,7 @@ def state_text(state: int, name: str | None) -> str:
 
 
 def add_gripper(record: Record, state: NDArray[np.int64], distance: Array, events: Iterable[Event]) -> None:
-    """Add the signals common to both levels, states and distances [m], (T,), and the events within the samples."""
+    """Add the signals of both plant levels, states and distances [m], (T,), and the events within the samples."""
     text = ", ".join(f"{number} {name}" for number, name in enumerate(GRIPPER_STATES))
     record.add("gripper_state", state, "1", description=text)
     text = "from the tip of the gripper to the nearest grasp frame"
@@ -239,7 +240,7 @@ def gripper_summary(record: Record, objects: Iterable[str]) -> dict[str, Any]:
 def nearest_object(
     model: Model, objects: Iterable[str], q: Array, tip: tuple[Array, Array], gripper: Gripper | None = None
 ) -> tuple[str, float, float]:
-    """Return the object with the nearest grasp frame, its distance [m], and the angle between the two axes [rad].
+    """Return the object with the nearest grasp frame, its distance [m], and its angle to the gripper axis [rad].
 
     Parameters
     ----------
@@ -252,7 +253,7 @@ def nearest_object(
     tip : ((3, 3) ndarray, (3,) ndarray)
         Rotation and position [m] of the gripper tip.
     gripper : Gripper, optional
-        If set, objects within its capture range come first.
+        If set, objects within its capture range take precedence.
     """
     seen = []
     for name in objects:
@@ -267,12 +268,12 @@ def nearest_object(
 
 
 def captures(gripper: Gripper, distance: float, angle: float) -> bool:
-    """Return whether a grasp frame is within capture range [m, rad]."""
+    """Return whether a grasp frame at a distance [m] and angle [rad] is within capture range."""
     return distance <= gripper.capture_distance and angle <= gripper.capture_angle
 
 
 def refuse_capture(gripper: Gripper, time: float, name: str, distance: float, angle: float) -> None:
-    """Raise SimulationStopped if the gripper closes too far from the nearest object [m, rad]."""
+    """Raise SimulationStopped if the nearest object, at a distance [m] and angle [rad], is out of capture range."""
     if captures(gripper, distance, angle):
         return
     raise SimulationStopped(

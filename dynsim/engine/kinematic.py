@@ -77,13 +77,13 @@ def attitude(w: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def attitude_distance(w: NDArray[np.float64], w_target: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the rotation angle between two attitudes [rad], shape (T,)."""
-    # Use the Frobenius norm: the arc cosine of a trace loses half the digits near zero.
+    # Use the Frobenius norm, because the arc cosine of a trace loses half of the digits near zero.
     norm = np.linalg.norm(attitude(w) - attitude(w_target), axis=(1, 2))
     return 2.0 * np.arcsin(np.clip(norm / np.sqrt(8.0), 0.0, 1.0))
 
 
 def hold_last(trace: SnakeTrace) -> None:
-    """Fill the last row, at whose time no control period starts, with the values held until then."""
+    """Copy the values of the last control period to the last row, because no control period starts at its time."""
     if len(trace.u) > 1:
         for array in (trace.u, trace.slip, trace.at_limit):
             array[-1] = array[-2]
@@ -124,22 +124,22 @@ def add_task(
     add("w_estimate", trace.w_hat, "m, rad", labels=COORDINATES, description="pose estimated by the controller")
     add("position_error", position_error, "m", description="distance of the controlled point from its target")
     add("attitude_error", attitude_error, "rad", description="angle between its attitude and the target attitude")
-    add("base_pose", trace.base, "m, rad", labels=("x", "y", "yaw"), description="base part, at wheel pair 1")
+    add("base_pose", trace.base, "m, rad", labels=("x", "y", "yaw"), description="pose of base part at wheel pair 1")
     add("mode", np.array(run.controller.modes.numbers)[trace.mode], "1", description="mode number")
     add("grounded", grounded, "1", labels=pairs, description="1 if the wheel pair is on the ground")
-    add("gripper", gripper, "1", description="1 closed (hardened), 0 open (soft)")
+    add("gripper", gripper, "1", description="1: closed (hardened), 0: open (soft)")
     add("cost", trace.cost, "1", description="redundancy cost V")
-    add("sigma_min", trace.sigma, "1", description="smallest singular value of B~ of the mode, unweighted")
+    add("sigma_min", trace.sigma, "1", description="smallest singular value of the unweighted matrix B~ of the mode")
     add(
         "support_margin",
         trace.margin,
         "m",
-        description="distance of the centre of mass inside the edges of the support polygon",
+        description="distance from the centre of mass to the nearest edge of the support polygon; negative: outside",
     )
     add("support_area", trace.area, "m^2", description="area of the support polygon")
     add("centre_of_mass", trace.centre, "m", labels=("x", "y", "z"))
-    add("slip", trace.slip, "m/s", description="largest violation of a wheel row within the period")
-    add("at_limit", trace.at_limit, "1", labels=names, description="1 joint removed from the allocation, 2 clamped")
+    add("slip", trace.slip, "m/s", description="largest violation of a rolling constraint in the period")
+    add("at_limit", trace.at_limit, "1", labels=names, description="1: joint removed from allocation, 2: clamped")
     labels = tuple(f"point{i}" for i in range(points.shape[1]))
     add("posture", points, "m", labels=labels, description="polyline: controlled point, joints, axles to the tail")
 
@@ -268,7 +268,7 @@ def task_warnings(run: SnakeControl, record: Record, summary: dict[str, Any]) ->
 
 
 def _refusal_warnings(refusals: list[dict[str, Any]], least_margin: float) -> list[str]:
-    """Return one line for each refused mode, and one for each mode used although it tips."""
+    """Return one line for each refused mode, and one for each mode that was used although the robot tips in it."""
     texts = []
     for mode, taken in dict.fromkeys((refusal["mode"], refusal["taken"]) for refusal in refusals):
         same = [refusal for refusal in refusals if (refusal["mode"], refusal["taken"]) == (mode, taken)]
@@ -281,7 +281,8 @@ def _refusal_warnings(refusals: list[dict[str, Any]], least_margin: float) -> li
     return texts
 
 
-# Objects of a kinematic snake: they carry no forces, are stationary, and follow the gripper while it holds them.
+# Objects of a kinematic snake: they exert no forces, follow the gripper while it holds them, and are otherwise
+# stationary.
 
 
 # A grasp frame closer than this to the hinge axis defines no angle; the rotation of the gripper is used instead [m].
@@ -290,7 +291,7 @@ ON_AXIS = 0.01
 
 @dataclass
 class HeldObject:
-    """An object in the gripper from one tick to another.
+    """An object that the gripper holds from one tick to another.
 
     Attributes
     ----------
@@ -324,7 +325,7 @@ class CarriedObjects:
     gripper : Gripper
         Gripper of the snake.
     ahead : float
-        Distance of the gripper tip in front of the controlled point [m].
+        Distance by which the gripper tip is in front of the controlled point [m].
     period : float
         Control period [s].
     """
@@ -382,7 +383,7 @@ class CarriedObjects:
         self.events.append(gripper_event(time, "captures", name, distance))
 
     def release(self, tick: int, w: Array) -> None:
-        """Release objects that are due, with the controlled point at w (6,)."""
+        """Release the objects that are due for release, with the controlled point at w (6,)."""
         for grasp in self.grasps:
             if grasp.released is None and grasp.end <= tick:
                 part = self._part[grasp.name]
@@ -401,7 +402,7 @@ class CarriedObjects:
                 self.q[self._part[grasp.name]] = self._followed(grasp, *self.tip(w))
 
     def _followed(self, grasp: HeldObject, R: Array, p: Array) -> Array:
-        """Return the coordinates of a held object with the gripper at R, p."""
+        """Return the coordinates of a held object with the gripper at rotation R and position p."""
         body, (R0, p0) = self.objects[grasp.name], grasp.tip
         index, at = self.robot.attach(grasp_frame(grasp.name), np.zeros(3))
         B, origin = self.model.body_pose(index, grasp.q)
@@ -413,7 +414,8 @@ class CarriedObjects:
         axis = B @ link.axis
         if body.slide is not None:
             return np.clip(before + axis @ (p - p0), link.lower, link.upper)
-        # In the plane of the hinge: the grasp frame relative to the axis before, and after moving with the tip.
+        # Position of the grasp frame relative to the hinge axis, in the plane of the hinge: before it moves with the
+        # tip, and afterwards.
         was = B @ at - axis * (axis @ B @ at)
         if np.linalg.norm(was) < ON_AXIS:
             return self._turned(grasp, before + axis @ turn_error(R0, R), link)
@@ -469,7 +471,7 @@ CHUNK = 500  # ticks between checks for signals and progress updates: about 25 m
 
 
 class SnakeRun(SnakeControl):
-    """Control of a snake whose joints follow their rates exactly and whose base moves as its wheels roll."""
+    """Control of a snake whose joints follow the commanded rates exactly and whose base moves as its wheels roll."""
 
     objects: CarriedObjects | None = None
 
@@ -481,7 +483,7 @@ class SnakeRun(SnakeControl):
         record_row(self.model, law, trial, self.ws, 0, trace)
 
     def advance(self) -> None:
-        """Run the control periods up to the next possible change; one period if the source supplies single commands.
+        """Run the control periods up to the next possible change of command or mode; one if commands come singly.
 
         Raises
         ------
@@ -520,7 +522,7 @@ def make_record(run: SnakeRun, scenario: Scenario, wall: float, pictured: bool =
     scenario : Scenario
         Scenario of the run.
     wall : float
-        Wall-clock time of the ticks [s].
+        Wall-clock time spent on the control periods [s].
     pictured : bool, optional
         If False, omit the scene and the poses of its bodies.
     """
@@ -539,8 +541,8 @@ def make_record(run: SnakeRun, scenario: Scenario, wall: float, pictured: bool =
     add = record.add
     add("phi", trace.phi, "rad", labels=names, description="joint angles, head to tail")
     add("rho", trace.rho, "rad", labels=wheels, description="angles of the active wheels")
-    add("phi_dot", trace.u[:, :joints], "rad/s", labels=names, description="joint rates held from this time on")
-    add("rho_dot", trace.u[:, joints:], "rad/s", labels=wheels, description="wheel rates held from this time on")
+    add("phi_dot", trace.u[:, :joints], "rad/s", labels=names, description="joint rates until the next control period")
+    add("rho_dot", trace.u[:, joints:], "rad/s", labels=wheels, description="wheel rates until the next control period")
     add_task(record, run, trace, trace.w, points)
     if run.objects is not None:
         run.objects.add_to(record, trace.w, np.rint(time / period).astype(np.int64))
@@ -572,7 +574,7 @@ def make_record(run: SnakeRun, scenario: Scenario, wall: float, pictured: bool =
 
 
 def _passed_limits(run: SnakeRun, record: Record) -> list[str]:
-    """Warn of the joint that exceeds its limit most: unlike the dynamic level, this level has no joint stops."""
+    """Warn of the joint that exceeds its limit most; unlike the dynamic level, this level has no joint stops."""
     d = run.description
     beyond = np.maximum(record["phi"] - d.upper, d.lower - record["phi"]).max(axis=0)
     worst = int(beyond.argmax())
@@ -600,8 +602,8 @@ def prepare(scenario: Scenario, source: CommandSource | None = None) -> SnakeRun
     Raises
     ------
     ModelError
-        If the robot cannot be controlled as configured, the scenario uses unsupported sections, or a command requests
-        an unknown mode.
+        If the robot cannot be controlled as configured, if the scenario uses unsupported sections, or if a command
+        requests an unknown mode.
     ScenarioError
         If the recording rate does not divide the control rate, or the record would be too large.
     """

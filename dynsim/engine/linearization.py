@@ -2,9 +2,9 @@
 
     δẋ = A δx + B δu,   δy = C δx + D δu,   x = (q, v, i)
 
-Bodies, motors with their controller, loads and active constraints form one right-hand side. Contact modes are fixed at
-the present ones, so the equations are valid until the next event. A sampled controller is replaced by the continuous
-controller with the same law: its loop is closed, and sampling effects are neglected. Constraints enter A at the
+Bodies, motors with their controller, loads and active constraints form one right-hand side. The present contact modes
+are kept, so the equations are valid until the next event. A sampled controller is replaced by the continuous controller
+with the same control law. The loop is therefore closed, and sampling effects are neglected. Constraints enter A at the
 acceleration level: each active row adds two zero eigenvalues, for motions that violate the constraint and do not occur
 in the simulation.
 """
@@ -33,7 +33,8 @@ from dynsim.integrators import run as ki
 from dynsim.integrators.run import fill_output
 
 Array = NDArray[np.float64]
-# Difference steps [rad, m, rad/s, A, …]: from minimum rounding error to below the speeds that smooth friction.
+# Steps of the finite differences [rad, m, rad/s, A, …]. The largest have the smallest rounding errors; the smallest are
+# below the speeds over which friction is smoothed.
 STEPS = tuple(1e-2 / 3.0**k for k in range(9))
 # Rows whose largest entry is below this count as zero [SI units].
 ZERO_ROW = 1e-6
@@ -56,15 +57,15 @@ class Linearization:
     D : (y, u) ndarray
         Feedthrough matrix.
     states, inputs, outputs : tuple of str
-        Names of rows and columns.
+        Names of the states, inputs and outputs, in the order of rows and columns.
     time : float
         Time of the linearization [s].
     x : (x,) ndarray
-        State at the end of a step.
+        State about which the system is linearized.
     xdot : (x,) ndarray
-        Its rate, zero only in an equilibrium.
+        Time derivative of the state; zero only in an equilibrium.
     modes : dict of str to str
-        Mode of each contact point: open, sliding or sticking; under the bilateral law all slide.
+        Mode of each contact point: open, sliding or sticking; under the bilateral law all points slide.
     error : float
         Estimated error of the least accurate entry, relative to the largest entry of its row; accurate to a factor of
         about ten.
@@ -245,9 +246,10 @@ def _selected(kind: str, names: Sequence[str], families: dict[str, dict[str, Any
 def _jacobian(function: Callable[[Array], Array], size: int) -> tuple[Array, float]:
     """Return the derivative of a function at zero, (m, size), and the largest difference between two estimates.
 
-    Sixth-order central differences at several steps. Each entry uses the estimate that differs least from the estimates
-    of the adjacent steps, similar to Ridders' method. (:mod:`scipy.differentiate` halves until an entry agrees in
-    relative terms, which an entry of zero never does, and ends in rounding errors.)
+    The estimates are sixth-order central differences with several step sizes. Each entry uses the estimate that differs
+    least from the estimates of the adjacent step sizes, similar to Ridders' method. (:mod:`scipy.differentiate` halves
+    the step until the relative change of an entry is small. An entry of zero never gets there, so the steps end in
+    rounding errors.)
     """
     estimates = []
     for step in STEPS:
@@ -258,7 +260,7 @@ def _jacobian(function: Callable[[Array], Array], size: int) -> tuple[Array, flo
         estimates.append(np.stack(columns, axis=1))
     every = np.stack(estimates)
     changes = np.abs(np.diff(every, axis=0))
-    # A single change may be small by chance.
+    # The change between two step sizes may be small by chance, so use the larger of two changes.
     changes = np.maximum(changes[:-1], changes[1:])
     best = changes.argmin(axis=0)[None]
     slope, change = (np.take_along_axis(table, best, axis=0)[0] for table in (every[1:-1], changes))

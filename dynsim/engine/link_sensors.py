@@ -1,6 +1,6 @@
-"""Recorded sensors on links: their signals follow from the samples of a run after its end, by Newton and Euler's laws.
+"""Sensors on links: after a run, their signals are computed from its samples by the Newton–Euler equations.
 
-A kind of sensor is an entry of :data:`LINK_SENSORS`, whose name is its key in ``sensors``.
+Each kind of sensor is an entry of :data:`LINK_SENSORS`, with the same key as in ``sensors``.
 """
 
 from __future__ import annotations
@@ -24,10 +24,11 @@ from dynsim.scenario.build import SensorMount
 if TYPE_CHECKING:
     from dynsim.engine.prepare import Prepared
 
-# Samples that are evaluated together: the bodies need 0.3 kB each.
+# Number of samples that are evaluated together; each body needs 0.3 kB per sample.
 BLOCK = 4096
-# Samples closer to a jump than this fraction of their time show the loads after it, see integrators.run.sampled_now; in
-# time stepping, steps that end closer to a jump than this fraction of a step end there.
+# If a sample is closer to a jump than this fraction of its time, it shows the loads after the jump, see
+# integrators.run.sampled_now. In time stepping, a step that ends closer to a jump than this fraction of a step ends at
+# the jump.
 SAME_TIME, SAME_STEP = 1e-12, 1e-9
 # Sine of the angle below which a rotation counts as a small rotation.
 SMALL = 1e-9
@@ -42,9 +43,10 @@ class LinkMotion:
     rotation, origin : (T, n, 3, 3) and (T, n, 3) ndarray
         Frames of the links in the world [m].
     velocity, acceleration : (T, n, 6) ndarray
-        Angular part, and linear part of the point at the world's origin; the acceleration minus gravity.
+        Angular part, then linear part of the body point at the world's origin; gravity is subtracted from the
+        acceleration.
     across : (T, n, 6) ndarray
-        Torque about the world's origin [N m], and force [N], from the parent on the link across its joint.
+        Torque about the world's origin [N m] and force [N] that the parent exerts on the link across its joint.
     """
 
     rotation: Array
@@ -54,7 +56,7 @@ class LinkMotion:
     across: Array
 
     def point(self, body: int, point: Array) -> Array:
-        """Return the position of a point of a link, (3,), in the world, (T, 3) [m]."""
+        """Return the world positions, (T, 3) [m], of a point that is fixed to a link, (3,)."""
         return np.asarray(self.origin[:, body] + self.rotation[:, body] @ point)
 
 
@@ -80,7 +82,7 @@ class LinkSensor:
 
 
 def wrench(motion: LinkMotion, mount: SensorMount) -> tuple[Array, Array]:
-    """Return force [N] and torque about the sensor's point [N m] of the parent on the link, in axes of the sensor."""
+    """Return force [N] and torque about the sensor's point [N m] exerted by the parent on the link, in sensor axes."""
     torque, force = motion.across[:, mount.body, :3], motion.across[:, mount.body, 3:]
     about = torque - np.cross(motion.point(mount.body, mount.point), force)
     return seen(mount, motion, force), seen(mount, motion, about)
@@ -89,8 +91,8 @@ def wrench(motion: LinkMotion, mount: SensorMount) -> tuple[Array, Array]:
 LINK_SENSORS = {
     "wrench": LinkSensor(
         (
-            ("wrench_force", "N", "force of the parent on the body across its joint, in axes of the sensor"),
-            ("wrench_torque", "N m", "torque across the joint about the point of the sensor, in its axes"),
+            ("wrench_force", "N", "force that the parent exerts on the body across its joint, in sensor axes"),
+            ("wrench_torque", "N m", "torque across the joint about the sensor's point, in sensor axes"),
         ),
         wrench,
     ),
@@ -112,7 +114,7 @@ def add_link_sensors(record: Record, scenario: Scenario, prepared: Prepared, pus
     Parameters
     ----------
     pushes : sequence of AppliedWrench
-        Wrenches that the caller of a stepped simulation has set, in the order of time.
+        Wrenches that the caller of a stepped simulation has set, in chronological order.
     """
     placed, count = build.sensor_mounts(scenario, prepared.model.robot), len(record)
     values = {kind: np.empty((len(LINK_SENSORS[kind].signals), count, len(named), 3)) for kind, named in placed.items()}
@@ -128,15 +130,15 @@ def add_link_sensors(record: Record, scenario: Scenario, prepared: Prepared, pus
 
 
 def link_motion(record: Record, prepared: Prepared, pushes: Sequence[AppliedWrench], rows: slice) -> LinkMotion:
-    """Return the motion of the links, and the wrenches across their joints, at some samples.
+    """Return the motion of the links, and the wrenches across their joints, at the samples in ``rows``.
 
-    The wrench across a joint is what the bodies that it carries need for their motion against gravity, minus the
-    wrenches of contacts, loads and ties on them:
+    The wrench across a joint is the wrench required to move the bodies that it carries and to support their weight,
+    minus the wrenches that contacts, loads and ties exert on them:
 
         F_i = Σ (İV − weight) − Σ W_outside, over the bodies from i to the tips
 
-    Its component along the axis of the joint is the force of its drive, losses, stop and coupling on the bodies, after
-    the inertia of the rotor: rotors turn with their joint only.
+    Its component along the joint axis is the force that drive, losses, stop and coupling exert on the bodies, less the
+    force that accelerates the rotor: a rotor turns only with its joint.
     """
     model, n = prepared.system.model, prepared.model.n
     q, v, vdot = (np.asarray(record[name][rows], dtype=np.float64) for name in ("q", "v", "vdot"))
@@ -174,7 +176,8 @@ def link_motion(record: Record, prepared: Prepared, pushes: Sequence[AppliedWren
     return motion
 
 
-# Force that acts on a link: its index, the point (T, 3), force and torque there (T, 3), in the world.
+# Force that acts on a link: index of the link, point of application (T, 3), and force and torque there (T, 3), all in
+# world axes.
 ActingForce = tuple[int, Array, Array, Array | float]
 
 
@@ -206,7 +209,7 @@ def _load_forces(
         if len(load.coefficients):
             body, point = robot.attach(load.body, load.point)
             add(body, load.in_body, point, _components(load, time))
-    # A wrench lasts until the next wrench on its body.
+    # A wrench lasts until the next wrench is set on the same body.
     for body in dict.fromkeys(push.body for push in pushes):
         own = [push for push in pushes if push.body == body]
         index = np.searchsorted([push.time for push in own], time, side="right") - 1
@@ -216,15 +219,18 @@ def _load_forces(
 
 
 def _components(load: Load, time: Array) -> Array:
-    """Return force and torque (T, 6); a load that is not held begins at its first time and has ended at its last."""
+    """Return force and torque (T, 6).
+
+    A load without ``hold`` begins at its first time and has already ended at its last time.
+    """
     lasts = load.hold | ((time >= load.knots[0]) & (time < load.knots[-1]))
     return np.where(lasts[:, None], load.components(time), 0.0)
 
 
 def _load_times(record: Record, prepared: Prepared, pushes: Sequence[AppliedWrench]) -> Array:
-    """Return the times of the loads that the samples show, (T,) [s].
+    """Return the times at which the loads in the samples are evaluated, (T,) [s].
 
-    In time stepping a step has the loads at t + θh. Steps begin when a load jumps, and at the start.
+    In time stepping, a step uses the loads at t + θh. A step begins at the start of the run and whenever a load jumps.
     """
     run, time = prepared.run, record.time
     after = SAME_TIME * np.maximum(1.0, np.abs(time))
@@ -260,9 +266,10 @@ def _tie_forces(record: Record, prepared: Prepared, motion: LinkMotion, rows: sl
 
 
 def _attitudes(record: Record, prepared: Prepared, k: int) -> Array:
-    """Return the rotation of the second body of a torsion tie in the axes of the first without deflection, (T, 3, 3).
+    """Return the rotation of a torsion tie's second body relative to the first in its undeflected state, (T, 3, 3).
 
-    The table has the rotation since the tie began last. Earlier, it is the rotation at the first sample with a force.
+    The table contains this rotation only for the time since the tie last began. For earlier times, the rotation at the
+    first sample with a force is used.
     """
     unilateral, tie, count = prepared.system.unilateral, prepared.model.robot.ties[k], len(record)
     assert unilateral is not None
@@ -293,7 +300,7 @@ def _turning_axes(axis: Array, turned: Array) -> Array:
 
 
 def _add_wheel_spin(robot: Robot, motion: LinkMotion, v: Array, vdot: Array) -> None:
-    """Add the spin of the wheels of a mobile base to what the ground exerts on it; see dynamics.tree.support."""
+    """Add the effect of a mobile base's spinning wheels to the wrench from the ground; see dynamics.tree.support."""
     base = robot.base
     if base is None:
         return

@@ -7,9 +7,9 @@ is in base axes. Each tick of length h moves the joint references at constant ra
     q_d(t) = q_d + (q_d⁺ − q_d) (t − t_k)/h
 
 v and the base velocities change from tick to tick by at most their acceleration limits times h, even if joint limits
-restrict the hand (:class:`HandGovernor`). Wheels get the rates (V ∓ ω T/2)/r, at which they roll without slip.
+restrict the hand (:class:`HandGovernor`). Wheels move at the rates (V ∓ ω T/2)/r, at which they roll without slip.
 
-The last part are the sensors of a sampled controller: sampling, noise, resolution, delay and hold.
+The last part of this module contains the sensors of a sampled controller: sampling, noise, resolution, delay and hold.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ from dynsim.scenario.schema import Encoders
 
 
 HALVINGS = 6
-"""Bisections of the velocity; each computes one stopping path."""
+"""Number of bisections of the velocity; each computes one stopping path."""
 ROUNDING = 1e-9
 """Tolerance of joint rates and accelerations, relative to their limits."""
 TIME_ROUNDING = 1e-9
-"""Tolerance of the times of samples [s]."""
+"""Tolerance of sample times [s]."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class StoppingPath:
 
 
 class HandGovernor(Stateful):
-    """Moves the hand with commanded velocities from which it can stop in time.
+    """Reference governor: limits the commanded hand velocity so that the hand can always stop in time.
 
     Attributes
     ----------
@@ -91,14 +91,14 @@ class HandGovernor(Stateful):
         self._path = StoppingPath(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, len(self.joints))))
 
     def begin(self, q: Array, v: Array) -> None:
-        """Start with the joint rates of the state q, (nq,), and v, (n,), instead of at rest."""
+        """Start with the joint rates of a state with q, (nq,), and v, (n,), instead of from rest."""
         columns = [self._model.joint_names.index(joint) for joint in self._options.joints]
         self.rates = v[columns].copy()
         jacobian = self._model.point_jacobian(*self._model.robot.hand, q)[:, columns]
         self.velocity = self._axes.T @ jacobian @ self.rates
 
     def step(self, commanded: Array) -> None:
-        """Advance one tick towards a velocity (3,) [m/s] that differs from the last by at most a h."""
+        """Advance one tick towards a velocity (3,) [m/s] that differs from the last by at most h times its limit."""
         self.hindrance = ""
         if not (commanded.any() or self.velocity.any()):
             self.rates = np.zeros_like(self.rates)
@@ -131,7 +131,7 @@ class HandGovernor(Stateful):
         """Return whether joints are slower in the second tick than in the first, as on the way out of a singular
         posture.
 
-        Only then may the hand creep. Otherwise it would creep jerkily to the edge of the workspace, and back again.
+        The hand may creep only in this case. Otherwise it would creep jerkily to the edge of the workspace and back.
         """
         joints, _ = self._followed(np.array([velocity, velocity]))
         if joints is None:
@@ -164,17 +164,17 @@ class HandGovernor(Stateful):
         why = (
             self._first((joints < self._low) | (joints > self._high), "is at its limit")
             or self._first(np.abs(rates) > options.rate_limit * (1.0 + ROUNDING), "would be too fast")
-            or self._first(np.abs(changes) > options.acceleration_limit * (1.0 + ROUNDING), "would speed up too fast")
+            or self._first(np.abs(changes) > options.acceleration_limit * (1.0 + ROUNDING), "would accelerate too fast")
         )
         return (None, why) if why else (StoppingPath(velocities, targets, joints), "")
 
     def _first(self, broken: NDArray[np.bool_], reason: str) -> str:
-        """Describe the joint that breaks a limit first."""
+        """Describe the joint that is the first to violate a limit."""
         ticks, joints = np.nonzero(broken)
         return f"{self._options.joints[joints[0]]} {reason}" if len(ticks) else ""
 
     def _followed(self, velocities: Array) -> tuple[Array | None, Array]:
-        """Return joint positions (T, c) along velocities (T, 3), None if out of reach, and the targets (T, 3)."""
+        """Return joint positions (T, c) for hand velocities (T, 3), None if out of reach, and the targets (T, 3)."""
         options = self._options
         targets = self.target + np.cumsum(velocities @ self._axes.T, axis=0) / options.rate
         q, joints, count = self._q.copy(), np.zeros((len(targets), len(self.joints))), len(targets)
@@ -185,7 +185,7 @@ class HandGovernor(Stateful):
 
 
 Array = NDArray[np.float64]
-# A state at a tick may be earlier than the tick by rounding [ticks].
+# Rounding may make a state at a tick earlier than the tick by up to this [ticks].
 TICK_SLACK = 1e-9
 # Fraction of the commanded distance that may be lost without a warning: joint limits slow down starts slightly.
 MISSED = 0.01
@@ -242,7 +242,7 @@ class OperatorPath(Stateful):
 
 
 class Operator(Stateful):
-    """Tick callback of a simulation; starts from the scenario's start or from the posture of a state."""
+    """Tick callback of a simulation that starts from the scenario's start or from the posture of a state."""
 
     SAVED = ("ticks", "_moving", "_angles", "_base_velocity", "_free", "_commanded", "_missed", "path", "_hand")
 
@@ -253,7 +253,8 @@ class Operator(Stateful):
         q, time = (robot.initial, 0.0) if state is None else (np.ravel(state.q), state.time)
         self.rate, self.period = options.rate, 1.0 / options.rate
         self.options, self.source = options, options.script if source is None else source
-        # When starting from a state, references are still at the scenario's start: the first tick writes them.
+        # When the simulation starts from a state, references are still those of the scenario's start; the first tick
+        # writes new ones.
         self.ticks, self._moving = math.floor(time * self.rate + TICK_SLACK), state is not None
         self._model, self._start = model, np.array(model.point_position(*robot.hand, q), dtype=np.float64)
         # On a moving base the target is in base axes and has no path in the world.
@@ -275,7 +276,7 @@ class Operator(Stateful):
             self._continue_motion(q, np.ravel(state.v))
 
     def _continue_motion(self, q: Array, v: Array) -> None:
-        """Start references with the present joint and wheel rates, (n,); at zero rates the drives would brake."""
+        """Start the references at the present joint and wheel rates, (n,); with zero rates the drives would brake."""
         if self._hand is not None:
             self._hand.begin(q, v)
             self._free = self._hand.velocity.copy()
@@ -332,7 +333,7 @@ class Operator(Stateful):
         self._commanded += float(np.linalg.norm(self._free)) / self.rate
         missed = float(np.linalg.norm(self._free - hand.velocity)) / self.rate
         if missed > 0.0:
-            # Without a hindrance the hand is still catching up after the last one.
+            # If there is no hindrance, the hand is still catching up after the last one.
             reason = hand.hindrance or next(reversed(self._missed), "limits")
             before, since = self._missed.get(reason, (0.0, (self.ticks - 1) / self.rate))
             # Keep the latest reason last.
@@ -355,10 +356,10 @@ class Operator(Stateful):
 
 
 def _limited_change(velocity: Array, wanted: Array, allowed: float) -> Array:
-    """Return a velocity moved towards another by at most the allowed change."""
+    """Return ``velocity``, changed towards ``wanted`` by at most the allowed amount."""
     change = wanted - velocity
     size = float(np.linalg.norm(change))
-    # Exact at the end: a robot that has to stop must have zero velocity.
+    # Reach the wanted velocity exactly, because a robot that has to stop must end at zero velocity.
     return wanted.copy() if size <= allowed else velocity + allowed / size * change
 
 
@@ -373,7 +374,7 @@ class SampledSensor(Stateful):
     Parameters
     ----------
     read : callable
-        Returns the true value (k,) of a state.
+        Returns the true value (k,) for a state.
     period : float
         Sampling period [s].
     delay : float
@@ -421,7 +422,7 @@ class SampledSensor(Stateful):
         return self._samples[0][1]
 
     def rate(self, time: float) -> Array:
-        """Return the difference of the last two samples over the period, (k,); zero with fewer than two samples."""
+        """Return the difference of the last two samples divided by the period, (k,); zero before the second sample."""
         value = self.value(time)
         return np.zeros_like(value) if self._before is None else (value - self._before) / self.period
 
@@ -429,8 +430,8 @@ class SampledSensor(Stateful):
 class EncodedCommands(Stateful):
     """Sampled controller that reads its joints through encoders and computes all commands at its ticks.
 
-    q̂ is the last sample that has arrived. v̂ is its difference to the previous sample over their period, as in servo
-    drives: resolution ρ and period T of the encoders give steps of ρ/T in v̂.
+    q̂ is the last sample that has arrived. v̂ is its difference from the previous sample divided by their period, as in
+    servo drives. With encoders of resolution ρ and period T, v̂ changes in steps of ρ/T.
 
     Parameters
     ----------

@@ -23,13 +23,13 @@ def check_size(scenario: Scenario, rows: int, columns: int) -> None:
     size = 8e-9 * rows * columns
     if size > limit:
         raise ScenarioError(
-            f"record.rate_hz = {rate:g}: {scenario.duration_s:g} s of {columns} columns need {size:.3g} GB, the limit "
+            f"record.rate_hz = {rate:g}: {scenario.duration_s:g} s of {columns} columns need {size:.3g} GB; the limit "
             f"(record.size_limit_GB) is {limit:g} GB; {rate * limit / size:.3g} Hz would fit"
         )
 
 
 def interrupted(scenario: Scenario, time: float, state: dict[str, Any]) -> SimulationInterrupted:
-    """Return the exception for a run that Ctrl-C ended at a time [s]."""
+    """Return the exception for a run that Ctrl-C interrupted at a time [s]."""
     return SimulationInterrupted(
         f"interrupted at t = {time:.3f} s of {scenario.duration_s:g} s", time=time, state=state
     )

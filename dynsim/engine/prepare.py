@@ -66,17 +66,19 @@ if TYPE_CHECKING:
 
 AUTO = "auto"
 PACE = 0.02
-"""Smallest step assumed necessary for an accurate arm motion [s]."""
+"""Step size that is assumed to be small enough for accurate arm motion [s]."""
 TOUCHING = 1e-6
-"""A contact with a smaller gap is closed at the start [m]."""
+"""A contact with a gap below this [m] is closed at the start."""
 SMALL = 36
-"""Number of joints up to which the Jacobians of RADAU5 cost less than half of its steps."""
+"""Number of joints up to which the Jacobians of RADAU5 take less than half of the time of its steps."""
 UNDAMPED, UNDAMPED_RTOL, LEAST_RTOL = (0.03, 0.1), 3e-9, 1e-12
-"""Step tolerance if nothing damps the errors of steps: UNDAMPED_RTOL, but within these fractions of rtol; fractions are
-applied down to LEAST_RTOL."""
+"""Step tolerance if nothing damps integration errors: UNDAMPED_RTOL, limited to the fractions UNDAMPED of rtol.
+
+The fraction is not applied if the tolerance would be below LEAST_RTOL.
+"""
 
 DENSE = 300
-"""Matrix size up to which all eigenvalues are computed; for larger matrices only the largest."""
+"""Matrix size up to which all eigenvalues are computed; for larger matrices, only the largest one is computed."""
 
 
 class Choice(NamedTuple):
@@ -102,7 +104,7 @@ def choose(
     if rate == 0.0:
         sharper = min(max(UNDAMPED_RTOL / options.rtol, UNDAMPED[0]), UNDAMPED[1])
         sharper = sharper if options.rtol * sharper >= LEAST_RTOL else 1.0
-        reason = f"no drive and no loss damps errors: {sharper:.2g} times the tolerances conserves the energy"
+        reason = f"no drive or loss damps errors: tolerances multiplied by {sharper:.2g} conserve the energy"
         if model.n <= SMALL and any(contact.friction_at_rest > 0.0 for contact in contacts):
             return Choice("radau5", f"{reason}; the implicit method resolves friction at slow slip", sharper)
         return Choice("dopri5", reason, sharper)
@@ -112,9 +114,9 @@ def choose(
 def implicit_threshold(n: int) -> float:
     """Return h |λ| above which a RADAU5 step costs less than the DOPRI5 steps that it replaces.
 
-    DOPRI5 evaluates six right-hand sides for each 3.3/|λ|. RADAU5 evaluates about twenty, and at every eleventh step a
-    Jacobian of 2 n columns and factors of n × n matrices: n³ multiplications take as long as 100 n right-hand sides of
-    a link.
+    DOPRI5 evaluates six right-hand sides per interval of 3.3/|λ|. RADAU5 evaluates about twenty per step and, at every
+    eleventh step, also a Jacobian of 2 n columns and factors of n × n matrices: n³ multiplications take as long as 100
+    n right-hand sides of a link.
     """
     return (20.0 + (2.0 * n + 0.03 * n**2) / 11.0) * 3.3 / 6.0
 
@@ -180,18 +182,19 @@ def _held(model: Model, contacts: Sequence[Contact], q: Array) -> Array:
 
 log = logging.getLogger(__name__)
 
-# A run is refused if its estimated time exceeds the wall-clock limit by this factor: the estimates for small systems
-# are too long by up to this factor.
+# A run is refused if its estimated time exceeds the wall-clock limit by this factor, because estimates for small
+# systems are too long by up to this factor.
 WORK_MARGIN = 10.0
 # Maximum number of explicit steps that the electrical poles may require: a quarter of an hour for ten joints.
 STEPS_LIMIT = 2e8
-# A run whose last MOST_TRIALS steps advanced by no more than this makes no progress, unless it is short [s]: its events
-# are closer together than the steps of any stiff robot.
+# A run, unless it is short, makes no progress if its last MOST_TRIALS steps together advanced by no more than this time
+# [s]. Its events are then closer together than the steps of any stiff robot.
 STALLED_S = 1e-5
-# Slower slip has no defined direction, however tight the tolerances: the rate at which friction turns slip is inversely
-# proportional to it and limits the steps; ten milliseconds of such slip are a nanometre [m/s].
+# Slip slower than this [m/s] has no defined direction, however tight the tolerances are. The rate at which friction
+# turns the slip direction is inversely proportional to the slip speed and limits the steps. In ten milliseconds, such
+# slip moves a point by a nanometre.
 SLOWEST = 1e-7
-# More steps than any run needs.
+# Maximum number of steps, more than any run needs.
 EVERY_STEP = 1 << 62
 
 
@@ -237,7 +240,7 @@ def prepare(
     motors: Sequence[Drive] | None = None,
     starts: bool = True,
 ) -> Prepared:
-    """Compile a scenario to kernel arrays; slow preparation of references reports to ``progress``.
+    """Compile a scenario to kernel arrays; call ``progress`` while references are prepared, if that takes long.
 
     A caller that changes tables of a run must prepare it within a separate memo.
 
@@ -256,7 +259,8 @@ def prepare(
     motors : sequence of Drive, optional
         Motors to use instead of the motors of the plant.
     starts : bool, optional
-        False for a run from a state: the caller checks its posture instead of the scenario's initial posture.
+        False for a run that starts from a state: the caller checks its posture instead of the scenario's initial
+        posture.
 
     Raises
     ------
@@ -287,7 +291,7 @@ def prepare(
     dry = dry_frictions(robot) if real else []
     watched = real and bool(contacts or stops or dry)
     check_robot(scenario.config, robot)
-    build.sensor_mounts(scenario, robot)  # sensors on links that do not exist are errors
+    build.sensor_mounts(scenario, robot)  # raises an error for a sensor on an unknown link
     gives = bool(robot.ties) or any(contact.stiffness > 0.0 for contact in contacts)
     sizes = kst.LOSSES if real else 0, 1 if stepped else 0, kst.ELASTIC_SIZE if gives else 0
     layout = state_layout(model.nq, n, robot.circuits, c, len(loads), *sizes)
@@ -409,14 +413,14 @@ def _check_sensors(scenario: Scenario, control: JointControl) -> None:
 def follow_lines(scenario: Scenario, q: Array, phases: Sequence[Phase]) -> Array:
     """Return the coordinates (nq,) that a robot reaches from rest at q when servos follow linear references.
 
-    ``phases`` is explained at :data:`dynsim.engine.snake_control.Phase`.
+    ``phases`` is described at :data:`dynsim.engine.snake_control.Phase`.
 
     Raises
     ------
     SimulationStopped
         If the motion diverges.
     """
-    # A separate memo: the tables written to below must not be shared with other runs.
+    # Use a separate memo, because the tables written to below must not be shared with other runs.
     with remembering(Memo()):
         prepared = prepare(scenario, times=np.full(1, np.inf), end=phases[-1][0])
     run, system, since = prepared.run, prepared.system, 0.0
@@ -455,7 +459,7 @@ def guards(
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Return the events that a run watches for by default, and their actions: base first, then unilateral contacts.
 
-    A mobile base has an event when its margin falls through zero; for contacts, stops and dry friction see
+    A mobile base triggers an event when its tip margin falls below zero. For contacts, stops and dry friction see
     dynsim.integrators.contacts.events.
     """
     rows = []
@@ -477,7 +481,7 @@ def guards(
 def slow_slip(atol: float) -> float:
     """Return the slip speed below which the slip direction is integration noise [m/s].
 
-    Below this speed, friction turns slip only as fast as at this speed.
+    Below this speed, friction changes the slip direction only as fast as at this speed.
     """
     return max(1000.0 * atol, SLOWEST)
 
@@ -485,16 +489,17 @@ def slow_slip(atol: float) -> float:
 def creep(atol: float) -> float:
     """Return the rate below which a joint with dry friction may be at rest [rad/s or m/s].
 
-    If contacts block a joint that has no row, only its rate shows that it moves. Until the rate exceeds this limit, its
-    friction is the constant friction of rest instead of the full friction. The energy error is proportional to the
-    limit: two to three times the limit per turnover when a turning surface starts to move the joint. At 100 atol, rtol
-    by default, this is a few rtol. The lower bound is the rate that projections leave in active rows.
+    If contacts block a joint that has no constraint row, only its rate shows that it moves. Until the rate exceeds this
+    limit, its friction keeps the constant value from rest instead of the full friction. The energy error is
+    proportional to the limit: relative to the turnover, it is two to three times the limit when a turning surface
+    starts to move the joint. With a limit of 100 atol, which equals rtol by default, the error is a few rtol. The lower
+    bound is the rate that projections leave in active rows.
     """
     return max(100.0 * atol, RATE_TOLERANCE)
 
 
 def _least_progress(duration: float) -> float:
-    """Return the time by which MOST_TRIALS steps must advance [s]."""
+    """Return the time by which MOST_TRIALS steps together must advance [s]."""
     least = ki.PROGRESS * duration
     return max(least, min(10.0 * least, STALLED_S))
 
@@ -503,17 +508,18 @@ def _longest_step(method: int, *, watched: bool) -> float:
     """Return the longest step [s]; limited for implicit methods if contacts, stops or dry friction are watched.
 
     While everything is at rest, nothing limits the steps, and a force could fall below zero and rise again within a
-    step. Knots of references are this far apart. An implicit method stops at their bends, but a force may pass its
-    bound between two of them, which changes the motion.
+    step. The knots of references have the same spacing as this limit. An implicit method stops where references bend,
+    but a force may pass its bound between two such points, which changes the motion.
     """
     table = by_number(method)
     return PACE if table.explicit or (watched and table.adaptive) else np.inf
 
 
 def _breaks(loads: Sequence[Load], control: JointControl, method: int, options: Integrator) -> np.ndarray:
-    """Return the times at which loads jump or bend [s]: a step across them could miss a short push completely.
+    """Return the times at which loads jump or change slope [s]: a step across them could miss a short push completely.
 
-    For an implicit method, include the times at which references bend: their knots are closer than its steps are long.
+    For an implicit method, include the times at which references bend, because its steps are longer than the spacing of
+    their knots.
     """
     times = []
     for load in loads:
@@ -527,7 +533,7 @@ def _breaks(loads: Sequence[Load], control: JointControl, method: int, options: 
 
 
 def sample_times(scenario: Scenario, layout: StateLayout, columns: OutputLayout, links: int) -> np.ndarray:
-    """Return the times of a whole record of a robot with ``links`` links, (T,) [s]; ScenarioError if too large."""
+    """Return the sample times of the whole record, (T,) [s]; raise ScenarioError if it would be too large."""
     rate = scenario.record.rate_hz
     count = int(np.floor(scenario.duration_s * rate * (1.0 + 1e-12))) + 1
     check_size(scenario, count, layout.size + columns.size + pose_columns(links))
@@ -550,10 +556,11 @@ def _check_stiffness(method: str, duration: float, robot: Robot) -> None:
 
 
 def right_hand_side(n: int, p: int, *, dense: bool) -> float:
-    """Return the estimated time of one right-hand side of n joints with p rows [s].
+    """Estimate the time of one evaluation of the right-hand side for n joints and p constraint rows [s].
 
-    Measured from 10 to 1000 links with up to 250 contacts, accurate to a factor of two: the sweeps, the p × p system of
-    chains as long as n, its elimination, twice that for dependent rows (p > n implies dependent rows).
+    The estimate is based on measurements from 10 to 1000 links with up to 250 contacts and is accurate to a factor of
+    two. Its terms are the sweeps over the links, the assembly of the p × p system for chains of n links, and its
+    elimination, which takes twice as long for dependent rows (rows are dependent if p > n).
     """
     seconds = 1e-7 * n + 4e-10 * n * p**2 + (4e-10 if p > n else 2e-10) * p**3
     return seconds + (3e-10 * (n + p) ** 3 if dense else 0.0)
@@ -581,7 +588,7 @@ def _check_work(scenario: Scenario, n: int, p: int, method: str) -> None:
     if wall > WORK_MARGIN * options.wall_limit_s:
         raise ScenarioError(
             f"{n} joints with {p} contacts: a right-hand side takes about {seconds:.1g} s, so "
-            f"{scenario.duration_s:g} s would take about {wall:.2g} s to integrate, the limit "
+            f"{scenario.duration_s:g} s would take about {wall:.2g} s to integrate, but the limit "
             f"(integrator.wall_limit_s) is {options.wall_limit_s:g} s; "
             "use fewer contacts or links, reduce duration_s, or raise the limit"
         )
@@ -603,7 +610,7 @@ def _control(scenario: Scenario, model: Model, contacts: Sequence[Contact], prog
 
 
 def _check_references(scenario: Scenario, model: Model, contacts: Sequence[Contact], control: JointControl) -> None:
-    """Raise an error if exactly followed references would pull a contact point off the surface that holds it."""
+    """Raise an error if references, when followed exactly, would pull a contact point off its surface."""
     robot, tolerance = model.robot, scenario.config.contacts.reference_tolerance_m
     places = [contact.geometry for contact in contacts]
 
@@ -630,7 +637,7 @@ def _check_held(model: Model, contacts: Sequence[Contact], control: JointControl
                 break
             body = parent
         # A joint that does not follow a reference yields, so references do not determine the position of the point. If
-        # no reference moves, the point stays at its initial position, which has a separate check.
+        # no reference moves, the point stays at its initial position, which is checked separately.
         follows = all(a >= 0 and control.k_p[a] > 0.0 for a in chain)
         if follows and any(control.reference.spline[a] >= 0 for a in chain):
             followed.setdefault(carrier, []).append((contact, point))

@@ -57,14 +57,14 @@ from dynsim.system.memo import recall
 # Integrals computed by the integrator, in the order of the state (dynsim.dynamics.ledger).
 INTEGRALS = {
     "energy_electrical": "∫ Σ u i dt, net electrical energy",
-    "energy_electrical_drawn": "∫ Σ max(u i, 0) dt, one supply per motor, without recuperation",
+    "energy_electrical_drawn": "∫ Σ max(u i, 0) dt, one supply per motor, without regeneration",
     "heat_joule": "∫ Σ R i² dt",
     "loss_gear": "∫ Σ D_m v² dt",
     "loss_joint": "∫ Σ D v² dt",
     "heat_friction": "energy dissipated by contact friction",
     "work_constraint": "∫ Σ f_n n·v dt, work of the normal forces",
     "work_mechanical": "∫ Σ tau v dt, tau of [WM] eq 25",
-    "energy_electrical_supply": "∫ max(Σ u i, 0) dt, one supply for all motors, without recuperation",
+    "energy_electrical_supply": "∫ max(Σ u i, 0) dt, one supply for all motors, without regeneration",
 }
 
 # Additional integrals of runs with springs or under the unilateral law.
@@ -76,8 +76,8 @@ LOSSES = {"loss_impact": "energy lost in contact impacts", "loss_stop": "energy 
 
 SCHEME = "energy lost by time stepping; negative: gained"
 
-# Landings do not resolve smaller heights [m]: each is located to AT_ROOT, which leaves the weight times AT_ROOT in the
-# ledger; at this height ten landings reach the limit of the residual.
+# Smallest height that landings resolve [m]. Each landing is located to within AT_ROOT, which leaves an error of the
+# weight times AT_ROOT in the ledger. With this height as energy scale, ten landings reach the limit of the residual.
 RESOLVED_M = 10.0 * ku.AT_ROOT / RESIDUAL_LIMIT
 
 # Pulling forces of unilateral contacts below this fraction of their largest force are within the lift-off tolerance.
@@ -86,7 +86,7 @@ _LOSS_KEYS = {"impact_loss": "loss_impact", "stop_loss": "loss_stop"}
 
 
 def energy_residual(record: Record) -> NDArray[np.float64]:
-    """Return electrical energy, work of constraints and loads minus losses and change of stored energy, (T,) [J]."""
+    """Return electrical energy plus work of constraints and loads minus losses and stored energy change, (T,) [J]."""
     residual = record["energy_electrical"] + record["work_constraint"]
     if "work_loads" in record:
         residual = residual + record["work_loads"].sum(axis=1)
@@ -136,7 +136,7 @@ def summarise(
     record : Record
         Record of the run.
     end : Record
-        One sample of all integrals, at the time up to which the tallies of ``prepared`` count.
+        One sample of all integrals, at the time up to which the statistics of ``prepared`` count.
     scenario : Scenario
         Scenario of the run.
     prepared : Prepared
@@ -247,11 +247,12 @@ def _contact(
     lowest = float(min(extremes[ki.FORCE_MIN], force.min(initial=np.inf)))
     if unilateral is not None and lowest >= -PULLS * max(largest, 0.0):
         lowest = max(lowest, 0.0)
-    # Steps may be longer than the pulling interval of a contact: then samples within them show it.
+    # Steps may be longer than the interval in which a contact pulls. In this case, samples within the steps show the
+    # interval.
     pulling, sampled = float(extremes[ki.PULLING]) / duration if duration > 0.0 else 0.0, int((force < 0.0).sum())
     if sampled > pulling * len(force) + 2.0:
         pulling = sampled / len(force)
-    # Extremes are over the samples and all accepted steps, which are closer together.
+    # Extremes are taken over the samples and all accepted steps, because steps are closer together than samples.
     return {
         "name": contact.name,
         "surface": contact.surface_name,
@@ -286,12 +287,12 @@ def _modes(unilateral: UnilateralArrays, k: int, duration: float) -> dict[str, A
 
 
 def _known(key: str, value: float) -> dict[str, float]:
-    """Return an entry, empty if its value is unknown (see dynsim.engine.ring)."""
+    """Return a dict with one entry, or an empty dict if its value is unknown (see dynsim.engine.ring)."""
     return {} if np.isnan(value) else {key: float(value)}
 
 
 def _joint_stops(record: Record, prepared: Prepared, duration: float) -> list[dict[str, Any]]:
-    """Return the joint stops that were touched."""
+    """Return the entries of the joint stops that were hit."""
     unilateral = prepared.system.unilateral
     assert unilateral is not None
     units = {link.joint: link.units for link in prepared.model.robot.links}
@@ -342,12 +343,12 @@ def _time_stepping(run: ki.Run, springs: bool) -> dict[str, Any]:
 
 
 def motor_loads(record: Record, robot: Robot) -> list[dict[str, Any]]:
-    """Return rms and maximum current and shaft torque of each motor, its ratings, and a servo's friction.
+    """Return rms and maximum of current and shaft torque of each motor, its ratings, and the friction of servos.
 
-    Values are over the whole run, by the trapezoidal rule between samples; unknown ratings are omitted.
+    Values cover the whole run and use the trapezoidal rule between samples; unknown ratings are omitted.
     """
     units = {link.joint: "N_m" if link.units[3] == "N m" else "N" for link in robot.links}
-    # Contiguous samples of each motor: a third of the time.
+    # Contiguous samples for each motor reduce the time to a third.
     values = {name: np.ascontiguousarray(record[name].T) for name in ("current", "torque")}
     rms = {name: _rms(record.time, rows).tolist() for name, rows in values.items()}
     most = {
@@ -414,7 +415,7 @@ def provenance(scenario: Scenario) -> dict[str, Any]:
 
 @lru_cache
 def _version(library: str) -> str:
-    # Reading all metadata takes 6 ms, as long as a short run of a sweep.
+    # Cached, because reading all metadata takes 6 ms, as long as a short run of a sweep.
     try:
         return metadata.version(library)
     except metadata.PackageNotFoundError:
@@ -425,7 +426,8 @@ def _version(library: str) -> str:
 def commit() -> str:
     """Return the commit of the running checkout or of the installed package; "" if unknown.
 
-    Read from .git once, because starting git would take longer. A package gets it from ``.ci/build_hook.py``.
+    The commit is read from .git once, because starting git would take longer. For a package, ``.ci/build_hook.py``
+    stores it.
     """
     built = Path(__file__).resolve().parents[1] / BUILT_FROM
     if built.is_file():
@@ -449,12 +451,13 @@ def commit() -> str:
         return ""
 
 
-# A last sample within this fraction of the run before its end counts as at the end, see dynsim.engine.trace.even_times.
+# If the last sample is before the end of the run by less than this fraction of the run, it counts as at the end, see
+# dynsim.engine.trace.even_times.
 SAME_END = 1e-9
 
 
 def pictured_parts(scene: Scene, scenario: Scenario) -> Scene:
-    """Return the scene with the parts that only the scenario names: objects, mesh folders and the gripper."""
+    """Return the scene with the parts that only the scenario defines: objects, mesh folders and the gripper."""
     plant, grip, tip = scenario.plant, None, 0.0
     if (law := getattr(plant, "gripper", None)) is not None:
         grip = SoftGripper(law.capture_m, law.bound_N, law.turning_bound_N_m)
@@ -482,7 +485,7 @@ def make_record(
     pictured: bool = True,
     begun: float = 0.0,
 ) -> Record:
-    """Return the record of the columns that the kernels wrote.
+    """Create the record of a run from the columns that the kernels wrote.
 
     Parameters
     ----------
@@ -495,7 +498,7 @@ def make_record(
     pushed : sequence of int, optional
         Indices of the loads that are wrenches of the caller and have been set.
     pushes : sequence of AppliedWrench, optional
-        These wrenches, in the order of time, if the scenario has sensors on links.
+        These wrenches in chronological order, if the scenario has sensors on links.
     happened : sequence of Event, optional
         Events of the run.
     base_as_planned : bool, optional
@@ -503,7 +506,8 @@ def make_record(
     pictured : bool, optional
         If False, omit the scene, the poses of its bodies, and provenance.
     begun : float, optional
-        Start time of the run [s]; if samples start later, everything except the effort counts from the first sample.
+        Start time of the run [s]; if samples start later, everything except the computing effort counts from the first
+        sample.
     """
     count, times = int(prepared.run.count[ki.SAMPLE]), prepared.run.sample_time
     lost = count > 0 and times[0] > begun
@@ -519,7 +523,7 @@ def make_record(
     angle, rate, acceleration, _ = _joint_units(robot.links)
     with_motor = set(driven)
     *_, force = _joint_units([link for link in robot.links if link.joint in with_motor] or robot.links)
-    # One unit for all columns, because servos replay and figures draw them together.
+    # All columns have the same unit, because servos replay them together and figures draw them together.
     positions = "joint positions" if robot.base is None else "joint positions; base.x and base.y [m]"
     record.add("q", run.states("q"), angle, labels=robot.position_names, description=positions)
     record.add("v", run.states("v"), rate, labels=joints, description="joint rates")
@@ -547,7 +551,7 @@ def make_record(
     record.add(
         "contact_normal_force", touch[:, :, kst.OUT_FORCE], "N", labels=names, description="f_n; negative: pulling"
     )
-    record.add("contact_force", touch[:, :, vector], "N", labels=names, description="normal and friction force, W")
+    record.add("contact_force", touch[:, :, vector], "N", labels=names, description="normal and friction force, in W")
     record.add("contact_gap", touch[:, :, kst.OUT_GAP], "m", labels=names, description="distance from the surface")
     record.add("contact_slip_velocity", touch[:, :, slip], "m/s", labels=names)
     _add_touch(record, prepared)
@@ -568,8 +572,8 @@ def make_record(
 def _end(record: Record, prepared: Prepared, pushed: Sequence[int], begun: float, *, within: bool) -> Record:
     """Return all integrals at the end of the summarised interval, as a record of one sample.
 
-    For a whole run, whose tallies count up to its present time, the end may be later than the last sample. If samples
-    were lost (``within``), it is the last sample.
+    For a whole run, whose statistics count up to the present time, the end may be later than the last sample. If
+    samples were lost (``within``), the end is the last sample.
     """
     run, rows = prepared.run, len(record)
     time, state = float(run.clock[ki.TIME]), run.y
@@ -584,7 +588,7 @@ def _end(record: Record, prepared: Prepared, pushed: Sequence[int], begun: float
 
 
 def _add_energies(record: Record, prepared: Prepared, pushed: Sequence[int]) -> None:
-    """Add integrals of powers, and energies of impacts and of the scheme."""
+    """Add integrals of powers, and energy losses of impacts and of the integration scheme."""
     run = prepared.run
     for integral, (name, text) in zip(_by_column(run.states("ledger")), INTEGRALS.items(), strict=True):
         record.add(name, integral, "J", description=text)
@@ -612,7 +616,7 @@ def _add_touch(record: Record, prepared: Prepared) -> None:
 
 
 def _by_column(table: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the table in column-major order, because the ledger sums up its columns many times."""
+    """Return the columns as contiguous rows, because the ledger sums them many times."""
     return np.ascontiguousarray(table.T)
 
 
@@ -658,14 +662,14 @@ def _add_touching_points(record: Record, robot: Robot, contacts: Sequence[Contac
             ]
             places[:, k] = touching_points(contact, *ends)
     names = tuple(contact.name for contact in shaped)
-    record.add(TOUCHING, places, "m", labels=names, description="where forces act on spheres and capsules")
+    record.add(TOUCHING, places, "m", labels=names, description="points of force application on spheres and capsules")
 
 
 def _add_base(record: Record, prepared: Prepared, base: MobileBase, as_planned: bool) -> None:
     """Add pose, target and ground forces of the base; see dynsim.dynamics.tree.support."""
     robot, run = prepared.model.robot, prepared.run
     pose, speed = base_pose(robot, run.states("q")), run.states("v")[:, list(map(robot.joint_names.index, base.wheels))]
-    record.add("base_pose", pose, "m, m, rad", labels=("x", "y", "heading"), description="base in the world")
+    record.add("base_pose", pose, "m, m, rad", labels=("x", "y", "heading"), description="base pose in the world")
     target = prepared.control.base_target(robot, record.time) if as_planned else None
     if target is not None:
         record.add(
@@ -673,15 +677,15 @@ def _add_base(record: Record, prepared: Prepared, base: MobileBase, as_planned: 
             target,
             "m, m, rad",
             labels=("x", "y", "heading"),
-            description="target pose of the references",
+            description="target pose according to the references",
         )
     sides, support = SUPPORTS[:2], run.outputs("support")
     parts = (slice(ks.LOADS, ks.LOADS + 3), slice(ks.PRESSURE, ks.PRESSURE + 2), slice(ks.TRACTION, ks.TRACTION + 2))
     load, pressure, traction = (support[:, part] for part in parts)
-    record.add("wheel_speed", speed, "rad/s", labels=sides, description="positive rolls ahead")
+    record.add("wheel_speed", speed, "rad/s", labels=sides, description="wheel speeds; positive: forward")
     record.add("wheel_load", load, "N", labels=SUPPORTS, description="normal forces; negative: pulling")
-    record.add("center_of_pressure", pressure, "m", labels=("x", "y"), description="in the world; NaN for no load")
-    record.add("tip_margin", support[:, ks.MARGIN], "1", description="1 at the incentre, 0 tipping; -1 lifted")
+    record.add("center_of_pressure", pressure, "m", labels=("x", "y"), description="in world axes; NaN without load")
+    record.add("tip_margin", support[:, ks.MARGIN], "1", description="1: at the incentre, 0: tipping, -1: lifted")
     record.add("traction_demand", traction, "1", labels=sides, description="|F|/(μ N); NaN without load")
 
 
@@ -691,11 +695,11 @@ def _joint_units(links: Iterable[Link]) -> Sequence[str]:
     return [" or ".join(dict.fromkeys(kinds)) for kinds in zip(*units, strict=True)]
 
 
-# Files of a run: names, and writing of record, summary and scenario, replaced together.
+# Files of a run: their names, and functions that write record, summary and scenario and replace them together.
 
 
 RUN_FILES = ("record.h5", "summary.json", "scenario.yaml")
-# Files made from records that can be regenerated.
+# Files that are made from records and can be regenerated.
 FIGURE_FORMATS = ("png", "pdf", "svg")
 VIEW = "view.html"
 FIGURES = (*(f"figures/*.{kind}" for kind in FIGURE_FORMATS), "figures/animation.gif", VIEW)
@@ -703,7 +707,7 @@ COMPARISON_FILES = ("comparison.json", "comparison.csv", *(f"compare_*.{kind}" f
 
 
 def save_run(record: Record, folder: Path) -> None:
-    """Write ``record.h5``, ``summary.json`` and the resolved ``scenario.yaml`` to a folder: all three or none.
+    """Write ``record.h5``, ``summary.json`` and the resolved ``scenario.yaml`` to a folder, either all three or none.
 
     A process killed while it replaces them leaves a file ``INCOMPLETE``, for which :meth:`Record.load` checks.
 

@@ -1,4 +1,4 @@
-"""Tallies of a run of which only the last samples are kept in a ring buffer.
+"""Event counts and statistics of a run that keeps only its last samples, in a ring buffer.
 
 The kernels count from the beginning of the run. Within the ring, events are counted; times, fractions and extremes are
 computed from the samples. Three numbers are unknown: the losses of single contacts, the losses of single stops, and the
@@ -33,7 +33,7 @@ _MODES = {ka.OPEN: ku.TIME_OPEN, ka.SLIDING: ku.TIME_SLIDING, ka.STICKING: ku.TI
 
 
 def counted_within(prepared: Prepared, happened: Sequence[Event]) -> Prepared:
-    """Return the run with tallies and extremes of its samples, and of the events from the first sample on.
+    """Return the run with statistics and extremes of the kept samples and of the events from the first sample on.
 
     Parameters
     ----------
@@ -84,13 +84,14 @@ def counted_within(prepared: Prepared, happened: Sequence[Event]) -> Prepared:
 
 
 def _extremes(run: ki.Run, force: Array, gaps: Array) -> Array:
-    """Return the extremes of the samples, (c, EXTREMES_SIZE), from normal forces [N] and gaps of closed contacts [m],
-    (T, c).
+    """Return the extremes of the samples, (c, EXTREMES_SIZE).
+
+    Arguments are the normal forces [N] and the gaps of closed contacts [m], both (T, c).
     """
     extremes = run.extremes.copy()
     extremes[:, ki.FORCE_MIN], extremes[:, ki.FORCE_MAX] = force.min(axis=0), force.max(axis=0)
     extremes[:, ki.DRIFT_MAX] = np.abs(gaps).max(axis=0)
-    # As in dynsim.integrators.run: linear between two samples.
+    # As in dynsim.integrators.run, forces are linear between two samples.
     low, high = np.minimum(force[1:], force[:-1]), np.maximum(force[1:], force[:-1])
     part = np.where(high <= 0.0, 1.0, low / np.where(low < high, low - high, -1.0))
     extremes[:, ki.PULLING] = np.diff(run.sample_time) @ np.where(low < 0.0, part, 0.0)

@@ -1,9 +1,9 @@
 """Simulation of multibody plants: the public stepper :class:`Simulation`, the check of a start, and complete runs.
 
-As long as the caller rewrites nothing, the steps are bit-identical to :func:`dynsim.simulate`, because ``advance`` does
-not cut them. The step that passes the requested time is kept pending, and the state at that time is interpolated from
-its dense output. If the caller rewrites something, this step is discarded, and a shorter one ends at the requested
-time.
+As long as the caller changes nothing, the steps are bit-identical to :func:`dynsim.simulate`, because ``advance`` does
+not shorten them. The step that passes the requested time is kept pending, and the state at that time is interpolated
+from its dense output. If the caller then makes a change, this step is discarded, and a shorter one ends at the
+requested time.
 """
 
 from __future__ import annotations
@@ -74,13 +74,14 @@ log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 
-# Limits on caller ticks: their number (kinds are bits of an integer), and their period [s].
+# Limits for ticks that a caller adds: their number (each is a bit of an integer), and their shortest period [s].
 MOST_TICKS, SHORTEST_PERIOD = 60, 1e-9
-# Ticks within this of the requested time count as at that time, relative to it.
+# Ticks that differ from the requested time by less than this fraction of it count as at that time.
 TICK_SLACK = 1e-12
-# End of a run without a set end [s]: finite, and later than any time in use.
+# End of a run for which no end is set [s]: finite, but later than any time in use.
 _FAR = 1e300
-# A state of a time-stepping run may be a step at this speed below a surface or beyond a stop [m/s or rad/s].
+# In a state from a time-stepping run, points may be below a surface and joints beyond a stop by one step at this speed
+# [m/s or rad/s].
 FASTEST_LANDING = 5.0
 SERVO_MODES = {"position": ka.POSITION_MODE, "velocity": ka.VELOCITY_MODE, "off": ka.OFF}
 # Buffers that kernels write samples to, and tables of callbacks: their sizes change.
@@ -102,8 +103,8 @@ class Simulation:
     scenario : Scenario
         Scenario of a plant with dynamics, see :func:`dynsim.load_scenario`.
     state : State, optional
-        State to start from, at its time, e.g. ``State.of(record)``; default: the start of the scenario at t = 0. The
-        energy ledger starts at zero.
+        State from which to start, at its own time, e.g. ``State.of(record)``; default: the scenario's start at t = 0.
+        The energy ledger starts at zero.
     duration : float, optional
         End of the run [s], ``math.inf`` for no end; default: the end of the scenario. References keep their final
         values after their end.
@@ -128,7 +129,8 @@ class Simulation:
     Notes
     -----
     As long as the caller changes nothing, results are bit-identical to :func:`dynsim.simulate`. Every change, such as
-    :meth:`set_wrench`, takes effect at :attr:`time`. Equations: [WM] eqs 25, 42–44, 54–55, see docs/physics.md.
+    :meth:`set_wrench`, takes effect at :attr:`time`. The equations are [WM] eqs 25, 42–44 and 54–55, see
+    docs/physics.md.
 
     Examples
     --------
@@ -174,16 +176,16 @@ class Simulation:
         self._end = min(end, _FAR)
         self._prepared = self._prepare(end=self._end, motors=motors, starts=state is None)
         if (unstable := unstable_loop(scenario, self._prepared)) is not None:
-            # Live sessions may never make a record, whose summary contains this warning.
+            # Log the warning now: it is in the summary of a record, but a live session may never create a record.
             log.warning("%s: %s", scenario.title, unstable[0])
         self._time, self._begun, self._wall = start, start, 0.0
         # With a ring buffer or a start from a state, the ledger counts from the first sample.
         self._relative = trace is not None or state is not None
         self._happened: list[Event] = []
         self._token = object()
-        # Exception with which a controller ended the run.
+        # Exception by which a controller ended the run.
         self._ended_by: SimulationStopped | None = None
-        # Callbacks due at the present time, in the order of their calls; the callback being called.
+        # Callbacks due at the present time, in call order, and the callback that is being called.
         self._due: list[Callable[[Simulation], None]] = []
         self._calling: Callable[[Simulation], None] | None = None
         self._loaded, self._watch = False, stopping.WallWatch(scenario.integrator.wall_limit_s)
@@ -209,11 +211,11 @@ class Simulation:
         self._references_end = self._prepared.control.end
         self._frozen = not math.isfinite(self._references_end)
         self._pushed: set[int] = set()
-        # Sensors on links need them; other records have their work only.
+        # Keep the caller's wrenches if there are sensors on links; otherwise the record needs only their work.
         self._keeps_pushes, self._past_pushes = bool(build.sensor_mounts(scenario, robot)), list[AppliedWrench]()
         times = None
         if state is None and self._end == scenario.duration_s and trace is None:
-            # Exactly the samples of simulate, including its size limit.
+            # Use exactly the sample times of simulate, including its size limit.
             times = sample_times(scenario, self._prepared.run.layout, self._prepared.run.columns, len(robot.links))
         self._trace = Trace(start, self._end, scenario.record.rate_hz, trace, times, self._block)
         self._sampled = self._prepared.system.drives.table[:, ka.SAMPLED].copy()
@@ -242,7 +244,7 @@ class Simulation:
 
     def _prepare(self, **options: Any) -> Prepared:
         """Compile the scenario to kernel arrays, see :func:`dynsim.engine.prepare.prepare`."""
-        # A separate memo: other runs must not share tables that the caller may change.
+        # Use a separate memo, because other runs must not share tables that the caller may change.
         with remembering(Memo()):
             return prepare(self._scenario, pushable=True, times=np.full(1, np.inf), **options)
 
@@ -265,7 +267,7 @@ class Simulation:
         periods = control_periods(self._scenario, control.task_space.schedule.period)
         pilot = SnakePilot(self.model, control.task_space, *periods, source, self._scenario.config.sensors)
         for sensor in pilot.sensors:
-            # Sensors come before the controller if both are due.
+            # Register sensors first: if both are due, they are called before the controller.
             self.every(sensor.period, sensor)
         return pilot
 
@@ -324,7 +326,7 @@ class Simulation:
 
     @property
     def tie_force(self) -> dict[str, float]:
-        """Force of each tie on its first body in the last step [N or N m]; zero for a tie that does not hold."""
+        """Force of each tie on its first body in the last step [N or N m]; zero for an inactive tie."""
         unilateral = self._prepared.system.unilateral
         if unilateral is None:
             return {}
@@ -333,14 +335,14 @@ class Simulation:
 
     @property
     def tie_slip(self) -> dict[str, float]:
-        """Total distance that each tie has slid beyond its bound since it began, in both directions [m or rad]."""
+        """Total distance that each tie has slid at its bound since it began, in both directions [m or rad]."""
         unilateral = self._prepared.system.unilateral
         slips = [] if unilateral is None else unilateral.tie[:, ku.TIE_GIVEN].tolist()
         return dict(zip((tie.name for tie in self.robot.ties), slips, strict=False))
 
     @property
     def operator(self) -> Operator | SnakePilot | None:
-        """Handler that rewrites references: hand and base (``controller.operator``) or a snake (``task_space``)."""
+        """Handler that rewrites references of hand and base (``controller.operator``) or a snake (``task_space``)."""
         return self._operator
 
     @property
@@ -392,11 +394,11 @@ class Simulation:
         ScenarioError
             If the time is in the past or not a number, or the call comes from a callback.
         SimulationStopped
-            On divergence, no solution, no progress, or the wall-clock limit; ``error.record`` contains the trace so
-            far.
+            If the run diverges, has no solution, makes no progress or exceeds the wall-clock limit; ``error.record``
+            contains the trace so far.
         KeyboardInterrupt
-            On Ctrl-C, within a second. The simulation is at a step on the way and can be advanced again, unless that
-            step would have taken longer.
+            On Ctrl-C, within a second. The simulation is then at the end of a step and can be advanced again, unless
+            that step would have taken longer than this.
 
         Notes
         -----
@@ -426,10 +428,10 @@ class Simulation:
             raise
 
     def _advanced(self, until: float) -> State:
-        # Callbacks left over from a snapshot or from an error in a callback.
+        # Call callbacks that are left over from a snapshot or from an error in a callback.
         self._call_due()
         last = self._references_end
-        # References of a whole run may end earlier by rounding, and then nothing must be rewritten.
+        # In a whole run, rounding may make the references end slightly before the run. They must not be rewritten then.
         if not self._frozen and until > last + END_SLACK * max(1.0, abs(last)):
             self._reach(max(last, self._time))
             if not self.finished:
@@ -438,7 +440,7 @@ class Simulation:
         return self.state
 
     def end_samples(self, time: float) -> None:
-        """End the samples with one at a time [s]; the simulation continues.
+        """Take the last sample at a time [s]; the simulation continues without further samples.
 
         Later records are identical to records of a run that ends at this time, including events and summary.
 
@@ -511,7 +513,7 @@ class Simulation:
             )
         if len(self._calls) == MOST_TICKS:
             raise ScenarioError(f"too many ticks (limit {MOST_TICKS}); call several functions from one tick")
-        # Settle first, because callbacks on the way may add ticks.
+        # End the pending step first, because callbacks that are called on the way may add ticks.
         self._settle_now()
         run = self._prepared.run
         tick = np.zeros((1, ki.TICK_SIZE))
@@ -530,7 +532,7 @@ class Simulation:
         call: Callable[[Simulation], None] | None = None,
         stop: bool = False,
     ) -> None:
-        """Register an event: locate when a quantity crosses a level.
+        """Register an event that occurs when a quantity crosses a level.
 
         Parameters
         ----------
@@ -597,7 +599,7 @@ class Simulation:
         joint : str
             Joint with a motor.
         position : float
-            Position [rad or m]; for an open torque source its torque [N m].
+            Position [rad or m]; for an open-loop torque source, its torque [N m].
         rate : float, optional
             Rate [rad/s or m/s].
 
@@ -700,7 +702,7 @@ class Simulation:
         joint : str
             Joint with a motor.
         command : float
-            Voltage of a motor or servo [V], or torque of an open torque source [N m].
+            Voltage of a motor or servo [V], or torque of an open-loop torque source [N m].
 
         Raises
         ------
@@ -815,8 +817,8 @@ class Simulation:
         A moving joint is stopped by an impulse, Δv = −M⁻¹ e v_j / (eᵀ M⁻¹ e), with the unit vector e of the joint and M
         including rotors. Its kinetic energy, ½ v_j² / (eᵀ M⁻¹ e), counts as joint loss in the ledger. Contacts and
         couplings react with separate impulses: their energy counts as impact loss under the unilateral law and as joint
-        loss under the bilateral law. A contact that only braked joints would move along its normal is left out
-        meanwhile.
+        loss under the bilateral law. A contact that only braked joints would move along its normal is left out while
+        the brakes are closed.
 
         Examples
         --------
@@ -884,8 +886,8 @@ class Simulation:
         -----
         A tie that starts has no force at the present position of its bodies, unless the scenario sets its rest value.
         Added stiffness starts undeflected: x_0 moves so that the force stays the same, as in a gripper that hardens in
-        its present shape. Removed stiffness takes its share of the force with it. Both take energy from the spring,
-        which counts as lost in its damper; when a tie ends, all its energy does.
+        its present shape. Removing stiffness also removes its share of the force. Both changes take energy from the
+        spring, which counts as lost in its damper. When a tie ends, all of its energy counts as lost.
 
         Examples
         --------
@@ -907,7 +909,7 @@ class Simulation:
         before, c = unilateral.tie[k, [ku.TIE_STIFFNESS, ku.TIE_DAMPING]]
         after = values.get("stiffness", float(before))
         if min(values.values(), default=0.0) < 0.0 or not after + values.get("damping", float(c)) > 0.0:
-            raise ModelError(f"tie {name}: stiffness or damping must be positive, and neither negative")
+            raise ModelError(f"tie {name}: stiffness or damping must be positive, and neither may be negative")
         self._settle_now()
         prepared, tie = self._prepared, self.robot.ties[k]
         assert prepared.system.unilateral is not None
@@ -915,7 +917,7 @@ class Simulation:
         y, layout = prepared.run.y, prepared.run.layout
         q, stored = y[block(layout, "q")], float(row[ku.TIE_STORED])
         if table[ku.TIE_HOLDS] == 1 and after != before:
-            # A one-sided tie without contact has no force to keep.
+            # A one-sided tie that is not in contact has no force that must stay the same.
             if after > before and (stored > 0.0 or not tie.pushes):
                 x = deflection(prepared.model, prepared.system.unilateral, k, q)
                 row[ku.TIE_REST] += x * (1.0 - before / after)
@@ -927,7 +929,7 @@ class Simulation:
                 row[[ku.TIE_STORED, ku.TIE_GIVEN, ku.TIE_FORCE, ku.TIE_TURNED]] = 0.0
             row[ku.TIE_REST] = tie.rest
             if holds and math.isnan(tie.rest):
-                # Set here, because the geometry of the first step is that at its midpoint.
+                # Set the rest value here, because the first step would use the geometry at its midpoint.
                 rest_here(prepared.model, prepared.system.unilateral, k, q)
         lost = stored - row[ku.TIE_STORED]
         y[layout.elastic + kst.STORED] -= lost
@@ -975,7 +977,7 @@ class Simulation:
     ) -> None:
         """Apply a constant force and torque to a body from now on.
 
-        Replaces a wrench set earlier on the same body.
+        The wrench replaces any wrench that was set earlier on the same body.
 
         Parameters
         ----------
@@ -993,7 +995,7 @@ class Simulation:
         Raises
         ------
         ModelError
-            If `body` does not exist, or a value is not three finite numbers.
+            If `body` does not exist, or a vector does not have three finite components.
 
         Examples
         --------
@@ -1026,9 +1028,10 @@ class Simulation:
         Parameters
         ----------
         inputs : sequence of str, optional
-            ``command`` of motors, in addition to the controller's command [V; N m for an open torque source],
-            ``reference`` [rad or m], ``reference_rate``, ``force`` [N] and ``torque`` [N m] on bodies, in the axes of
-            the present wrench; a whole family or a member: ``"command.joint_3"``, ``"force.link_10.z"``.
+            ``command`` of motors, in addition to the controller's command [V; N m for an open-loop torque source],
+            ``reference`` [rad or m], ``reference_rate``, and ``force`` [N] and ``torque`` [N m] on bodies, in the axes
+            of the present wrench. Each entry is a whole family or a member of it, such as ``"command.joint_3"`` or
+            ``"force.link_10.z"``.
         outputs : sequence of str, optional
             ``q``, ``v``, ``current``, ``vdot``, ``voltage``, ``motor_torque``, ``hand_position``,
             ``contact_normal_force``, ``contact_force``, ``contact_gap``, or their members.
@@ -1047,9 +1050,9 @@ class Simulation:
         Notes
         -----
         x contains q, v and the currents of motors with a circuit. Contacts, stops and couplings keep their present
-        modes, and the controller is part of the system. A sampled controller counts as continuous: its period, and
-        delay, resolution and rates of encoders, are neglected. Commands set by the caller, and the references of an
-        operator or of a snake's controller, stay constant. The simulation is not changed. Derivatives are central
+        modes, and the controller is part of the system. A sampled controller is treated as continuous: its period and
+        the delay, resolution and rates of its encoders are neglected. Commands set by the caller, and the references of
+        an operator or of a snake's controller, stay constant. The simulation is not changed. Derivatives are central
         differences of sixth order.
 
         Examples
@@ -1083,7 +1086,7 @@ class Simulation:
         Raises
         ------
         ScenarioError
-            Within the tick of the scenario's operator, half of which would be lost.
+            If called within a tick of the scenario's operator, because half of that tick would be lost.
 
         Notes
         -----
@@ -1127,8 +1130,8 @@ class Simulation:
         Raises
         ------
         ScenarioError
-            If events or ticks were added since, the snapshot belongs to another simulation, or the call comes from a
-            callback.
+            If events or ticks were added after the snapshot, if the snapshot belongs to another simulation, or if the
+            call comes from a callback.
 
         Examples
         --------
@@ -1147,12 +1150,12 @@ class Simulation:
         own = self._arrays()
         sizes = ({k: a.shape for k, a in arrays.items() if k not in _BUFFERS} for arrays in (own, snapshot.arrays))
         if snapshot.owner is not self._token or next(sizes) != next(sizes):
-            raise ScenarioError("the snapshot belongs to another simulation, or ticks or events were added since")
+            raise ScenarioError("the snapshot belongs to another simulation, or ticks or events were added later")
         self._restore_arrays(snapshot)
         self._ended_by = None
 
     def _restore_arrays(self, snapshot: Snapshot) -> None:
-        """Restore all arrays and values from a snapshot that fits."""
+        """Restore all arrays and values from a matching snapshot."""
         self._swap(**{field: snapshot.arrays[name].copy() for name, field in (_BUFFERS | _TABLES).items()})
         for name, array in self._arrays().items():
             array[...] = snapshot.arrays[name]
@@ -1168,7 +1171,8 @@ class Simulation:
         Parameters
         ----------
         scenario : Scenario, optional
-            Scenario to name in the record if it was built during the run; default: the scenario of the simulation.
+            Scenario to store in the record, for a scenario built during the run; default: the scenario of the
+            simulation.
         pictured : bool, optional
             If False, omit the scene and the poses of bodies.
 
@@ -1194,8 +1198,8 @@ class Simulation:
         if self._window is None and self.finished:
             record = self._record_now(scenario, pictured, wall)
         else:
-            # Samples, tallies and events must refer to the same time, which may lie in the pending step: end the step
-            # here, start the next one, and undo this afterwards.
+            # Samples, statistics and events must refer to the same time, which may lie in the pending step. Therefore
+            # end the step here, start the next one, and undo this afterwards.
             before = self._saved()
             try:
                 if self._window is not None:
@@ -1223,19 +1227,19 @@ class Simulation:
             self._refill()
             run = self._prepared.run
         row, now = int(run.count[ki.SAMPLE]), float(run.clock[ki.TIME])
-        # Time stepping has already recorded it.
+        # Time stepping has already recorded this sample.
         late = run.stepping is None and abs(run.sample_time[row] - now) <= TICK_SLACK * max(1.0, abs(now))
         if late:
-            # A step that ends before a sample by rounding leaves it to the next step. At a start, the sample at this
-            # time is written again, whatever its content.
+            # If a step ends before a sample only because of rounding, it leaves the sample to the next step. At a
+            # start, the sample at this time is written again, whatever the buffer contains.
             run.count[ki.SAMPLE], run.count[ki.STARTED], run.sample[row] = row + 1, 0, np.nan
         self._kernel(self._prepared.system, self._prepared.workspace, run, 0)
         if late and np.isnan(run.sample[row]).any():
-            # No start is possible from here.
+            # The integration cannot start from this state, so no sample was written.
             run.count[ki.SAMPLE] = row
 
     def _keep_window(self, until: float) -> None:
-        """Save the state at the end of the samples, before the pending step passes it on the way to a time."""
+        """Save the state at the end of the samples before the pending step passes that time on the way to ``until``."""
         run, end = self._prepared.run, self._samples_end
         passes = run.count[ki.PENDING] == 1 and run.clock[ki.TIME] + run.clock[ki.STEP] > end
         if self._window is not None or not (passes and until > end):
@@ -1250,14 +1254,12 @@ class Simulation:
         self._window = window
 
     def _hold_time(self, until: float) -> float:
-        """Return the time beyond which a step on the way to another time must wait: end of the buffer or of the samples
-        [s].
-        """
+        """Return the time [s] that a step must not pass yet: the end of the buffer or the end of the samples."""
         last, end = float(self._prepared.run.sample_time[-1]), self._samples_end
         return min(last, end) if self._window is None and until > end else last
 
     def _record_now(self, scenario: Scenario | None, pictured: bool, wall: float) -> Record:
-        """Return the record of the present arrays of a run that took ``wall`` [s]."""
+        """Create a record from the present arrays of the run, which has taken ``wall`` [s]."""
         run = self._prepared.run
         times, states, outputs = self._trace.rows(run)
         y = run.y
@@ -1305,14 +1307,15 @@ class Simulation:
                 values = values[circuits]
             if values.shape != run.y[part].shape:
                 raise ModelError(
-                    f"the state has {len(values)} values of {name}, {model.robot.name} has {part.stop - part.start}"
+                    f"the state has {len(values)} values of {name}, but {model.robot.name} has {part.stop - part.start}"
                 )
             run.y[part] = values
         q = run.y[block(run.layout, "q")]
         check_couplings(model.robot, q)
         beyond = START_TOLERANCE
         if run.method == ki.TIME_STEPPING:
-            # Landed points are below their surface, and joints beyond their stop, by up to a step at their speed.
+            # Points that have landed may be below their surface, and joints beyond their stop, by up to one step at
+            # their speed.
             beyond = max(beyond, float(run.clock[ki.STEP]) * FASTEST_LANDING)
         if self._prepared.system.unilateral is not None:
             joint_stops(model.robot, q, beyond)
@@ -1324,7 +1327,7 @@ class Simulation:
         """Continue ties from the point they have slid to; at_start: coordinates of the scenario's start, (nq,)."""
         model, ties = self._prepared.model, self._prepared.model.robot.ties
         if rests is not None and np.shape(rests) != (len(ties),):
-            raise ModelError(f"the state has {np.size(rests)} values of tie_rest, {model.robot.name} has {len(ties)}")
+            raise ModelError(f"the state has {np.size(rests)} values of tie_rest; {model.robot.name} has {len(ties)}")
         set_rests(model, unilateral, at_start, rests)
         slid = [tie.name for tie in ties if may_have_slid(tie)]
         if rests is None and slid:
@@ -1335,7 +1338,7 @@ class Simulation:
             log.warning("%s: %s", self._scenario.title, self._warnings[-1])
 
     def _reach(self, asked: float) -> None:
-        """Integrate until the step that would pass a time is pending, or ends there."""
+        """Integrate until a step ends at a time, or until the step that would pass this time is pending."""
         until = asked = min(asked, self._end)
         while not self.finished and self._time < until:
             self._keep_window(until)
@@ -1353,7 +1356,7 @@ class Simulation:
             if run.count[ki.STARTED] == 1 and run.clock[ki.TIME] >= until:
                 break
         while not self.finished and self._prepared.run.clock[ki.TIME] >= self._end:
-            # A tick at the end came before the end itself.
+            # A tick at the end time was handled first; run the end itself now.
             self._piece(self._end)
         self._time = until if not self.finished else float(self._prepared.run.clock[ki.TIME])
 
@@ -1392,10 +1395,10 @@ class Simulation:
         return raised
 
     def _collect_due(self, raised: BaseException | None) -> None:
-        """Empty the log of the kernels, and collect the callbacks due at the present end of the run.
+        """Empty the log of the kernels, and collect the callbacks due at the time that the run has reached.
 
-        All are collected before the first call, so that a snapshot in a callback has all events and due callbacks of
-        this time.
+        All callbacks are collected before the first is called, so that a snapshot taken in a callback contains all
+        events and due callbacks of this time.
         """
         run = self._prepared.run
         for time, e in take_log(run):
@@ -1435,8 +1438,8 @@ class Simulation:
     def _settle_now(self, *, calling: bool = True) -> None:
         """End a step at the present time if it lies within one.
 
-        ``calling`` is True to call callbacks at events that only the shorter steps detect, at their times; with False
-        the caller undoes this.
+        If ``calling`` is True, callbacks of events that only the shorter steps detect are called at the times of these
+        events. If it is False, the caller undoes this step.
         """
         run, now = self._prepared.run, self._time
         if run.count[ki.PENDING] == 0 or self.finished:
@@ -1445,7 +1448,7 @@ class Simulation:
         step = run.clock[ki.STEP] = max(run.clock[ki.PROPOSED], run.clock[ki.STEP])
         if now > run.clock[ki.TIME]:
             self._integrate_to(now, calling)
-            # An abandoned piece leaves copies.
+            # After an abandoned piece of compiled code, the run consists of copies.
             run = self._prepared.run
             if self.finished:
                 self._time = float(run.clock[ki.TIME])
@@ -1463,9 +1466,9 @@ class Simulation:
                 self._refill(run.clock[ki.TIME] + run.clock[ki.STEP])
                 run = self._prepared.run
             run.clock[ki.HOLD], run.clock[ki.END] = self._hold_time(until), until
-            # The end here is only part of an operation: pending signals keep waiting.
+            # This end is only part of an operation, so pending signals must wait.
             raised = self._run_piece(lambda: None)
-            # Callbacks and their snapshots must not see this end.
+            # Callbacks and their snapshots must not see this temporary end.
             run = self._prepared.run
             run.clock[ki.END] = self._end
             reached = bool(run.count[ki.STATUS] == ki.FINISHED)
@@ -1486,7 +1489,7 @@ class Simulation:
 
     def _freeze(self) -> None:
         """Keep moving references at their final values."""
-        # Settle first: a snapshot in a callback on the way must not be frozen.
+        # End the pending step first, so that a snapshot taken in a callback on the way is not frozen.
         self._settle_now()
         self._frozen = True
         for joint, a in self._motors.items():
@@ -1565,7 +1568,7 @@ def check(scenario: Scenario, started: Callable[[Start], None]) -> Start:
     control, model = prepared.control, prepared.model
     start = replace(start, scene=drawn_scene(scenario, model.robot, prepared.contacts))
     if prepared.balance is not None:
-        # Pressing compliant contacts moves joints.
+        # Pressing compliant contacts in moves joints.
         points, gaps = _touching(model, prepared.contacts)
         hand = model.point_position(*model.robot.hand, model.robot.initial)
         said = [*start.warnings, *prepared.balance.warnings]
@@ -1592,12 +1595,12 @@ def commanded_by_python(scenario: Scenario) -> bool:
 def _begin(scenario: Scenario, prepared: Prepared) -> None:
     """Choose contact modes and find forces at t = 0, as a run does before its first step.
 
-    Skipped if Python code sets the first commands.
+    Nothing is done if Python code sets the first commands.
 
     Raises
     ------
     SimulationStopped
-        If forces do not exist or cannot last.
+        If no consistent forces exist, or if they break down immediately.
     """
     if not prepared.contacts or commanded_by_python(scenario):
         return
@@ -1663,7 +1666,7 @@ def _below(scenario: Scenario, robot: Robot) -> list[str]:
 
 
 def _margins(scenario: Scenario, model: Model, contacts: Sequence[Contact]) -> tuple[float | None, float | None]:
-    """Return the tip margin of a mobile base at rest, alone and with its braces; None if undefined."""
+    """Return the tip margins of a mobile base at rest, without and with its braces; None if undefined."""
     robot, q = model.robot, model.robot.initial
     if robot.base is None:
         return None, None

@@ -1,7 +1,6 @@
-"""Task-space control of a snake run, kinematic or dynamic: wheel lifting, mode changes, commands, states, recorded
-rows.
+"""Task-space control of a snake: wheel lifting, mode changes, commands, states, recorded rows.
 
-The control law: :mod:`dynsim.snake.controller`.
+It serves kinematic and dynamic snakes. The control law is in :mod:`dynsim.snake.controller`.
 """
 
 from __future__ import annotations
@@ -78,7 +77,7 @@ class WheelLifter(Stateful):
         self._up, self._down = np.where(grounded == 0, -np.inf, np.inf), np.full(pairs, np.inf)
         servos = {motor.joint: motor for motor in robot.motors}
         chosen = [servo for joint in robot.lifting_joints if isinstance(servo := servos[joint], Servo)]
-        # Torque per angle of the position loop [N m/rad].
+        # Stiffness of the position loop, torque per angle [N m/rad].
         self._stiffness = np.array([servo.k_p * servo.torque_constant / servo.resistance for servo in chosen])
 
     def change(self, time: float, grounded: Array) -> None:
@@ -110,7 +109,7 @@ class WheelLifter(Stateful):
 
 
 def angles_of_heights(robot: SnakeTree, height: Array, yaw: Array, stiffness: Array) -> Array:
-    """Return the pitch angles that bring pairs to heights (pairs,) [m], including the sag of the servos.
+    """Return the pitch angles that move wheel pairs to heights (pairs,) [m], including the sag of the servos.
 
     ``stiffness`` has shape (pairs − 1,) [N m/rad].
     """
@@ -119,7 +118,8 @@ def angles_of_heights(robot: SnakeTree, height: Array, yaw: Array, stiffness: Ar
     hinge = np.asarray(robot.base_part.fold(yaw[None], height[None]).hinge[0])
     if not robot.sag_compensation:
         return hinge
-    # Moments of the pairs higher than s, averaged over s from zero to the clearance, so that they change continuously.
+    # The moments include all pairs higher than s and are averaged over s from zero to the clearance, so that they
+    # change continuously.
     share, below = height / (1e-3 * robot.lifts.clearance_mm), 0.0
     for level in np.unique(share[share > 0.0]).tolist():
         hinge = hinge + (level - below) * lifted_moments(robot, share >= level) / stiffness
@@ -135,15 +135,15 @@ def command_angles(robot: SnakeTree, phi: Array, added: Array) -> dict[str, floa
     return angles
 
 
-# End time [s] of a phase, and its servo references: position and rate by joint.
+# End time [s] of a phase, and its servo references: position and rate of each joint.
 Phase = tuple[float, Mapping[str, tuple[float, float]]]
-# Returns the final coordinates of a scenario started at given coordinates, with servo phases:
+# Function that runs a scenario from given coordinates through servo phases and returns the final coordinates, see
 # dynsim.engine.prepare.follow_lines.
 Follow = Callable[[Scenario, Array, Sequence[Phase]], Array]
 
 
 def snake_start(scenario: Scenario, robot: SnakeTree, follow: Follow) -> tuple[SnakeTree, JointControl]:
-    """Return the robot at the start of a run, and its initial servo references until a controller changes them.
+    """Return the robot at the start of a run, and its servo references until a controller changes them.
 
     ``follow`` simulates the raising of the head.
 
@@ -260,11 +260,11 @@ class Refusal(NamedTuple):
 
 @dataclass
 class ModeSwitcher(Stateful):
-    """Fixing and switching states: follows requests, and picks a mode at every switching time t_k = t_0 + k dT.
+    """State machine for modes: follows requests, or picks a mode at every switching time t_k = t_0 + k dT.
 
     Every mode change is tested by simulating the mode for one period with the present command. The robot tips if the
-    support margin is not above ``least_margin`` at any time; such a mode is refused and the present mode stays. Only if
-    the present mode tips as well, the mode with the largest support margin is used; the fixing mode is also a
+    support margin is not above ``least_margin`` at any time; such a mode is refused and the present mode stays. If the
+    robot tips in the present mode as well, the mode with the largest support margin is used; the fixing mode is also a
     candidate.
 
     Attributes
@@ -275,7 +275,7 @@ class ModeSwitcher(Stateful):
     modes : ModeTable
         Table of the modes; ``fixing_row``, ``order`` and ``row`` are rows of it.
     period_ticks : int
-        dT in control periods.
+        Switching period dT, in control periods.
     predict : callable
         predict(row) -> (cost after dT, smallest support margin until then [m]).
     row : int
@@ -283,7 +283,7 @@ class ModeSwitcher(Stateful):
     switches : int
         Number of mode changes.
     refusals : list of Refusal
-        Modes that would tip, in the order of their tests.
+        Modes in which the robot would tip, in the order of their tests.
     """
 
     SAVED = ("row", "switching", "next_switch", "switches", "refusals", "_place")
@@ -355,7 +355,7 @@ class ModeSwitcher(Stateful):
         return self._least_tipping(tick, tipping)
 
     def _least_tipping(self, tick: int, tipping: dict[int, float]) -> int:
-        """Return the present mode if it is stable, otherwise the candidate with the largest margin; all candidates tip.
+        """Return the present mode if it is stable, otherwise the mode with the largest margin; all candidates tip.
 
         The fixing mode is also a candidate: it need not be in the order.
         """
@@ -370,7 +370,7 @@ class ModeSwitcher(Stateful):
         self.refusals += [Refusal(tick, row, margin, row == taken) for row, margin in tipping.items()]
 
 
-# Reasons why the target waited, in the order of the counters of dynsim.snake.ticks.SnakeState. The last is for the wait
+# Reasons why the target waited, in the order of the counters of dynsim.snake.ticks.SnakeState. The last reason applies
 # after an obstacle, until switching has brought the joints below switching.release_fraction of their limits.
 OBSTACLES = ("joint limit", "rate limit", "singular posture", "attitude at beta = 90 deg", "release of the joints")
 
@@ -382,9 +382,9 @@ class SnakeControl:
     Attributes
     ----------
     ticks : int
-        Control periods of the whole run.
+        Number of control periods of the whole run.
     stride : int
-        Control periods between recorded samples.
+        Number of control periods between recorded samples.
     block : CommandBlock
         Commands from tick ``block_start`` on.
     gripper : (ticks,) ndarray of int
@@ -394,7 +394,7 @@ class SnakeControl:
     recovering : bool
         True while modes are switched until the base joints are released.
     switch_due : bool
-        True if this switching starts at the next tick.
+        True if switching starts at the next tick.
     """
 
     description: SnakeDescription
@@ -463,10 +463,10 @@ class SnakeControl:
         return w, state.base.copy(), state.phi.copy()
 
     def read_commands(self, waiting: bool) -> None:
-        """Read commands from the source: a block from the present tick on.
+        """Read a block of commands from the source, starting at the present tick.
 
         Velocities of the previous block that had to wait and were not executed are dropped: a script is a single block
-        and loses none, a joystick sends its current command again.
+        and loses none, and a joystick sends its current command again.
 
         Raises
         ------
@@ -537,7 +537,7 @@ class SnakeControl:
         if now == self.block_start + len(self.block.request):
             self.read_commands(waiting=self.blocked or self.recovering)
         request = int(self.block.request[now - self.block_start])
-        # Only at the end of switching periods, so that every recovery has at least one.
+        # A recovery ends only at the end of a switching period, so that it contains at least one.
         if self.recovering and now >= (switcher.next_event() or 0):
             # Until every base joint is well within its limit again ([T] IV.C.5: until the robot becomes operable).
             base = slice(self.model.head_joints, None)
@@ -565,14 +565,14 @@ class SnakeControl:
     def diverged(self) -> SimulationStopped:
         """Return the exception for a state that is no longer finite."""
         return SimulationStopped(
-            f"the state is no longer finite at t = {self.time:g} s: singular posture, or gain too high "
+            f"the state is no longer finite at t = {self.time:g} s: the posture is singular, or the gain is too high "
             "for the control period",
             time=self.time,
             state=self.postures(),
         )
 
     def _predict(self, row: int) -> tuple[float, float]:
-        """Return the cost after one switching period in a mode at constant command, and the smallest support margin."""
+        """Return the cost after one switching period in a mode, at constant command, and the least support margin."""
         ticks, law, real = self.controller.prediction_ticks, self.controller.law, self.controller.schedule
         schedule = self.controller.prediction
         waits = (real.null_start_tick - self.tick) * real.period  # time until the null-space motion starts [s]

@@ -1,4 +1,4 @@
-"""Task-space control of the dynamic snake: at every tick, references for the servos of joints and wheels.
+"""Task-space control of the dynamic snake: it sets references for the servos of joints and wheels at every tick.
 
 Order within a tick t_k: sensors, controller, modes and lifts, references. Joint servos follow the integrated command,
 q_d(t) = φ + u (t − t_k), with commanded angles φ and rates u, independent of the actual joint angles ([T] IV.C); wheel
@@ -41,7 +41,8 @@ from dynsim.snake.ticks import FEEDFORWARD, GIVEN, MEASURED, SnakeTrace, command
 _ROOT_COORDINATES = 7
 # Interval of the overload checks, and duration of an overload after which the run ends [s].
 OVERLOAD_LOOK, OVERLOAD_TIME = 0.1, 0.5
-# The head is far below its target by more than this [m]; the robot has overturned at this tilt [rad] (assumed).
+# Distance below the target beyond which the head counts as far too low [m], and tilt beyond which the robot counts as
+# overturned [rad] (both assumed).
 SAG, OVERTURNED = 0.05, 0.8
 
 
@@ -55,9 +56,9 @@ class SnakePilot(Stateful, SnakeControl):
     controller : TaskSpaceController
         Controller.
     ticks : int
-        Control periods of the run.
+        Number of control periods of the run.
     stride : int
-        Control periods between recorded samples.
+        Number of control periods between recorded samples.
     source : CommandSource, optional
         Source of the commands instead of the controller's script.
     sensors : Sensors, optional
@@ -198,7 +199,7 @@ class SnakePilot(Stateful, SnakeControl):
             estimate[:] = sensor.value(self._seen.time)
 
     def _sensors(self, config: Sensors) -> list[SampledSensor]:
-        """Return the sensors of the controller, empty under feedforward."""
+        """Return the sensors of the controller; feedforward uses none."""
 
         def sensor(read: Callable[[State], Array], of: Any, noise: Array, resolution: Array) -> SampledSensor:
             period = self.period if of is None or of.rate_hz is None else 1.0 / of.rate_hz
@@ -230,8 +231,9 @@ class SnakePilot(Stateful, SnakeControl):
         self._added = self._added + self.period * self._added_rate
 
     def _lift(self, time: float) -> None:
-        """Update the rates at which lifting moves the pitch joints: every tick while heights change, otherwise less
-        often.
+        """Update the rates at which lifting moves the pitch joints.
+
+        They are updated at every tick while heights change, otherwise less often.
         """
         now = self.tick  # number of the tick that has just been commanded
         if now < self._next_look:
@@ -271,7 +273,7 @@ class SnakePilot(Stateful, SnakeControl):
             sensor.restore(part)
 
     def add_to(self, record: Record) -> None:
-        """Add signals and summary of the control, and of joints and wheels by their snake names."""
+        """Add signals and summary of the control, and the signals of joints and wheels under their snake names."""
         rows, q, v = len(record), record["q"], record["v"]
         if rows == 0:
             return
@@ -289,7 +291,7 @@ class SnakePilot(Stateful, SnakeControl):
             commanded[-1], trace.w_hat[-1] = self.state.phi, self.state.w_hat
         if between:
             # Joints have followed linear references since the last tick, and the target has already moved to the next
-            # one.
+            # tick.
             now = self.tick * self.period
             commanded[-1] += (end - now) * self.ws.work.u[: commanded.shape[1]]
             if end < now:
@@ -315,7 +317,7 @@ class SnakePilot(Stateful, SnakeControl):
         add("rho_dot", rates, "rad/s", labels=d.wheel_names, description="rates of the active wheels")
         text = "joint angles commanded to the servos, without lifting"
         add("phi_command", commanded, "rad", labels=names, description=text)
-        text = "rates held from this time on, as commanded"
+        text = "commanded rates, held from this time on"
         add("phi_dot_command", trace.u[:, :columns], "rad/s", labels=names, description=f"joint {text}")
         add("rho_dot_command", trace.u[:, columns:], "rad/s", labels=d.wheel_names, description=f"wheel {text}")
         add_task(record, self, trace, w, np.array(points))
@@ -334,7 +336,7 @@ def _places(robot: SnakeTree, joints: tuple[str, ...]) -> Array:
 def base_pose(q: Array) -> Array:
     """Return x, y [m] of wheel pair 1 and yaw [rad] of the base part at coordinates (…, nq) of the tree, (…, 3)."""
     w, x, y, z = (q[..., k] for k in range(3, _ROOT_COORDINATES))
-    # Yaw of the axle, e_y of the root: it stays level even if the body behind it is tilted.
+    # Use the yaw of the axle, e_y of the root, because the axle stays level even if the body behind it is tilted.
     yaw = np.arctan2(-2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z))
     return np.stack([q[..., 0], q[..., 1], yaw], axis=-1)
 

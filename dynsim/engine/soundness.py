@@ -5,9 +5,9 @@ deviations δq, v and currents i, with constant commands u:
 
     M v̇ = K_m i − D v,    L di/dt = u − R i − K_m v,    u = −k_p δq̂ − k_d v̂ at each tick
 
-in the motions that couplings and active contacts allow. Over a period it is integrated exactly. Positions q̂ and rates
+for the motions that couplings and active contacts allow. It is integrated exactly over a period. Positions q̂ and rates
 v̂ are the true values at the tick, or encoder measurements with their delay. Gravity and velocity products are
-neglected: a posture that falls slowly is not an unstable loop.
+neglected, so a robot that slowly falls out of a posture does not count as an unstable loop.
 """
 
 from __future__ import annotations
@@ -32,18 +32,19 @@ from dynsim.scenario.schema import Encoders
 if TYPE_CHECKING:
     from dynsim.engine.prepare import Prepared
 
-# Maximum number of joints for which the loop is examined: its matrices have three rows for each.
+# Maximum number of joints for which the loop is examined: its matrices have three rows for each joint.
 LARGE = 100
 # Maximum number of rows of a loop with delayed encoder samples: the same as for LARGE joints.
 LATE = 3 * LARGE
-# Minimum growth of deviations that counts [1/s], and per period: free motions have a double eigenvalue 1 with rounding
-# errors of 1e-8.
+# Deviations count as growing above this rate [1/s] and above this growth per period. Free motions have a double
+# eigenvalue 1 with rounding errors of 1e-8.
 GROWTH, ROUNDING = 1.0, 1e-6
 # Periods of encoders and of the controller must be multiples of each other to this relative accuracy.
 WHOLE = 1e-9
 # Number of shorter periods tried for a message, each half of the previous one.
 HALVINGS = 8
-# Minimum logarithmic growth of deviations until a stop for which instability is the reported reason: a factor of 20.
+# Instability is reported as the reason for a stop if the logarithm of the growth of deviations reaches this value, a
+# factor of 20.
 GROWN = 3.0
 # Number of postures of a record in which a sampled loop is examined.
 POSTURES = 10
@@ -53,7 +54,7 @@ NEAR_POSTURE = 0.02
 
 @dataclass(frozen=True)
 class Growth:
-    """Growth of deviations of a sampled loop.
+    """Growth of deviations in a sampled control loop.
 
     Attributes
     ----------
@@ -76,14 +77,15 @@ class Growth:
 
     @property
     def unstable(self) -> bool:
-        """True if deviations grow beyond rounding errors."""
+        """True if deviations grow faster than rounding errors explain."""
         return self.radius > 1.0 + ROUNDING and self.rate > GROWTH
 
 
 @dataclass(frozen=True)
 class HeldLoop:
-    """Linear open loop dx/dt = A x + B u with states x = (δq, v, i) and commands u; δq and v are coordinates of free
-    motions.
+    """Linear open loop dx/dt = A x + B u with states x = (δq, v, i) and commands u.
+
+    δq and v are the coordinates of the motions that constraints leave free.
 
     Attributes
     ----------
@@ -94,7 +96,7 @@ class HeldLoop:
     position, rate : (na, s) ndarray
         Positions and rates of the motors' joints as functions of the state.
     gain : (na, 2) ndarray
-        k_p and k_d of the held commands; 0 for commands that do not depend on the state.
+        k_p and k_d of the sampled commands; 0 for commands that do not depend on the state.
     """
 
     A: Array
@@ -170,9 +172,9 @@ def _growth(step: Array, commands: Array, period: float) -> Growth:
 def held_loop(model: Model, drives: ka.DriveArrays, q: Array, rows: Array) -> HeldLoop:
     """Return the loop at coordinates q (nq,), whose rates v satisfy ``rows`` v = 0, (r, n).
 
-    Smoothed gear friction has its slope at rest.
+    Smoothed gear friction is represented by its slope at rest.
     """
-    from scipy.linalg import null_space  # as in HeldLoop
+    from scipy.linalg import null_space  # for the same reason as in HeldLoop._over
 
     free = null_space(rows) if len(rows) else np.eye(model.n)
     torque_q, torque_v, torque_i, rate_q, rate_v, rate_i = drive_slopes(model, drives)
@@ -206,8 +208,9 @@ def held_loop(model: Model, drives: ka.DriveArrays, q: Array, rows: Array) -> He
 
 
 def held_rows(model: Model, contacts: Sequence[Contact], real: bool, q: Array) -> Array:
-    """Return the rows of couplings and active contacts at q: all under the bilateral law, otherwise closed ones, at
-    rest.
+    """Return the rows of couplings and active contacts at q and at rest.
+
+    Under the bilateral law all contacts are active, otherwise only the closed ones.
     """
     rows = [model.coupling_rows]
     for contact in contacts:
@@ -236,7 +239,7 @@ def loop_growth(scenario: Scenario, prepared: Prepared, q: Array, period: float)
 def unstable_loop(scenario: Scenario, prepared: Prepared, q: Array | None = None) -> tuple[str, Growth] | None:
     """Return a warning about a sampled loop that is unstable at coordinates q (default: the start), and its growth.
 
-    Returns None for a stable loop, without a sampled controller, and for more than :data:`LARGE` joints.
+    Returns None if the loop is stable, if there is no sampled controller, or for more than :data:`LARGE` joints.
     """
     period = prepared.control.sample_time
     if period is None:
@@ -266,7 +269,8 @@ def unstable_loop(scenario: Scenario, prepared: Prepared, q: Array | None = None
 def unstable_later(scenario: Scenario, prepared: Prepared, record: Record) -> str:
     """Return the warning about a loop that is unstable in later postures long enough for deviations to grow by e³.
 
-    Postures of the record are examined at equal intervals. Empty if none is unstable, or only briefly.
+    Postures of the record are examined at equal intervals. The result is empty if the loop is never unstable, or only
+    briefly.
     """
     period, time = prepared.control.sample_time, record.time
     if period is None or len(record) < 2:
@@ -288,9 +292,9 @@ def unstable_later(scenario: Scenario, prepared: Prepared, record: Record) -> st
 
 
 def unstable_stop(scenario: Scenario, prepared: Prepared, q: Array, v: Array, elapsed: float) -> str:
-    """Return the warning about a loop whose growth is the reason of a stop after ``elapsed`` [s], or an empty string.
+    """Return the warning about a loop whose growth explains a stop after ``elapsed`` [s], or an empty string.
 
-    Deviations had time to grow by e³, and the kinetic energy is larger than at the start or not finite.
+    This requires that deviations had time to grow by e³, and that the kinetic energy is positive or not finite.
     """
     for at in (None, q):
         verdict = unstable_loop(scenario, prepared, at)
@@ -301,5 +305,5 @@ def unstable_stop(scenario: Scenario, prepared: Prepared, q: Array, v: Array, el
         if prepared.model.kinetic_energy(q, v) > 0.0:
             # Contacts may just have stopped the motion, so its energy is not conclusive.
             growth = verdict[1].rate * elapsed / math.log(10.0)
-            return f"{verdict[0]}; until then they could grow by a factor of 1e{growth:.0f}"
+            return f"{verdict[0]}; until then, deviations could grow by a factor of 1e{growth:.0f}"
     return ""

@@ -79,12 +79,12 @@ class State:
     current : (circuits,) ndarray
         Currents of the motors that have a circuit [A].
     tie_rest : (ties,) ndarray or None
-        Rest values x_0 of the ties [m or rad], which change when ties slide beyond a bound; None: as at the start of
-        the scenario.
+        Rest values x_0 of the ties [m or rad], which change when ties slide beyond a bound; None: the values at the
+        start of the scenario.
 
     Notes
     -----
-    Symbols as in docs/notation.md.
+    docs/notation.md explains the symbols.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Running of compiled code with signals and time limits, and the messages and last state of runs that stopped."""
+"""Execution of compiled code with signals and time limits; messages and last states of runs that stopped early."""
 
 from __future__ import annotations
 
@@ -41,7 +41,8 @@ log = logging.getLogger(__name__)
 LOOK_S, PATIENCE_S = 0.1, 0.5
 # Processor time without progress of the simulated time after which a run is stopped [s]; see LEAST_PROGRESS.
 STALLED_S = 50.0
-# Maximum number of time-stepping steps in the caller's thread: contacts may close within them.
+# Maximum number of time-stepping steps in the caller's thread; it is limited because contacts may close during these
+# steps.
 MOST_SHORT = 50
 # Time of one contact-solver iteration divided by the cube of the number of rows [s].
 ROUND = 2e-9
@@ -55,11 +56,11 @@ def run_in_thread(
     Parameters
     ----------
     work : callable
-        Work that releases the interpreter lock.
+        Function to run; it must release the interpreter lock.
     ask : callable
-        Requests the work to end soon.
+        Asks the work to end soon.
     look : callable
-        Called every LOOK_S; its exceptions, like those of signals, request the work to end.
+        Called every LOOK_S seconds; an exception from it or from a signal asks the work to end.
 
     Returns
     -------
@@ -93,7 +94,7 @@ def run_in_thread(
             ask()
             ended = done.wait(PATIENCE_S)
     finally:
-        # Needed also after a second signal.
+        # This is also necessary after a second signal.
         if not ended:
             interruption.leave()
     if ended and failure:
@@ -102,7 +103,7 @@ def run_in_thread(
 
 
 class OutOfTime(Exception):
-    """The watch ended a run; ``status`` is its new status."""
+    """Raised when the watch ends a run; ``status`` is the new status of the run."""
 
     def __init__(self, status: int) -> None:
         super().__init__(status)
@@ -172,13 +173,13 @@ def load(prepared: Prepared) -> None:
 
 
 def _short_steps(prepared: Prepared) -> int:
-    """Return the number of steps certain to end before the first check would be due.
+    """Return a number of steps that are certain to end before the first check is due.
 
-    They run in the caller's thread, because handing a short run to another thread costs some hundredths of its time.
-    Under the unilateral law the number is zero, as one step may take a minute. The exception is time stepping, whose
-    contact problems are given up after a fixed number of iterations: its steps must not exceed PATIENCE_S, with the
-    rows of the last step. This number of iterations is hardly ever needed, and a thread for each controller tick would
-    double the time of a snake.
+    They run in the caller's thread, because handing a short run to another thread costs a few percent of its time.
+    Under the unilateral law the number is zero, as one step may take a minute. The exception is time stepping, which
+    abandons a contact problem after a fixed number of iterations. Its steps, each with as many rows as the last step,
+    must not take longer than PATIENCE_S in total. This number of iterations is hardly ever reached, and a thread for
+    each controller tick would double the time of a snake.
     """
     if prepared.system.unilateral is not None:
         rows = max(int(prepared.workspace.counts[ka.ROWS]), 1)
@@ -186,7 +187,7 @@ def _short_steps(prepared: Prepared) -> int:
         return few if prepared.run.stepping is not None else 0
     n, p = len(prepared.workspace.joints), prepared.workspace.small.shape[1]
     seconds = right_hand_side(n, p, dense=prepared.system.dense is not None)
-    # A RADAU5 step, including a Jacobian and its factors.
+    # Time of a step; for RADAU5 including a Jacobian and its factorization.
     step = (2 * n + 60) * seconds + 3e-9 * n**3 if prepared.run.newton is not None else 6.0 * seconds
     return int(LOOK_S / step)
 
@@ -203,7 +204,7 @@ def advance(
     prepared : Prepared
         Prepared run.
     watch : WallWatch
-        Watch of the run.
+        Watch on the wall-clock time of the run.
     look : callable
         Called regularly; may raise.
     kernel : callable
@@ -230,7 +231,7 @@ def advance(
     due = few == 0
     if not due:
         kernel(prepared.system, prepared.workspace, run, few)
-        # Not if the caller has to act first. (A pending step at the start is to be accepted.)
+        # Do not continue if the caller has to act first. (A step that is pending at the start is accepted.)
         count = run.count
         due = count[ki.STATUS] == ki.RUNNING and count[ki.PENDING] == count[ki.TICKED] == count[ki.LOGGED] == 0
     if due:
@@ -254,7 +255,7 @@ def advance(
 
 
 def copied(value: Any) -> Any:
-    """Return separate copies of tables and arrays, which nothing modifies any more."""
+    """Return separate copies of tables and arrays that nothing else modifies."""
     if isinstance(value, Prepared):
         return replace(value, run=copied(value.run), workspace=copied(value.workspace), system=copied(value.system))
     if isinstance(value, np.ndarray):
@@ -265,13 +266,13 @@ def copied(value: Any) -> Any:
     return value
 
 
-# Friction that changes fast with slip, the reason for short explicit steps.
+# Friction that changes fast with slip, which forces explicit methods to take short steps.
 
 
 Array = NDArray[np.float64]
 
-# Steps of an explicit method at the stability limit, in time constants: 3.3 for DOPRI5 [Hairer and Wanner], shorter
-# after a rejected step, longer before one.
+# Range of explicit steps at the stability limit, in time constants. The limit is 3.3 for DOPRI5 [Hairer and Wanner];
+# steps are shorter after a rejected step and longer before one.
 LEAST, MOST = 1.0, 5.0
 
 
@@ -343,7 +344,8 @@ def _slip(prepared: Prepared, k: int) -> Array:
 def _friction(prepared: Prepared, k: int, normal: Array) -> tuple[Array, Array, Array]:
     """Return the friction of sliding contact k.
 
-    Minus its force per normal force, (3,); the rows of E on the surface; and D.
+    The result is the negative friction force per unit of normal force, (3,), the tangential directions whose rows form
+    E, and D.
     """
     ws, unilateral, contact = prepared.workspace, prepared.system.unilateral, prepared.contacts[k]
     slip = _slip(prepared, k)
@@ -384,7 +386,7 @@ def stopped(scenario: Scenario, prepared: Prepared) -> SimulationStopped:
     """Return the exception for a run whose STATUS shows that it stopped before its end."""
     run, unstable = prepared.run, ""
     status, time, y = int(run.count[ki.STATUS]), float(run.clock[ki.TIME]), run.y
-    if status != ki.STOPPED:  # a base may tip over for any reason
+    if status != ki.STOPPED:  # the reason why a base tips over is not examined
         q, v = (y[block(run.layout, name)] for name in ("q", "v"))
         elapsed = float((run.tick_table[:, ki.TICK_COUNT] * run.tick[:, ki.TICK_PERIOD]).max(initial=0.0))
         unstable = unstable_stop(scenario, prepared, q, v, elapsed)
@@ -428,8 +430,9 @@ def _modes_text(prepared: Prepared) -> str:
 
 
 def _can_step_over(prepared: Prepared) -> bool:
-    """Return whether time stepping supports this system: unilateral contacts and no mobile base
-    (dynsim.engine.prepare).
+    """Return whether time stepping could continue this run.
+
+    Time stepping supports unilateral contacts without a mobile base (dynsim.engine.prepare).
     """
     events = prepared.system.unilateral is not None and prepared.run.stepping is None
     return events and bool(prepared.contacts) and prepared.model.robot.base is None
@@ -465,12 +468,12 @@ def _reason(scenario: Scenario, prepared: Prepared) -> str:
     if status == ki.NO_CONTACT_FORCES:
         names = _listed(prepared, prepared.workspace.active[:, ka.MODE] != ka.OPEN)
         return (
-            f"{where}: no forces{names} are consistent with Coulomb's law (Painlevé's paradox, or contradicting "
+            f"{where}: no forces{names} are consistent with Coulomb's law (Painlevé's paradox, or contradictory "
             "rows); lower contacts.friction or change the posture"
         )
     if status == ki.NO_PROGRESS:
         other = STEP_OVER if _can_step_over(prepared) else "another integrator.method"
-        because = short_step_reason(prepared) or f"use {other}, or longer steps if they are fixed"
+        because = short_step_reason(prepared) or f"use {other}, or a longer step if the step is fixed"
         return (
             f"{where}: no progress, the last {ki.MOST_TRIALS} steps, or the last minute, advanced by less than "
             f"{run.clock[ki.LEAST_PROGRESS]:.1e} s, last step {run.clock[ki.STEP]:.1e} s"
@@ -480,7 +483,7 @@ def _reason(scenario: Scenario, prepared: Prepared) -> str:
         because = short_step_reason(prepared)
         return (
             f"{where}: the wall-clock limit, integrator.wall_limit_s = {scenario.integrator.wall_limit_s:g} s, is "
-            f"exceeded, last step {run.clock[ki.STEP]:.1e} s{_modes_text(prepared)}{'; ' if because else ''}{because}"
+            f"exceeded; last step: {run.clock[ki.STEP]:.1e} s{_modes_text(prepared)}{'; ' if because else ''}{because}"
         )
     if status == ki.STUCK:
         return (
@@ -522,4 +525,4 @@ def _reason(scenario: Scenario, prepared: Prepared) -> str:
         return f"{where}: joint {prepared.stops[stop].joint} cannot be kept at its stop {off}"
     else:
         failure = f"joint {couplings[owner].joint} cannot follow its leader {couplings[owner].leader} {off}"
-    return f"{where}: {failure}; the contacts contradict each other, or the arm is singular here"
+    return f"{where}: {failure}; the contacts contradict each other, or the posture is singular"

@@ -28,7 +28,7 @@ def even_times(start: float, end: float, rate: float, first: int = 0, count: int
     rate : float
         Sampling rate [1/s].
     first : int, optional
-        Number of the first sample to return.
+        Index of the first sample to return.
     count : int, optional
         Number of samples; default: up to the end.
     """
@@ -44,9 +44,10 @@ def even_times(start: float, end: float, rate: float, first: int = 0, count: int
 
 
 def _times(start: float, rate: float, numbers: NDArray[np.int64]) -> Array:
-    """Return times [s] of samples by number; after a start from a sample of another run, exactly the times of that run.
+    """Return the times [s] of samples by number.
 
-    A load may jump at such a time, and 0.35 + 0.05 is before 0.4.
+    After a start from a sample of another run, they are exactly the times of that run. This matters because a load may
+    jump at such a time, and 0.35 + 0.05 is less than 0.4 in floating-point arithmetic.
     """
     before = round(start * rate)
     if abs(start * rate - before) > 1e-9:
@@ -64,7 +65,7 @@ class Trace:
     start : float
         First sample time [s].
     end : float
-        Last sample time [s]; a sample is taken there for any rate.
+        Last sample time [s]; a sample is taken there whatever the rate is.
     rate : float
         Sampling rate [1/s].
     keep : int or None
@@ -99,7 +100,7 @@ class Trace:
         return run.sample_time[:rows], run.sample[:rows], run.output[:rows]
 
     def move(self, run: ki.Run, until: float = -np.inf) -> Array:
-        """Keep the buffer's contents and return the next sample times [s], at least up to ``until`` and one more."""
+        """Keep the buffer's contents and return the next sample times [s], at least up to the first after ``until``."""
         times, states, outputs = self.taken(run)
         if len(times):
             self._rows = (*self._rows, (times.copy(), states.copy(), outputs.copy()))
@@ -121,7 +122,7 @@ class Trace:
         return times[first:], states[first:], outputs[first:]
 
     def last_output(self) -> Array | None:
-        """Return the outputs of the last kept sample."""
+        """Return the outputs of the last kept sample, or None if no sample is kept."""
         return self._rows[-1][2][-1] if self._rows else None
 
     def _block(self, until: float) -> Array:

@@ -1,4 +1,4 @@
-"""Warnings of a dynamics run: sentences with location, number and fix."""
+"""Warnings of a dynamics run, each a sentence with location, number and fix."""
 
 from __future__ import annotations
 
@@ -29,30 +29,32 @@ from dynsim.scenario import Scenario, build
 from dynsim.scenario.effect import without_effect
 
 DRIFT_LIMIT_M = 1e-9
-# A larger joint acceleration at an equilibrium start is motion, not rounding [rad/s² or m/s²].
+# A joint acceleration above this at an equilibrium start is motion, not a rounding error [rad/s² or m/s²].
 STARTS_MOVING = 1e-6
-# Postures that differ by less are equal up to rounding [rad or m].
+# Postures that differ by less than this are equal up to rounding errors [rad or m].
 SAME_POSTURE = 1e-12
 # If an equilibrium does not use the full friction, accelerations below this fraction of gravity are rounding errors of
 # stiff contacts.
 OF_WEIGHT = 1e-4
-# Contact forces at the start that differ by more than this, relative or in N, differ from the forces at rest.
+# Contact forces at the start count as different from the forces at rest if they differ by more than this, relative or
+# in N.
 DIFFERS = 1e-3
-# Slip that starts before this time belongs to the start [s].
+# Slip that starts before this time counts as slip at the start [s].
 START_SLIP_TIME = 1e-3
 # A joint with dry friction that is slower than this is at rest [rad/s or m/s].
 AT_REST = 1e-9
-# Negative friction heat below this fraction of the turnover is rounding.
+# Negative friction heat below this fraction of the energy turnover is a rounding error.
 FRICTION_ROUNDING = 1e-12
 # Limits in files are rounded: a joint that starts at 1.5707963 = 90° does not exceed it.
 LIMIT_SLACK = 1e-6
 # Relative distance from a current limit within which it counts as reached.
 NEAR_LIMIT = 1e-3
 NOT_ENFORCED = "this limit is not enforced"
-# Warning limits of time stepping: energy that the steps remove or add, and change of the energy if everything happened
-# half a step later, both as fractions of the turnover; depth of points below surfaces [m].
+# Limits above which time stepping causes a warning: energy that the steps remove or add, and energy change if
+# everything happened half a step later, both as fractions of the energy turnover; depth of points below surfaces [m].
 SCHEME_LIMIT = 1e-2
-# Energy added by the steps at compliant contacts: a spring first met within a step stores more than it has taken.
+# Limit of the energy that steps add at compliant contacts. A spring that is first touched within a step stores more
+# energy than it has absorbed.
 GAIN_LIMIT = 1e-3
 HALF_STEP_LIMIT = 2e-2
 PENETRATION_LIMIT_M = 1e-3
@@ -82,7 +84,7 @@ def warnings_of(
     summary : dict
         Entries of the summary so far.
     scale : float
-        Turnover of the energy, at least the resolution of the ledger [J].
+        Energy turnover, but at least the resolution of the ledger [J].
     sunk : sequence of Sinking
         Bodies below surfaces.
     motors : sequence of dict
@@ -122,7 +124,7 @@ def warnings_of(
 def _contact_warnings(
     record: Record, scenario: Scenario, prepared: Prepared, summary: dict[str, Any], begun: float
 ) -> list[str]:
-    """Warn of chatter, contacts that pull, carry no load or oppose their own force, and friction that adds energy."""
+    """Warn of chatter, contacts that pull, carry no load or oppose their force, and of friction that adds energy."""
     contacts, unilateral, warnings = prepared.contacts, prepared.system.unilateral, list[str]()
     units = {link.joint: link.units for link in prepared.model.robot.links}
     if unilateral is not None:
@@ -141,8 +143,8 @@ def _contact_warnings(
     for contact in summary["contacts"]:
         if contact["normal_force_min_N"] < 0.0 and unilateral is not None:
             warnings.append(
-                f"{contact['name']}: pulls with up to {-contact['normal_force_min_N']:.3g} N within a step, when it "
-                "would lift off and land again; reduce integrator.step_max_s"
+                f"{contact['name']}: pulls with up to {-contact['normal_force_min_N']:.3g} N within a step, in which "
+                "a real contact would lift off and land again; reduce integrator.step_max_s"
             )
         elif contact["normal_force_min_N"] < 0.0:
             warnings.append(
@@ -158,7 +160,8 @@ def _contact_warnings(
     within = f" from t = {record.time[0]:.4g} s on" if len(record) and record.time[0] > begun else ""
     for contact in summary["contacts"]:
         name = contact["name"]
-        # A contact that only bounces is never closed, and a run that ends in its first step leaves no time for closing.
+        # A contact that only bounces never counts as closed, and neither does a contact in a run that ends in its first
+        # step.
         pressed = contact["closed_fraction"] > 0.0 or contact.get("bounces") or contact["normal_force_max_N"] > 0.0
         never = "gap_min_m" in contact and not pressed
         if never and name not in left_out:
@@ -170,7 +173,7 @@ def _contact_warnings(
                 )
                 continue
             warnings.append(
-                f"{name}: never touches the {surface}{within} and carries no load; nearest "
+                f"{name}: never touches the {surface}{within} and carries no load; smallest gap "
                 f"{1e3 * contact['gap_min_m']:.3g} mm at {time}"
                 f"{'' if name in placed else ' (use initial.on_surface to start on the surface)'}"
             )
@@ -186,7 +189,7 @@ def _contact_warnings(
     if gained > FRICTION_ROUNDING * summary["energy_turnover_J"]:
         text = f"friction has added {gained:.3g} J to the arm: "
         if unilateral is None:
-            text += "f_t = μ f_n reverses with a pulling normal force "
+            text += "f_t = μ f_n reverses when the normal force pulls "
             text += "(contacts.pulling_friction: dissipative uses μ |f_n|)"
         else:
             text += "an integration error; reduce integrator.step_s or tighten integrator.rtol"
@@ -201,7 +204,7 @@ def _saturated(record: Record, robot: Robot) -> list[str]:
     limited = [
         (a, motor, limits) for a, motor in enumerate(robot.motors) for limits in _limits_of(motor, units[motor.joint])
     ]
-    # The maximum along contiguous samples needs a third of the time.
+    # Computing the maximum along contiguous samples takes a third of the time.
     peaks = {
         name: np.abs(record[name].T.copy()).max(axis=1, initial=0.0) for name in {limit[1] for *_, limit in limited}
     }
@@ -236,7 +239,7 @@ def _limits_of(motor: Drive, unit: str) -> list[tuple[str, str, float, str]]:
 
 
 def _named(contacts: Sequence[Contact], chosen: NDArray[np.bool_], names: Sequence[str]) -> list[str]:
-    """Return the names whose contacts are chosen, in the order of the contacts; ``chosen`` has shape (c,)."""
+    """Return those of the names whose contacts are chosen, in the order of the contacts; ``chosen`` has shape (c,)."""
     return [contact.name for contact, own in zip(contacts, chosen, strict=True) if own and contact.name in names]
 
 
@@ -248,7 +251,7 @@ def _undetermined(record: Record, prepared: Prepared, stepped: bool) -> list[str
         return _shared_forces(record, prepared, evaluations > 0, stepped)
     if not evaluations:
         return []
-    warnings = [f"contact rows were linearly dependent in {evaluations} evaluations: forces are the least-norm split"]
+    warnings = [f"contact rows were linearly dependent in {evaluations} evaluations; the forces are a least-norm split"]
     spread = None
     if len(record) and any(contact.friction > 0.0 for contact in contacts):
         rows, units = len(record), [(link.joint, link.units[2]) for link in prepared.model.robot.links]
@@ -276,7 +279,7 @@ def _shared_forces(record: Record, prepared: Prepared, dependent: bool, stepped:
     if joints and not touching:
         return [
             f"{first_few(joints)}: shared dry friction forces keep these coupled joints at rest; the motion does not "
-            "determine them, and the recorded forces are only one solution"
+            "determine these forces, and the recorded forces are only one solution"
         ]
     if not touching:
         return []
@@ -297,9 +300,9 @@ def _shared_forces(record: Record, prepared: Prepared, dependent: bool, stepped:
             f"{motion}"
         ]
     if sliding:
-        choice = "have the least norm" if stepped else "change least from the last mode change"
+        choice = "have the least norm" if stepped else "differ least from the forces at the last mode change"
         return [
-            f"{', '.join(touching)}: shared forces that the motion does not determine{motion}; the recorded forces "
+            f"{', '.join(touching)}: the motion does not determine how load is shared{motion}; the recorded forces "
             f"{choice}"
         ]
     return [
@@ -338,8 +341,8 @@ def _not_unique(record: Record, prepared: Prepared, begun: float) -> list[str]:
             f"(wedged), which also satisfies the contact law; {MODEL_IT.format('supports')}"
         )
     wedged = [
-        f"{wedge.contact.name} against {wedge.contact.surface_name} for coefficients from {wedge.least:.4g} on (here "
-        f"{wedge.friction:.4g}, t = {wedge.time:.6g} s)"
+        f"{wedge.contact.name} against {wedge.contact.surface_name} for coefficients of {wedge.least:.4g} or more "
+        f"(here {wedge.friction:.4g}, t = {wedge.time:.6g} s)"
         for wedge in wedges(prepared.model, prepared.contacts, record)
     ]
     if wedged:
@@ -374,7 +377,7 @@ def _moving_start(record: Record, prepared: Prepared) -> list[str]:
         return []
     # The run may have started from a different state. Quaternions have been normalised.
     there = np.allclose(record["q"][0], robot.initial, rtol=0.0, atol=SAME_POSTURE)
-    # A projection leaves rates of the size of rounding errors.
+    # After a projection, rates are of the size of rounding errors.
     if not there or np.abs(record["v"][0]).max(initial=0.0) > RATE_TOLERANCE:
         return []
     size = np.abs(record["vdot"][0])
@@ -410,7 +413,7 @@ def _joints_at_rest(record: Record, prepared: Prepared) -> NDArray[np.bool_]:
 
 
 def _sunk(record: Record, sunk: Sequence[Sinking]) -> list[str]:
-    """Warn once per surface of the bodies below it in samples of the record, with the deepest body."""
+    """Warn once for each surface of the bodies below it in the samples, with the depth of the deepest body."""
     warnings = []
     for surface, below in by_surface(sunk).items():
         deepest = max(below, key=lambda s: s.depth)
@@ -419,7 +422,7 @@ def _sunk(record: Record, sunk: Sequence[Sinking]) -> list[str]:
         # Bodies from URDF do not have a radius.
         thick = any(s.radius > 0.0 for s in below)
         beyond = " by more than the link's radius" if thick else ""
-        radius = f", of {1e3 * deepest.radius:g} mm," if thick else ""
+        radius = f" (radius {1e3 * deepest.radius:g} mm)" if thick else ""
         warnings.append(
             f"{names} {verb} below {surface}{beyond}: {deepest.body}{radius} by up to {1e3 * deepest.depth:.3g} mm in "
             f"the samples, first at t = {record.time[min(s.sample for s in below)]:.4g} s; "
@@ -472,7 +475,7 @@ def _after_passing(left: float, unit: str, real: bool) -> str:
 
 
 def _beyond_stops(robot: Robot, stops: Sequence[JointStop], control: JointControl) -> list[str]:
-    """Warn of references beyond a joint stop: the controller pushes against the stop and misses the reference."""
+    """Warn of references beyond a joint stop: the controller pushes against the stop and cannot reach the reference."""
     follows = {motor.joint: bool(k_p > 0.0) for motor, k_p in zip(robot.motors, control.k_p, strict=True)}
     places = dict(zip(robot.joint_names, robot.position_index, strict=True))
     units = {link.joint: link.units[0] for link in robot.links}
@@ -491,20 +494,21 @@ def _beyond_stops(robot: Robot, stops: Sequence[JointStop], control: JointContro
     return [
         f"{stop.joint}: its reference exceeds its stop at {format_quantity(stop.position, units[stop.joint])} by "
         f"up to {format_quantity(most, units[stop.joint])}, first at t = {first[stop]:.4g} s, most at t = {time:.4g} "
-        "s; the motor pushes against the stop and misses its path; change the path or the limit"
+        "s; the motor pushes against the stop and cannot follow its path; change the path or the limit"
         for stop, (most, time) in worst.items()
     ]
 
 
 def coarse(stepping: dict[str, Any], scale: float) -> list[str]:
-    """Warn of steps that remove, add or blur too much energy or let points sink in too far, and suggest a shorter step.
+    """Warn of steps that are too long, and suggest a shorter step.
 
-    ``scale`` is the turnover of the energy, at least the resolution of the ledger; zero before the first motion [J].
+    Such steps remove or add too much energy, leave the energy uncertain, or let points sink in too far. ``scale`` is
+    the energy turnover [J], but at least the resolution of the ledger; it is zero before the first motion.
     """
     step, worst, deepest = stepping["step_s"], stepping["scheme_loss_worst_J"], stepping["penetration_max_m"]
-    # Missing for a ring buffer.
+    # This value is missing for a ring buffer.
     blurred = stepping.get("half_step_energy_J", 0.0)
-    # Only with compliant contacts or ties.
+    # This value exists only with compliant contacts or ties.
     made = stepping.get("scheme_gain_J", 0.0)
     warnings: list[str] = []
 
@@ -534,15 +538,15 @@ def coarse(stepping: dict[str, Any], scale: float) -> list[str]:
 
 
 def _resolving(stepping: dict[str, Any], share: float) -> float:
-    """Return a step with which landings on springs add less than GAIN_LIMIT of the energy; now they add ``share``.
+    """Return a step with which landings on springs add less than GAIN_LIMIT of the energy; so far they add ``share``.
 
-    A step has the full spring force if its midpoint is in contact, and none otherwise. This adds up to z/4, and on
-    average z/12, of the kinetic energy of a landing, depending on the position within the step, z = (ω h)². With z =
+    A step applies the full spring force if its midpoint is in contact, and no force otherwise. This adds up to z/4, and
+    on average z/12, of the kinetic energy of a landing, depending on the position within the step, z = (ω h)². With z =
     GAIN_LIMIT, four landings at worst, and twelve on average, stay within the limit. The share of a single run is not a
-    measure: it depends on these positions, and has no order for z > 1.
+    reliable measure, because it depends on these positions and follows no power of z for z > 1.
     """
     step, pulsation = float(stepping["step_s"]), stepping["spring_rate_rad_per_s"]
-    # The share includes energy added by other effects, of the method's order or of first order.
+    # The share includes energy added by other effects, which are of the method's order or of first order.
     if pulsation == 0.0:  # ties with dampers only
         return step * GAIN_LIMIT / share
     return float(min(GAIN_LIMIT**0.5 / pulsation, step * (GAIN_LIMIT / share) ** 0.5))
@@ -589,9 +593,9 @@ def _base_warnings(record: Record, scenario: Scenario, prepared: Prepared, begun
         beyond = f"{percent((record['tip_margin'] < 0.0).mean())} of the samples"
         if late.size and overturns_settled(record, settle) is None:
             warnings.append(
-                f"a jolt at the start drives the tip margin below zero at t = {first:.4f} s, in {beyond}, none from "
-                f"{settle:g} s on (margin at least {late.min():.3g}){least}; use initial.equilibrium, or start the "
-                "motion at rest"
+                f"a jolt at the start drives the tip margin below zero at t = {first:.4f} s, in {beyond}, but none "
+                f"from {settle:g} s on (margin at least {late.min():.3g}){least}; use initial.equilibrium, or start "
+                "the motion at rest"
             )
         else:
             warnings.append(
@@ -610,8 +614,8 @@ def _base_warnings(record: Record, scenario: Scenario, prepared: Prepared, begun
         slips = demand > 1.0
         if slips.any():
             warnings.append(
-                f"the {name} wheel would slip: it requires up to {np.nanmax(demand):.3g} times the traction of "
-                f"plant.base.wheel_friction = {base.wheel_friction:g}, first at "
+                f"the {name} wheel would slip: it requires up to {np.nanmax(demand):.3g} times the traction that "
+                f"plant.base.wheel_friction = {base.wheel_friction:g} provides, first at "
                 f"t = {record.time[standing][slips.argmax()]:.4g} s; the simulation enforces rolling anyway"
             )
     return warnings

@@ -1,4 +1,4 @@
-"""Exceptions of replays and hardware commands, one class per cause, with exit codes."""
+"""Exceptions raised by replays and hardware commands: one class per cause, each with an exit code."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from dynsim.errors import DynsimError
 
 
 class ServoMapError(DynsimError):
-    """Unreadable or invalid servo map, fault script or gate file; the message has file, line, key and fix."""
+    """A servo map, fault script or gate file is unreadable or invalid; the message states file, line, key and fix."""
 
 
 class PortError(DynsimError):
-    """The port cannot be opened, is in use by another process, or failed."""
+    """The port cannot be opened, is in use by another process, or has failed."""
 
     exit_code: ClassVar[int] = 3
 
@@ -24,7 +24,7 @@ class VerificationFailed(DynsimError):
 
 
 class ReplayAborted(DynsimError):
-    """An abort rule fired; the fault policy was applied and the log contains the reason.
+    """An abort rule stopped the replay; the fault policy was applied, and the log contains the reason.
 
     Attributes
     ----------

@@ -1,8 +1,8 @@
 """Check of the direction of rotation: turn each joint by a small angle and back, and compare with the servo map.
 
-A nudge is a replay of one servo, with all checks and abort rules of a replay: the servo is verified, armed at its
-present position, moved by 3° and back at no more than 0.1 rad/s, and its torque is switched off. The torque of all
-other servos is off.
+A nudge is a replay on a single servo, with all checks and abort rules of a replay: the servo is verified, armed at its
+present position, moved by 3° and back at no more than 0.1 rad/s, and then its torque is switched off. The torque of all
+other servos stays off.
 """
 
 from __future__ import annotations
@@ -28,25 +28,25 @@ ANGLE = math.radians(3.0)
 SPEED = 0.1
 """Maximum speed of a nudge [rad/s]."""
 PAUSE = 0.5
-"""Pause at the far end [s], so that a person can see the motion."""
+"""Pause at the far end of the motion [s], so that a person can see that the joint has moved."""
 KNOTS = 31
-"""Number of knots per leg; the interpolant is within 1e-7 rad of the quintic."""
+"""Number of knots for each direction; the interpolant is within 1e-7 rad of the quintic."""
 ERROR_LIMIT = 0.75
-"""Following error that ends a nudge, as a fraction of its angle; it limits the load on a blocked joint."""
+"""Following error at which a nudge is aborted, as a fraction of its angle; this limits the load on a blocked joint."""
 MOVED = 0.5
-"""Minimum motion from which the direction of rotation is determined, as a fraction of the angle."""
+"""Minimum motion needed to determine the direction of rotation, as a fraction of the commanded angle."""
 
 
 @dataclass(frozen=True)
 class Nudge:
-    """Result of the nudge of one joint.
+    """Result of nudging one joint.
 
     Attributes
     ----------
     joint : str
     id : int
     asked, moved : float
-        Commanded and measured displacement at the far end, positive as in the servo map [rad].
+        Commanded and measured displacement at the far end [rad], positive in the positive direction of the servo map.
     ticks : int
         Measured displacement in servo ticks.
     """
@@ -64,7 +64,7 @@ class Nudge:
 
 
 class _OneServo:
-    """Bus on which a broadcast ping returns one servo only; the replay ignores all other servos."""
+    """Bus on which a broadcast ping finds only one servo, so that the replay ignores all other servos."""
 
     def __init__(self, bus: Bus, id_: int) -> None:
         self._bus = bus
@@ -87,15 +87,15 @@ def nudge(
     Parameters
     ----------
     servo_map : ServoMap
-        Map with the servo.
+        Map that contains the servo.
     servo : MappedServo
         Servo to move.
     bus, clock : Bus, Clock
-        Bus and clock of the replay.
+        Bus and clock for the replay.
     live : bool
         If False, verify the servo without moving it.
     stop : StopRequest, optional
-        Request of the user to stop.
+        Object through which the user can stop the nudge.
 
     Returns
     -------
@@ -105,10 +105,10 @@ def nudge(
     Raises
     ------
     VerificationFailed
-        If a servo of the map has its torque on (it may be holding the robot, and a nudge ends with torque off), or
-        this servo is not ready to move or is too close to its limits.
+        If the torque of any servo in the map is on (the servo may be holding the robot, and a nudge ends with its
+        torque off), or if the servo to be moved is not ready or is too close to its limits.
     ReplayInterrupted, ReplayAborted
-        If the user or an abort rule ended the nudge; torque is off.
+        If the user or an abort rule ends the nudge; the torque is off then.
     """
     refuse_torque(bus, servo_map.servos)
     tick = read_ticks(bus, [servo])[servo.id]
@@ -151,7 +151,7 @@ def _out_and_back(start: float, distance: float) -> Path:
 
 
 def _single_servo_map(servo_map: ServoMap, servo: MappedServo) -> ServoMap:
-    """Return a map of one servo that stops at an obstacle and ends with its torque off."""
+    """Return a map with one servo, whose settings make it stop at an obstacle and end with its torque off."""
     watched, alone = copy.copy(servo), copy.copy(servo_map)
     if servo.in_position_mode:
         bound = min(ERROR_LIMIT * ANGLE, servo.kind.following_error)

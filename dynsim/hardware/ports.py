@@ -1,4 +1,4 @@
-"""Open a bus by the name of its real or virtual port."""
+"""Open the servo bus on a port, which is specified by name and may be real or virtual."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from dynsim.hardware.virtual.line import VirtualPort, line_for_map
 
 VIRTUAL = "virtual"
 PSEUDO_TERMINAL_LATENCY = 0.05
-"""Latency allowed for virtual servos on a pseudo-terminal, because a busy computer may suspend their process [s]."""
+"""Latency allowed for virtual servos on a pseudo-terminal [s]: a busy computer may suspend their process."""
 
 
 @contextmanager
@@ -30,22 +30,22 @@ def bus_on(
     posture: Mapping[str, float] | None = None,
     in_wall_time: bool = False,
 ) -> Iterator[tuple[DynamixelBus, Clock]]:
-    """Open the bus of a port and close it when the block ends.
+    """Open the servo bus on a port, and close it when the block ends.
 
     Parameters
     ----------
     port : str
         Serial device, or "virtual" for virtual servos in this process.
     servo_map : ServoMap
-        Servos and settings of the bus.
+        Map with the servos and the settings of the bus.
     script : FaultScript, optional
-        Faults of the virtual servos.
+        Faults that the virtual servos simulate.
     plant : optional
         Plant that the virtual servos drive.
     posture : mapping of str to float, optional
         Initial joint angles of the virtual servos [rad].
     in_wall_time : bool, optional
-        If True, virtual servos run in wall time; default: on a virtual clock.
+        If True, virtual servos run in real time; otherwise they use a virtual clock.
 
     Yields
     ------

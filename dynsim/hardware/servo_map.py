@@ -1,11 +1,11 @@
 """Servo maps: schema, checks and files, conversions between joints and servos, safety settings, and calibration.
 
-Joint angle [rad] and servo position [ticks] are related by
+A joint angle [rad] and the servo position [ticks] are related by
 
     tick = zero_tick + sign · gear · angle / (2π/4096)
 
-where ``gear`` is servo turns per joint turn. Angles are radians internally; a key with a unit other than SI has the
-unit in its name.
+where ``gear`` is the number of servo turns per joint turn. Internally, all angles are in radians; the name of a key
+contains the unit if it is not an SI unit.
 """
 
 from __future__ import annotations
@@ -56,16 +56,17 @@ from dynsim.snake.lifting import Lifts
 from dynsim.system.files import file_name, write_text
 from dynsim.system.inputs import is_file, parse_yaml, read_text
 
-# Read YAML files for hardware (servo maps, fault scripts, gates) into pydantic models; errors have file, line and key.
+# Functions that read YAML files for hardware (servo maps, fault scripts, gates) into pydantic models; error messages
+# state file, line and key.
 
 
 Objection = tuple[str, str]
-"""Dotted key of a file, and the reason why its value is rejected."""
+"""Dotted key of a value in a file, and the reason why the value is rejected."""
 
 
 @dataclass(frozen=True)
 class Within:
-    """Annotation of a number from ``low`` to ``high``; the error has the reason ``why`` and the valid range."""
+    """Annotation for a number from ``low`` to ``high``; the error message states ``why`` and this range."""
 
     low: float
     high: float
@@ -90,31 +91,31 @@ _Schema = TypeVar("_Schema", bound=BaseModel)
 
 
 def rounded_up(value: float) -> float:
-    """Round up to a multiple of 1e-4, for the valid value in an error message."""
+    """Round up to a multiple of 1e-4, so that the value suggested in an error message is valid."""
     return math.ceil(value * 1e4) / 1e4
 
 
 def read_yaml(path: Path, schema: type[_Schema], context: dict[str, Any] | None = None) -> _Schema:
-    """Read YAML into a pydantic model; see :func:`read_located`."""
+    """Read a YAML file into a pydantic model, see :func:`read_located`."""
     return read_located(path, schema, context)[0]
 
 
 def read_located(path: Path, schema: type[_Schema], context: dict[str, Any] | None = None) -> tuple[_Schema, Origin]:
-    """Read YAML into a pydantic model, and return it with the location of its keys in the file.
+    """Read a YAML file into a pydantic model; return the model and the origin of its values in the file.
 
     Parameters
     ----------
     path : Path
         YAML file.
     schema : type of BaseModel
-        Model of the file.
+        Pydantic model of the file.
     context : dict, optional
         Context that is passed to the validators.
 
     Raises
     ------
     ServoMapError
-        If the file is missing, is not YAML or has an invalid entry; the message has file, line and key.
+        If the file is missing, is not YAML or has an invalid entry; the message states file, line and key.
     """
     data = parse_yaml(read_text(path, ServoMapError), ServoMapError, str(path))
     if not isinstance(data, dict):
@@ -130,26 +131,26 @@ def read_located(path: Path, schema: type[_Schema], context: dict[str, Any] | No
 
 
 LONGEST_REACTION = 0.5
-"""Maximum time from the first cycle with a fault to the abort [s]."""
+"""Maximum time between the first cycle with a fault and the abort [s]."""
 STOP_CYCLES = 3
-"""Minimum number of cycles of a stop along the path."""
+"""Minimum number of cycles that a stop along the path must last."""
 ROUNDED = 1e-9
 """Relative rounding error allowed when a number of cycles is compared with a time."""
 
 FaultPolicy = Literal["hold", "decelerate", "off"]
 
-# The servos support 4.5 Mbit/s, the client library does not.
+# The servos support 4.5 Mbit/s, but the client library does not.
 _BAUD_CHOICES = [rate for rate in BAUD_RATES if rate <= 4_000_000]
 
 
 class BusSettings(StrictConfig):
-    """The serial line."""
+    """Settings of the serial line."""
 
     baud: int = Field(3_000_000, json_schema_extra={"enum": [*_BAUD_CHOICES]}, description="bit rate [bit/s]")
-    rate: Positive = Field(200.0, description="goal and state cycles per second [Hz]")
+    rate: Positive = Field(200.0, description="cycle rate; each cycle sends goals and reads states [Hz]")
     latency: Annotated[
-        Positive, Within(1e-4, 2.54, "s", "must be long enough for an adapter and at most the longest watchdog")
-    ] = Field(2e-3, description="maximum delay of an answer by adapter and operating system [s]")
+        Positive, Within(1e-4, 2.54, "s", "must be long enough for an adapter, and at most the longest watchdog time")
+    ] = Field(2e-3, description="maximum delay of an answer caused by adapter and operating system [s]")
     return_delay: float = Field(0.0, ge=0, le=508e-6, description="maximum return delay time stored in the servos [s]")
 
     @model_validator(mode="after")
@@ -160,33 +161,33 @@ class BusSettings(StrictConfig):
 
 
 class Supply(StrictConfig):
-    """Range of the supply voltage in which the robot may move."""
+    """Range of supply voltages in which the robot may move."""
 
     lowest: Positive = Field(10.0, description="minimum voltage [V]")
     highest: Positive = Field(14.8, description="maximum voltage [V]")
 
 
 class Safety(StrictConfig):
-    """When to abort, and how to stop."""
+    """Conditions for aborting a motion, and how the robot stops."""
 
     policy: FaultPolicy = Field(
         "decelerate",
         description="reaction to a fault: `hold` the present position, `decelerate` along the path and hold, or switch "
         "torque `off`",
     )
-    stop_time: float = Field(0.3, gt=0, le=3.0, description="duration of a stop by `decelerate` [s]")
-    run_up: Annotated[
-        Positive, Within(0.01, 1e5, "rad/s²", "must allow a run-up that is neither endless nor a jerk")
-    ] = Field(2.0, description="acceleration of the run-up or run-out if a record starts or ends in motion [rad/s²]")
+    stop_time: float = Field(0.3, gt=0, le=3.0, description="duration of a stop with the policy `decelerate` [s]")
+    run_up: Annotated[Positive, Within(0.01, 1e5, "rad/s²", "must make the run-up neither very long nor abrupt")] = (
+        Field(2.0, description="acceleration of the run-up or run-out if a record starts or ends in motion [rad/s²]")
+    )
     approach_velocity: Annotated[
         Positive, Within(1e-3, 1.0, "rad/s", "must be slow, because the move to the start is not checked")
     ] = Field(0.3, description="maximum speed of the move to the start posture [rad/s]")
     start_distance: Annotated[
-        Positive, Within(1e-3, 2 * math.pi, "rad", "must ask about some joints, but not about all")
+        Positive, Within(1e-3, 2 * math.pi, "rad", "must require confirmation sometimes, but not always")
     ] = Field(0.5, description="a joint farther than this from the start posture needs a second confirmation [rad]")
     watchdog: float = Field(0.2, ge=0.02, le=2.54, description="servos stop if the bus is silent for this long [s]")
     missed_cycles: int = Field(
-        3, ge=1, le=100, description="consecutive cycles without status from a servo before an abort"
+        3, ge=1, le=100, description="consecutive cycles without a status from a servo before an abort"
     )
     late_cycles: int = Field(5, ge=1, le=1000, description="consecutive late cycles before an abort")
     following_cycles: int = Field(
@@ -201,9 +202,9 @@ class Safety(StrictConfig):
 
 
 def objections_to_times(bus: BusSettings, safety: Safety) -> Iterable[Objection]:
-    """Yield abort rules that fire too late at the rate of the map, and stops shorter than the cycles they need."""
+    """Yield objections to abort rules that fire too late at the map's rate, and to a stop with too few cycles."""
     if bus.latency >= safety.watchdog:
-        yield "bus.latency", "must be below safety.watchdog, or one lost answer would trip the watchdogs"
+        yield "bus.latency", "must be below safety.watchdog; otherwise one lost answer would trip the watchdogs"
     for key in ("missed_cycles", "late_cycles", "following_cycles", "torque_cycles"):
         reaction = getattr(safety, key) / bus.rate
         if reaction > LONGEST_REACTION * (1 + ROUNDED):
@@ -219,28 +220,29 @@ def objections_to_times(bus: BusSettings, safety: Safety) -> Iterable[Objection]
     if safety.stop_time < STOP_CYCLES / bus.rate:
         yield (
             "safety.stop_time",
-            f"is below {STOP_CYCLES} cycles at {bus.rate:g} Hz; use {rounded_up(STOP_CYCLES / bus.rate):g} or more",
+            f"is less than {STOP_CYCLES} cycles at {bus.rate:g} Hz; use {rounded_up(STOP_CYCLES / bus.rate):g} or more",
         )
 
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 _CHECKOUT = _PACKAGE.parent / "scenarios" / "hardware"
 SHIPPED = _CHECKOUT if _CHECKOUT.is_dir() else _PACKAGE / "shipped_scenarios" / "hardware"
-"""Folder of the servo maps that are shipped with dynsim."""
+"""Folder with the servo maps that are shipped with dynsim."""
 
 
 HIGHEST_SUPPLY, RATED_SUPPLY = 14.8, 12.0
-"""Maximum recommended supply of the MX series, and supply in its data sheet [V]; speed and torque grow with it."""
+"""Maximum recommended supply voltage of the MX series, and supply voltage for which its data sheet specifies speed and
+torque [V]; both are assumed to be proportional to the supply voltage."""
 MAX_FOLLOWING_ERROR = 1.0
-"""Largest limit on the following error of a position servo; a larger limit would have no effect [rad]."""
+"""Largest limit allowed for the following error of a position servo [rad]; a larger limit would have no effect."""
 ROOM = 20.0
-"""Room temperature, assumed for a servo that has not moved yet [°C]."""
+"""Room temperature, which is assumed for a servo that has not moved yet [°C]."""
 
-_NO_LIMIT = "would have no effect, or reject every motion"
+_NO_LIMIT = "would have no effect or reject every motion"
 
 
 class Follows(StrictConfig):
-    """Signals of the record that a servo follows."""
+    """Signals in the record that a servo follows."""
 
     position: str = Field(description="signal with the joint angle [rad]")
     velocity: str = Field(description="signal with the joint rate [rad/s]")
@@ -249,19 +251,20 @@ class Follows(StrictConfig):
     )
     rates: Literal["continuous", "held"] = Field(
         "continuous",
-        description="joint rate between samples: changes smoothly, or is held (sampled controller)",
+        description="joint rate between samples: `continuous`, or `held` constant (for a sampled controller)",
     )
 
 
 class Limits(StrictConfig):
     """Limits of a joint.
 
-    The default acceleration accepts the start of the record of the published arm, which jumps to 2.6 rad/s within 5 ms;
-    use less for a joint that turns a load. The default jerk rejects a zigzag of 2 mrad every 5 ms.
+    The default acceleration allows the record of the published arm, in which a joint rate jumps to 2.6 rad/s within
+    5 ms at the start; use a lower value for a joint that turns a load. The default jerk rejects a zigzag of 2 mrad
+    every 5 ms.
     """
 
     position_deg: tuple[float, float] | None = Field(
-        None, description="minimum and maximum joint angle [°]; required in position mode, not for wheels"
+        None, description="minimum and maximum joint angle [°]; required in position mode, not allowed for wheels"
     )
     velocity: Positive = Field(description="maximum joint speed [rad/s]")
     torque: Positive = Field(description="joint torque at which the replay aborts [N m]")
@@ -269,14 +272,14 @@ class Limits(StrictConfig):
         2000.0, description="maximum acceleration of the path, including between samples [rad/s²]"
     )
     jerk: Annotated[Positive, Within(0.01, 1e7, "rad/s³", _NO_LIMIT)] = Field(
-        60_000.0, description="maximum mean magnitude of the jerk over 0.1 s [rad/s³]"
+        60_000.0, description="maximum magnitude of the jerk, averaged over 0.1 s [rad/s³]"
     )
     shaking: Annotated[Positive, Within(0.01, 100.0, "rad/s", _NO_LIMIT)] = Field(
         3.0, description="maximum change of velocity that is reversed within 0.3 s [rad/s]"
     )
 
 
-# For editors; when a map is loaded, Kind._objections checks the same.
+# Part of the JSON schema for editors; when a map is loaded, Kind._objections checks the same rule.
 _POSITION_NEEDS_LIMITS: dict[str, Any] = {
     "if": {"properties": {"mode": {"const": "position"}}},
     "then": {
@@ -286,7 +289,7 @@ _POSITION_NEEDS_LIMITS: dict[str, Any] = {
 
 
 class Kind(StrictConfig):
-    """Settings shared by several servos."""
+    """Settings that several servos share."""
 
     model: Literal["MX-106", "MX-28", "XL430-W250", "XM430-W210", "XM430-W350", "XH540-W150", "XH540-W270"] = Field(
         description="model of the servo"
@@ -294,7 +297,7 @@ class Kind(StrictConfig):
     mode: Literal["position", "velocity"] = Field(
         description="operating mode: position for joints, velocity for wheels"
     )
-    firmware_min: int = Field(41, description="oldest firmware version accepted")
+    firmware_min: int = Field(41, description="oldest firmware version that is accepted")
     follows: Follows = Field(description="signals of the record that the servo follows")
     limits: Limits = Field(description="limits of the joint")
     following_error: Positive = Field(
@@ -312,7 +315,7 @@ class Kind(StrictConfig):
         return self
 
     def _objections(self) -> Iterator[Objection]:
-        """Yield values that a servo of this model and gear cannot reach, and abort rules that could never fire."""
+        """Yield objections to values that this servo and gear cannot reach, and to abort rules that can never fire."""
         model, gear, limits, error = MODELS[self.model], self.gear, self.limits, self.following_error
         position = limits.position_deg
         speed = model.no_load_speed * HIGHEST_SUPPLY / RATED_SUPPLY / gear
@@ -325,7 +328,7 @@ class Kind(StrictConfig):
         if limits.velocity > speed:
             yield (
                 "limits.velocity",
-                f"the maximum of a {model.name} at this joint is {speed:.3g} rad/s; use that or less",
+                f"the maximum speed of a {model.name} at this joint is {speed:.3g} rad/s; use that or less",
             )
         if limits.torque > stall:
             yield "limits.torque", f"a {model.name} stalls at {stall:.3g} N m at this joint; use that or less"
@@ -347,29 +350,29 @@ class Kind(StrictConfig):
             if error > MAX_FOLLOWING_ERROR:
                 yield "following_error", f"is above {MAX_FOLLOWING_ERROR:g} rad and would have no effect; use less"
         elif error > limits.velocity:
-            yield "following_error", "is above limits.velocity, so a stopped servo would not be detected; use less"
+            yield "following_error", "is above limits.velocity, so that a stopped servo would not be detected; use less"
 
 
 def _not_a_flag(value: Any) -> Any:
-    """Reject Booleans: ``True`` equals 1 and would pass as a sign."""
+    """Reject Booleans, because ``True`` equals 1 and would be accepted as a sign."""
     if isinstance(value, bool):
         raise ValueError("must be 1 or -1")
     return value
 
 
 class ServoEntry(StrictConfig):
-    """One servo: kind, bus ID, direction of rotation, zero position, record column, and fixed angle if any."""
+    """One servo: its kind, bus ID, direction of rotation, zero position, record column, and fixed angle, if any."""
 
-    kind: str = Field(description="name of an entry of `kinds`")
+    kind: str = Field(description="name of an entry in `kinds`")
     id: int = Field(ge=0, le=MAX_ID, description="ID on the bus")
     sign: Annotated[Literal[1, -1], BeforeValidator(_not_a_flag)] = Field(
         1, description="direction of rotation of the servo relative to the joint"
     )
     zero_tick: int = Field(
-        2048, ge=-(1 << 20), le=1 << 20, description="servo position in the zero posture of the joint [ticks of 0.088°]"
+        2048, ge=-(1 << 20), le=1 << 20, description="servo position at the zero angle of the joint [ticks of 0.088°]"
     )
-    label: str | None = Field(None, description="column of the record; default: the name of the joint")
-    hold_at_deg: float | None = Field(None, description="fixed joint angle, instead of following the record [°]")
+    label: str | None = Field(None, description="label of the column in the record; default: the name of the joint")
+    hold_at_deg: float | None = Field(None, description="fixed joint angle, used instead of the record [°]")
 
 
 def _is_a_file_name(robot: str) -> str:
@@ -379,16 +382,16 @@ def _is_a_file_name(robot: str) -> str:
 
 
 class _MapFile(StrictConfig):
-    """Servo map: the column of a record that each servo follows, and the limits of its joint."""
+    """Servo map, which defines the column of a record that each servo follows, and the limits of its joint."""
 
     model_config = ConfigDict(title="ServoMap")
 
     robot: Annotated[str, AfterValidator(_is_a_file_name)] = Field(
-        description="name of the robot; also part of the name of the results folder"
+        description="name of the robot, which is also part of the name of the results folder"
     )
-    bus: BusSettings = Field(BusSettings(), description="the serial line")
-    safety: Safety = Field(Safety(), description="conditions of an abort, and how to stop")
-    lifts: Lifts | None = Field(None, description="lifting of the wheel pairs of a snake robot")
+    bus: BusSettings = Field(BusSettings(), description="settings of the serial line")
+    safety: Safety = Field(Safety(), description="conditions for aborting a motion, and how the robot stops")
+    lifts: Lifts | None = Field(None, description="how a snake robot lifts its wheel pairs")
     kinds: dict[str, Kind] = Field(description="settings shared by several servos")
     servos: dict[str, ServoEntry] = Field(
         json_schema_extra={"minProperties": 1}, description="servo of each joint; the key is the name of the joint"
@@ -402,7 +405,7 @@ class _MapFile(StrictConfig):
         return self
 
     def _in_names(self) -> Iterator[Objection]:
-        """Yield IDs and columns that are used twice, and kinds and joints that do not exist."""
+        """Yield objections to IDs and columns that are used twice, and to kinds and joints that do not exist."""
         if not self.servos:
             yield "servos", "must list at least one servo"
         owner: dict[int, str] = {}
@@ -425,16 +428,16 @@ class _MapFile(StrictConfig):
                 yield "lifts.joints", f"{joint} must be in position mode, without hold_at_deg or with hold_at_deg: 0"
 
     def _in_safety(self) -> Iterator[Objection]:
-        """Yield settings of ``safety`` that the kinds in use or their servo models cannot satisfy.
+        """Yield objections to settings in ``safety`` that conflict with the kinds in use or their servo models.
 
-        These include thresholds beyond the point where a servo switches its own torque off.
+        These include abort thresholds at which a servo would already have switched its own torque off.
         """
         safety, hottest, supply = self.safety, self.safety.temperature_max, self.safety.supply
         kinds = {name: self.kinds[name] for name in dict.fromkeys(entry.kind for entry in self.servos.values())}
         if supply.lowest >= supply.highest:
             yield "safety.supply.lowest", "must be below supply.highest"
         if hottest <= ROOM:
-            text = f"must be above room temperature ({ROOM:g} °C), or every run would abort; use about 65"
+            text = f"must be above room temperature ({ROOM:g} °C); otherwise every run would abort; use about 65"
             yield "safety.temperature_max", text
         for model in (MODELS[kind.model] for kind in kinds.values()):
             limp = model.fields["temperature_limit"].default
@@ -459,7 +462,7 @@ class _MapFile(StrictConfig):
                 yield "safety.run_up", text
 
     def _in_zeros(self) -> Iterator[Objection]:
-        """Yield servos in position mode with a fixed angle beyond their limits, or without any allowed position."""
+        """Yield objections to fixed angles outside the limits, and to servos that have no allowed position."""
         for joint, entry in self.servos.items():
             kind = self.kinds[entry.kind]
             limits = kind.limits.position_deg
@@ -478,12 +481,12 @@ class _MapFile(StrictConfig):
 
 
 class MappedServo:
-    """One servo of the map, with conversions between joint and servo units.
+    """One servo in the map, with conversions between joint units and servo units.
 
     Attributes
     ----------
     joint, label : str
-        Name of the joint, and of its column in the record.
+        Name of the joint, and label of its column in the record.
     id : int
     model : ServoModel
     kind : Kind
@@ -517,7 +520,7 @@ class MappedServo:
 
     @property
     def operating_mode(self) -> OperatingMode:
-        """Value that address 11 of this servo must have."""
+        """Value that the operating mode register (address 11) of this servo must contain."""
         return OperatingMode.POSITION if self.in_position_mode else OperatingMode.VELOCITY
 
     def to_ticks(self, angle: float) -> int:
@@ -529,20 +532,20 @@ class MappedServo:
         return self.sign * (ticks - self.zero_tick) * RAD_PER_TICK / self.gear
 
     def to_velocity_units(self, velocity: float) -> int:
-        """Return the servo velocity register for a joint velocity [rad/s]."""
+        """Return the value of the servo's velocity register for a joint velocity [rad/s]."""
         return round(self.sign * self.gear * velocity / RAD_S_PER_UNIT)
 
     def to_velocity(self, units: int) -> float:
-        """Return the joint velocity [rad/s] for a servo velocity register."""
+        """Return the joint velocity [rad/s] for a value of the servo's velocity register."""
         return self.sign * units * RAD_S_PER_UNIT / self.gear
 
     def to_torque(self, effort: int) -> float:
-        """Return the estimated joint torque [N·m] for the register at address 126."""
+        """Return the estimated joint torque [N·m] for a value of the register at address 126."""
         return self.sign * self.gear * self.model.torque(effort)
 
     @property
     def tick_limits(self) -> tuple[int, int]:
-        """Lowest and highest goal position that this servo may receive [ticks]."""
+        """Lowest and highest goal position that may be sent to this servo [ticks]."""
         if not self.in_position_mode:
             return (0, TICKS_PER_TURN - 1)
         ends = [self.to_ticks(angle) for angle in self.position_limits]
@@ -582,7 +585,7 @@ class ServoMap:
 
     @property
     def lifting(self) -> dict[str, Any]:
-        """Entry ``lifts`` with record columns in place of joint names, for the provenance; empty without ``lifts``."""
+        """Entry ``lifts`` for the provenance, with column labels instead of joint names; empty without ``lifts``."""
         if self.lifts is None:
             return {}
         label = {servo.joint: servo.label for servo in self.servos}
@@ -600,11 +603,11 @@ def load_servo_map(path: str | Path) -> ServoMap:
     Raises
     ------
     ServoMapError
-        If the file is missing, is not YAML or has an invalid entry; the message has file and line.
+        If the file is missing, is not YAML or has an invalid entry; the message states the file and the line.
     """
     if not isinstance(path, (str, Path)):
         raise ServoMapError(
-            f"expected the file of a servo map or the name of a shipped map (arm, snake), got {brief(path)}"
+            f"expected the path of a servo map or the name of a shipped map (arm, snake), got {brief(path)}"
         )
     path = Path(path)
     shipped = SHIPPED / f"{path.stem}.yaml"
@@ -615,30 +618,31 @@ def load_servo_map(path: str | Path) -> ServoMap:
 
 
 def json_schema() -> dict[str, Any]:
-    """Return the JSON schema of servo maps, for editors.
+    """Return the JSON schema of servo maps, for use in editors.
 
-    The schema cannot express relations between entries: ``kind`` is a key of ``kinds``, IDs differ, the lower limit is
-    below the upper limit. These are checked when a map is loaded.
+    The schema cannot express relations between entries, for example that ``kind`` is a key of ``kinds``, that all IDs
+    are different, or that a lower limit is below the upper limit. These relations are checked when a map is loaded.
     """
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **_MapFile.model_json_schema()}
 
 
-# Calibration of a servo map: read the zero ticks in a posture set by hand, and write zero ticks or signs to the map.
+# Calibration of a servo map: read the zero ticks in a posture that was set by hand, and write zero ticks or signs to
+# the map.
 
 
 Key = Literal["zero_tick", "sign"]
 READS = 20
 STILL = 3
-"""Maximum spread over the reads of a servo at rest [ticks]."""
+"""Maximum difference between the positions that are read from a servo at rest [ticks]."""
 
 
 def read_zero_ticks(bus: Bus, servos: Iterable[MappedServo]) -> dict[str, int]:
-    """Return the median servo position of each joint [ticks], read with the torque off.
+    """Return the median of the positions [ticks] that are read from the servo of each joint while the torque is off.
 
     Raises
     ------
     VerificationFailed
-        If the torque of a servo is on, or a servo does not answer or moves.
+        If the torque of a servo is on, or if a servo does not answer or is moving.
     """
     chosen = list(servos)
     refuse_torque(bus, chosen)
@@ -652,19 +656,19 @@ def read_zero_ticks(bus: Bus, servos: Iterable[MappedServo]) -> dict[str, int]:
     for servo in chosen:
         seen = ticks[servo.joint]
         if len(seen) < READS // 2:
-            raise VerificationFailed(f"{servo}: answered only {len(seen)} of {READS} reads; check cable and power")
+            raise VerificationFailed(f"{servo}: answered only {len(seen)} of {READS} reads; check its cable and power")
         if max(seen) - min(seen) > STILL:
             raise VerificationFailed(f"{servo.joint} moves (ticks {min(seen)} to {max(seen)}); hold it still")
     return {joint: int(np.median(seen)) for joint, seen in ticks.items()}
 
 
 def refuse_torque(bus: Bus, servos: Iterable[MappedServo]) -> None:
-    """Raise VerificationFailed if a servo has its torque on or does not answer."""
+    """Raise VerificationFailed if the torque of a servo is on or a servo does not answer."""
     for servo in servos:
         try:
             torque = bus.read(servo.id, MX_106.fields["torque_enable"])
         except (NoAnswer, RequestRefused) as error:
-            raise VerificationFailed(f"{servo.joint}: {error}; check power, cable, ID and baud rate") from error
+            raise VerificationFailed(f"{servo.joint}: {error}; check the power, cable, ID and baud rate") from error
         if torque:
             raise VerificationFailed(f"{servo}: torque is on; switch it off with `dynsim hw stop`")
 
@@ -686,7 +690,8 @@ def write_into_map(servo_map: ServoMap, key: Key, values: Mapping[str, int], pat
     Raises
     ------
     ServoMapError
-        If the limits of a joint would exceed the single turn of position mode, or the file cannot be written.
+        If the limits of a joint would exceed the single turn that position mode allows, or if the file cannot be
+        written.
     """
     yaml = YAML(typ="rt")
     yaml.preserve_quotes = True

@@ -1,6 +1,7 @@
 """BOGACKI_SHAMPINE, the explicit Runge–Kutta method 3(2) of Bogacki and Shampine (1989): coefficients and loop.
 
-Three evaluations a step; at loose tolerances fewer than DOPRI5 needs. Dense output is the cubic Hermite polynomial.
+A step takes three evaluations; at loose tolerances, a run takes fewer evaluations than with DOPRI5. The dense output is
+the cubic Hermite polynomial.
 """
 
 from __future__ import annotations

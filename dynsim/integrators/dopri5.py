@@ -50,7 +50,7 @@ def explicit_error(system: System, ws: Workspace, run: Run, row):
     combine(k[7], h, row, 7, k, k[7])
     error = error_norm(system, ws, run, k[7], 1.0)
     if system.layout.circuits < ws.motors.shape[0]:
-        # Currents of circuits are states: their errors also show the errors of the power.
+        # The currents of circuits are states, so their errors also reveal errors of the power.
         for j in (system.layout.ledger + kst.ELECTRICAL, system.layout.ledger + kst.JOULE):
             error = max(error, energy_norm(run, j, k[7, j]))
     return error

@@ -1,19 +1,19 @@
 """Time integration of the coupled system: start, steps of the chosen method, acceptance, events, ticks, samples.
 
-Methods, all with dense output (so that records do not force steps):
+All methods have dense output, so that sample times do not limit the steps:
 
-- ``DOPRI5``: Dormand–Prince 5(4), adaptive, six evaluations a step; dense output of order 4 (Hairer, Nørsett, Wanner:
-  Solving Ordinary Differential Equations I, II.5–II.6). For non-stiff systems;
-- ``RADAU5``: implicit, order 5 with three stages (stage order 3), error estimate of order 3, adaptive; accuracy limits
-  its steps, not the fast eigenvalues of motors (−450 ± 1900i 1/s in the published arm), see ``radau5``; dense output of
-  order 3;
-- ``TIME_STEPPING``: contacts open and close within fixed steps, see ``stepping``; samples are linear within a step.
+- ``DOPRI5``: Dormand–Prince 5(4) for non-stiff systems, adaptive, with six evaluations per step and dense output of
+  order 4 (Hairer, Nørsett, Wanner: Solving Ordinary Differential Equations I, II.5–II.6).
+- ``RADAU5``: implicit and adaptive, of order 5 with three stages (stage order 3), an error estimate of order 3 and
+  dense output of order 3. Its steps are limited by accuracy, not by the fast eigenvalues of motors (−450 ± 1900i 1/s in
+  the published arm); see ``radau5``.
+- ``TIME_STEPPING``: contacts open and close within fixed steps, see ``stepping``; samples are interpolated linearly.
 
 After each accepted step of the adaptive methods, q and v are projected onto the active rows if they are off by more
 than ``GAP_TOLERANCE`` or ``RATE_TOLERANCE``, see ``project_level``.
 
-A sample at a tick has the values in force from the tick on: it is recorded at the end of the preceding step, and again
-after the commands are taken.
+A sample at a tick contains the values that apply from the tick on: it is recorded at the end of the preceding step, and
+again after the commands have been sampled.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from dynsim.jit.kernel import FixedSignature, free_kernel, inline_kernel, intern
 
 @internal_kernel
 def start(system: System, ws: Workspace, run: Run):
-    """Evaluate the first derivative, on the contacts, and a first step size if none is set. Sets STATUS on failure."""
+    """Evaluate the first derivative with contacts, and set the first step size if it is unset; STATUS on failure."""
     if not start_contacts(system.unilateral, system, ws, run):
         run.count[ki.STATUS] = ki.NOT_PROJECTED if run.count[ki.STATUS] == ki.RUNNING else run.count[ki.STATUS]
     elif not finite(run.stage[0]):
@@ -58,8 +58,8 @@ def start(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def start_contacts(unilateral: UnilateralArrays | None, system: System, ws: Workspace, run: Run):
-    """Evaluate the derivative at the start of a step, on the constraints; unilateral law: with agreeing modes."""
-    if unilateral is None:  # resolved at compile time, as below; system.unilateral would not be
+    """Evaluate the derivative at the start of a step, with satisfied constraints and consistent contact modes."""
+    if unilateral is None:  # resolved at compile time, as below, unlike a test of system.unilateral
         return settle(system, run.clock[ki.TIME], run.y, ws, run.stage[0], run)
     due, first = run.count[ki.MODES_DUE] > 0, run.count[ki.MODES_DUE] == ki.AT_START
     if due:
@@ -77,14 +77,14 @@ def start_contacts(unilateral: UnilateralArrays | None, system: System, ws: Work
 
 @internal_kernel
 def hold_all_joints(unilateral: UnilateralArrays, ws: Workspace):
-    """Let dry friction hold joints in position: an impact precedes the modes that select the joints it holds."""
+    """Let dry friction hold all joints: the first impact comes before the modes that select the joints it holds."""
     for k in range(unilateral.dry_table.shape[0]):
         unilateral.dry[k, ku.DRY_AT] = ws.joints[unilateral.dry_table[k, ku.DRY_JOINT], ka.Q]
 
 
 @inline_kernel
 def accept(system: System, ws: Workspace, run: Run):
-    """Project y_new, record it, make it the new y. Sets STATUS if contacts cannot be met or forces are not unique."""
+    """Project y_new, record it and make it y; set STATUS if contacts cannot be satisfied or forces are not unique."""
     t, h = run.clock[ki.TIME], run.clock[ki.STEP]
     if not end_accepted(run.newton, system, ws, run):
         return
@@ -105,7 +105,7 @@ def accept(system: System, ws: Workspace, run: Run):
 
 @inline_kernel
 def accepts_step(system: System, ws: Workspace, run: Run, error):
-    """True if error control, events and HOLD accept the step just taken."""
+    """Return whether error control, events and HOLD accept the step just taken."""
     clock, count = run.clock, run.count
     if run.event.shape[0] > 0 and cut_step(system, end_workspace(run.newton, system, ws, run), run):
         return False
@@ -118,7 +118,7 @@ def accepts_step(system: System, ws: Workspace, run: Run, error):
 
 @internal_kernel
 def propose(run: Run):
-    """Set the step size to try next, unless a root is being searched, which sets it."""
+    """Set the size of the next trial step, unless a search for a root sets it."""
     if run.count[ki.SEARCHING] == 0:
         run.clock[ki.PROPOSED] = run.clock[ki.STEP]
         choose_step(run)
@@ -132,17 +132,17 @@ def adapt_step_size(run: Run, order, beta):
         clock[ki.STEP] = clock[ki.PROPOSED]
     else:
         next_step(run, clock[ki.ERROR], order, beta)
-        # A step that was cut short does not disprove the step size proposed before.
+        # A step that was cut short does not invalidate the step size that was proposed before.
         if count[ki.TRIMMED] == 1:
             clock[ki.STEP] = max(clock[ki.STEP], clock[ki.PROPOSED])
 
 
 @internal_kernel
 def evaluate_for_commands(unilateral: UnilateralArrays | None, system: System, ws: Workspace, run: Run):
-    """Evaluate the state from which commands are computed, into ``ws``; on the rows if contact modes fit this state.
+    """Evaluate the state from which commands are computed into ``ws``, projected if the contact modes fit this state.
 
-    At the start, and after a jump of rates, the rows are still the earlier ones: held joints may have no position yet,
-    and projection onto them would move the robot.
+    At the start and after a jump of rates, the rows still belong to the earlier modes: held joints may not have a
+    position yet, and projection onto these rows would move the robot.
     """
     if unilateral is not None and run.count[ki.MODES_DUE] > 0:
         derivative(system, run.clock[ki.TIME], run.y, ws, run.stage[0])
@@ -153,7 +153,7 @@ def evaluate_for_commands(unilateral: UnilateralArrays | None, system: System, w
 
 @internal_kernel
 def ready(system: System, ws: Workspace, run: Run):
-    """Start or restart and process ticks if due; False if control must return to the caller."""
+    """Start or restart, and process ticks, if due; return False if control must return to the caller."""
     count = run.count
     due = take_ticks(run)
     if due & ki.TAKE_COMMANDS:
@@ -171,7 +171,7 @@ def ready(system: System, ws: Workspace, run: Run):
 
 @inline_kernel
 def can_step(system: System, ws: Workspace, run: Run):
-    """True if a step can be taken; False if control must return to the caller first."""
+    """Return whether a step can be taken; if not, control must first return to the caller."""
     # Most runs have nothing to do between two steps.
     idle = run.count[ki.STARTED] == 1 and run.tick.shape[0] + run.breaks.shape[0] == 0
     return idle or ready(system, ws, run)
@@ -179,7 +179,7 @@ def can_step(system: System, ws: Workspace, run: Run):
 
 @inline_kernel
 def conclude(system: System, ws: Workspace, run: Run, error, order):
-    """Accept or reject the step just taken or pending; True if control must return to the caller."""
+    """Accept or reject the step just taken or pending; return whether control must return to the caller."""
     count = run.count
     if count[ki.PENDING] == 0:
         if rejected(ws, run, error, order):
@@ -220,8 +220,8 @@ def advance_dopri5(system: System, ws: Workspace, run: Run, limit):
 def conclude_separately(system: System, ws: Workspace, run: Run, error, order):
     """Call :func:`conclude`, compiled separately.
 
-    The callees of a RADAU5 step compile slowly, and functions as small as this one compile in less than half the time
-    of one function that contains them all.
+    The functions that a RADAU5 step calls compile slowly; with small functions such as this one, compilation takes less
+    than half the time of one function that contains them all.
     """
     return conclude(system, ws, run, error, order)
 
@@ -230,8 +230,8 @@ def conclude_separately(system: System, ws: Workspace, run: Run, error, order):
 def advance_radau5(system: System, ws: Workspace, run: Run, limit):
     """Run :func:`advance` with RADAU5.
 
-    Samples keep waiting, with at most three others, if only ``limit`` has ended the call: which samples are computed
-    together must not depend on the speed of the machine.
+    If the call ends only because of ``limit``, up to four samples remain waiting, because the samples that are computed
+    together must not depend on the speed of the computer.
     """
     taken, error = 0, 0.0
     if limit < 0:
@@ -257,14 +257,15 @@ def advance_radau5(system: System, ws: Workspace, run: Run, limit):
 def advance(system: System, ws: Workspace, run: Run, limit: int) -> None:
     """Take up to ``limit`` steps towards END and set run.count[STATUS]; a negative limit only loads the function.
 
-    Returns earlier if an event or a tick needs the caller (LOGGED, TICKED), if the next step would end beyond HOLD (it
-    is kept, PENDING, and accepted by the next call unless the caller drops it), and if another thread has set ASKED.
+    The call returns earlier if an event or a tick needs the caller (LOGGED, TICKED), if the next step would end beyond
+    HOLD (the step is kept as PENDING and accepted by the next call unless the caller drops it), or if another thread
+    has set ASKED.
 
-    One compiled function per method, so that each is compiled only when it is used.
+    There is one compiled function per method, so that each is compiled only when it is used.
     """
     compiled(run.method)(system, ws, run, limit)
 
 
 def direct(run: Run) -> Callable[[System, Workspace, Run, int], None]:
-    """Return :func:`advance` for a run in many short pieces whose tables keep the types of the first piece."""
+    """Return the compiled :func:`advance` for a run in many short pieces whose tables keep their types."""
     return FixedSignature(compiled(run.method))

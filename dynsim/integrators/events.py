@@ -1,13 +1,13 @@
-"""Event location: a step ends where a guard function crosses zero; ticks end steps at given times.
+"""Event location: a step ends when a guard function crosses zero; ticks end steps at given times.
 
-The event table has the guard of each event, its value at the last accepted step and its side of zero there. After a
-step that error control has accepted, the guards are evaluated from the workspace of the right-hand side. If one has
-crossed zero, the step is repeated, shorter, until it ends within ``event_tolerance`` beyond the root. The root thus
-belongs to the method's own solution, not to the dense output, whose order is lower.
+The event table contains the guard of each event, its value at the last accepted step and its side of zero there. After
+a step that error control has accepted, the guards are evaluated from the workspace of the right-hand side. If a guard
+has crossed zero, the step is repeated with shorter lengths until it ends within ``event_tolerance`` beyond the root.
+The root thus belongs to the method's own solution, not to the dense output, whose order is lower.
 
-A guard may also cross zero twice within a step. Guards of this file are recorded at two inner stages, where the
-derivative is evaluated anyway: the cubic through these values and those at the ends shows the crossings, and the step
-is cut there.
+A guard may also cross zero twice within a step. The guards of this file are recorded at two inner stages, where the
+derivative is evaluated anyway. The cubic through these values and the values at the ends reveals the crossings, and the
+step is cut there.
 """
 
 from __future__ import annotations
@@ -27,25 +27,26 @@ from dynsim.integrators.contacts.events import contact_guard, lowest, note_gaps,
 from dynsim.integrators.run import Run
 from dynsim.jit.kernel import internal_kernel
 
-# Kinds of guards. To add one: a number here, a branch in ``guard`` and a name in GUARDS of dynsim.engine.stepped.
+# Kinds of guards. To add one, add a number here, a branch in ``guard`` and a name in GUARDS of dynsim.engine.stepped.
 # Guards of the unilateral law, from NORMAL_GUARD on, are in dynsim.integrators.contacts.events.
 JOINT_POSITION, JOINT_RATE, MOTOR_CURRENT, MOTOR_VOLTAGE, CONTACT_FORCE, CONTACT_GAP = 0, 1, 2, 3, 4, 5
 HAND_X, HAND_Y, HAND_Z = 6, 7, 8
 TIP_MARGIN = 9
 
-# Most trial steps for a root; regula falsi with halving (Illinois) needs about eight. After FALSI_LIMIT trials the
-# bracket is bisected, for guards that jump (forces do when their split changes); after SEARCH_LIMIT one more follows.
+# Maximum number of trial steps for a root; the Illinois method (regula falsi with halving) needs about eight. After
+# FALSI_LIMIT trials the bracket is bisected, because some guards jump, such as forces when their split changes; after
+# SEARCH_LIMIT trials, one more trial follows.
 SEARCH_LIMIT, FALSI_LIMIT = 60, 16
-# A step also ends at a turning point that stays short of zero by this part of the way back, since the cubic is not
-# exact. The next step shows more, because its ends are next to the turning point.
+# A step also ends at a turning point that misses zero by at most this fraction of the way back, because the cubic is
+# not exact. The next step is more accurate, because one of its ends is next to the turning point.
 SHORT_OF_ZERO = 0.1
-# A guard that turns back by less than this part of its level, or of its unit, is constant up to rounding.
+# A guard that turns back by less than this fraction of its level, or of its unit, is constant up to rounding.
 ROUNDING = 1e-12
 
 
 @internal_kernel
 def guard(system: System, t, ws: Workspace, run: Run, e):
-    """Return the value of the guard of event e, zero at the event, right after ``derivative`` at time t."""
+    """Return the guard of event e, which is zero at the event; call right after ``derivative`` at time t."""
     kind, k, value = run.event_table[e, ki.EVENT_KIND], run.event_table[e, ki.EVENT_INDEX], 0.0
     if kind == JOINT_POSITION:
         value = ws.joints[k, ka.Q]
@@ -71,9 +72,10 @@ def guard(system: System, t, ws: Workspace, run: Run, e):
 
 @internal_kernel
 def note_inside(system: System, ws: Workspace, run: Run, inner, x):
-    """Record the guards at fraction x of the step being taken, right after ``derivative`` there, for `turns_within`.
+    """Record the guards at fraction x of the current step for `turns_within`; call right after ``derivative`` there.
 
-    Of the unilateral law, only forces of closed contacts: :func:`too_long` checks gaps and slip. Other guards are NaN.
+    Of the guards of the unilateral law, only the forces of closed contacts are recorded, because :func:`too_long`
+    checks gaps and slip. The other guards are NaN.
     """
     run.clock[ki.INNER + inner] = x
     for e in range(run.event.shape[0]):
@@ -86,7 +88,7 @@ def note_inside(system: System, ws: Workspace, run: Run, inner, x):
 
 @internal_kernel
 def presses(unilateral: UnilateralArrays | None, ws: Workspace, run: Run, e):
-    """True if event e is that a closed contact loses its force, and the motion determines this force."""
+    """Return whether event e is the loss of a closed contact's force, and the motion determines this force."""
     if unilateral is None:  # resolved at compile time
         return False
     if run.event_table[e, ki.EVENT_KIND] != ke.NORMAL_GUARD or unilateral.number[ku.SPLIT] == 1.0:
@@ -96,16 +98,16 @@ def presses(unilateral: UnilateralArrays | None, ws: Workspace, run: Run, e):
 
 @internal_kernel
 def rounding(run: Run, e):
-    """Return the guard value of event e that may be rounding."""
+    """Return the largest guard value of event e that may be a rounding error."""
     return ROUNDING * max(1.0, abs(run.event[e, ki.EVENT_LEVEL]))
 
 
 @internal_kernel
 def turns_within(run: Run):
-    """Return the fraction of the step just taken at which a guard turns beyond zero and comes back, or 1.
+    """Return the fraction of the step just taken at which a guard that crosses zero twice turns back, or 1.
 
-    Uses the cubic through its values at both ends and at two stages. The direction of the event does not matter, since
-    one of two crossings has it.
+    The function uses the cubic through the guard's values at both ends and at two stages. The direction of the event
+    does not matter, because one of the two crossings has this direction.
     """
     fraction, event, a, b = 1.0, run.event, run.clock[ki.INNER], run.clock[ki.INNER + 1]
     for e in range(event.shape[0]):
@@ -114,7 +116,7 @@ def turns_within(run: Run):
         side = event[e, ki.SIDE] if event[e, ki.SIDE] != 0.0 else (1.0 if event[e, ki.VALUE] > 0.0 else -1.0)
         g0, g1 = side * event[e, ki.START_VALUE], side * event[e, ki.VALUE]
         ga, gb = side * event[e, ki.INNER_VALUE], side * event[e, ki.INNER_VALUE + 1]
-        # Newton's divided differences, then powers of x.
+        # Compute Newton's divided differences, then the coefficients of the powers of x.
         first, between = (ga - g0) / a, (gb - ga) / (b - a)
         second = (between - first) / b
         third = ((g1 - gb) / (1.0 - b) - between) / (1.0 - a) - second
@@ -122,7 +124,7 @@ def turns_within(run: Run):
         x = lowest(slope, bend, third)
         nearest, least = min(g0, g1), g0 + x * (slope + x * (bend + x * third))
         back = nearest - least
-        # If the end is far beyond zero the guard has passed once, in the direction that does not count.
+        # If the end is far beyond zero, the guard has crossed once, in the direction that does not count.
         passes = least < SHORT_OF_ZERO * back and nearest > -SHORT_OF_ZERO * back
         if x < 1.0 and back > rounding(run, e) and passes:
             fraction = min(fraction, x)
@@ -131,9 +133,9 @@ def turns_within(run: Run):
 
 @internal_kernel
 def arm_events(system: System, ws: Workspace, run: Run):
-    """Set values and sides of all guards at the start of a step, right after ``derivative`` there.
+    """Set the values and sides of all guards at the start of a step; call right after ``derivative`` there.
 
-    An event that has just occurred keeps its new side, whatever the rounding of its guard.
+    An event that has just occurred keeps its new side, regardless of rounding errors of its guard.
     """
     for e in range(run.event.shape[0]):
         value = guard(system, run.clock[ki.TIME], ws, run, e)
@@ -145,20 +147,20 @@ def arm_events(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def happened(run: Run, e, value):
-    """True if the guard of event e, at this value, has crossed zero in its direction."""
+    """Return whether a value of the guard of event e means that it has crossed zero in the event's direction."""
     side, direction = run.event[e, ki.SIDE], run.event_table[e, ki.DIRECTION]
     return side != 0.0 and value * side <= 0.0 and (direction == 0 or direction * side < 0.0)
 
 
 @internal_kernel
 def event_tolerance(t):
-    """Return the bracket width at which a root counts as located [s]: a few roundings of the time."""
+    """Return the bracket width at which a root counts as located [s]: a few rounding errors of the time."""
     return 1e-13 + 1e-15 * abs(t)
 
 
 @internal_kernel
 def cut_step(system: System, ws: Workspace, run: Run):
-    """True if the step just taken must be repeated because an event lies within it; STEP is then the next trial.
+    """Return whether the step just taken must be repeated because an event lies within it; STEP is then the next trial.
 
     If False, FIRED is 1 if the step ends at an event.
     """
@@ -191,13 +193,13 @@ def cut_step(system: System, ws: Workspace, run: Run):
     count[ki.SEARCHING] += 1
     low, high = clock[ki.LOW], clock[ki.HIGH]
     if high - low <= event_tolerance(clock[ki.TIME]) or count[ki.SEARCHING] > SEARCH_LIMIT:
-        # A repeated step of RADAU5 is not bit-identical, since its Newton method depends on the contraction of the last
-        # one: at HIGH it may miss a guard that had crossed zero there, sometimes or every time.
+        # A repeated step of RADAU5 is not bit-identical, because its Newton method depends on the contraction of the
+        # previous step. At HIGH, it may therefore miss a guard that had crossed zero there, sometimes or every time.
         if h == high and (hit or count[ki.SEARCHING] > SEARCH_LIMIT):
             if not hit:
                 keep_passed(run)
             count[ki.SEARCHING] = 0
-            # Contacts and turning points that were passed over before the event come first.
+            # Contacts and turning points that the step passed over before the event must be handled first.
             if passes_over(system, ws, run):
                 return True
             count[ki.FIRED] = 1
@@ -208,7 +210,7 @@ def cut_step(system: System, ws: Workspace, run: Run):
     for e in range(event.shape[0]):
         a, b = event[e, ki.AT_LOW], event[e, ki.AT_HIGH]
         if happened(run, e, b) and not happened(run, e, a):
-            # A secant from the root just located leads back to it, where rounding decides.
+            # A secant from the root just located leads back to this root, where the sign of the guard is rounding.
             known = low == 0.0 and run.event_table[e, ki.EVENT_KIND] < ke.NORMAL_GUARD and abs(a) <= rounding(run, e)
             trial = min(trial, low + (high - low) * (0.5 if known else a / (a - b)))
     if not low < trial < high or count[ki.SEARCHING] > FALSI_LIMIT:
@@ -227,7 +229,7 @@ def keep_passed(run: Run):
 
 @internal_kernel
 def passes_over(system: System, ws: Workspace, run: Run):
-    """True if the step has passed over a contact, a reversal of slip or a level; STEP is then the step to take."""
+    """Return whether the step has passed over a contact, a slip reversal or a level; STEP is then the step to take."""
     part = too_long(system.model, system.contacts, system.unilateral, ws, run.clock[ki.STEP], run.gaps)
     part = min(part, turns_within(run))
     # A false alarm must not shorten steps indefinitely, or to zero.
@@ -242,7 +244,7 @@ def passes_over(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def fire_events(run: Run):
-    """Log and handle the events at the end of the accepted step; True if control must return to the caller."""
+    """Log and handle the events at the end of the accepted step; return whether control must return to the caller."""
     count, event, look = run.count, run.event, False
     for e in range(event.shape[0]):
         if count[ki.FIRED] == 1 and happened(run, e, event[e, ki.VALUE]):
@@ -263,7 +265,7 @@ def fire_events(run: Run):
 def next_tick(run: Run, until):
     """Return the earliest tick or break, or ``until`` if that is earlier [s].
 
-    A step to a break ends a few roundings before it, so that its last stage is on the near side of a jump.
+    A step to a break ends a few rounding errors before it, so that its last stage is on the near side of a jump.
     """
     for k in range(run.tick.shape[0]):
         until = min(until, run.tick[k, ki.TICK_NEXT])
@@ -289,7 +291,7 @@ def take_ticks(run: Run):
         if tick[k, ki.TICK_NEXT] - clock[ki.TIME] <= 1e-12 * max(1.0, abs(clock[ki.TIME])):
             clock[ki.TIME] = tick[k, ki.TICK_NEXT]
             run.tick_table[k, ki.TICK_COUNT] += 1
-            # Not a sum of periods, whose rounding errors would add up.
+            # Do not sum periods, because rounding errors would accumulate.
             tick[k, ki.TICK_NEXT] = tick[k, ki.TICK_PHASE] + run.tick_table[k, ki.TICK_COUNT] * tick[k, ki.TICK_PERIOD]
             due |= run.tick_table[k, ki.TICK_KIND]
     return due

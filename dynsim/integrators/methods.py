@@ -1,7 +1,7 @@
-"""Table of the integration methods. A new method is a module with its compiled steps, and a row here.
+"""Table of the integration methods. A new method requires a module with its compiled steps, and a row in this table.
 
-Scenario schema, choice and checks of the method, dense output, the tables of supported features and the tests read this
-table. It imports no compiled code.
+The scenario schema, the choice and checks of the method, dense output, the tables of supported features and the tests
+read this table. This module imports no compiled code.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ class Method(NamedTuple):
     order : int
         Order of the solution at the ends of steps between events.
     advance : str
-        Module and name of its compiled ``advance(system, ws, run, limit)``, joined by a colon.
+        Module and name of the compiled ``advance(system, ws, run, limit)`` of the method, joined by a colon.
     dense : int
         ``LINEAR``; ``HERMITE``: the cubic through states and derivatives at both ends, plus
         θ² (1 − θ)² h Σ b_s k_s over the stages k_s; ``COLLOCATION``: the cubic through the stages of RADAU5.
     stability : float
         Largest stable |h λ| on the negative real axis; 0 for an implicit method.
     quartic : tuple of float
-        b_s of the seven stages, for ``HERMITE``.
+        Coefficients b_s of the seven stages, for ``HERMITE``.
     adaptive : bool
         Whether error control chooses the steps, which then end at events.
     """
@@ -50,7 +50,7 @@ class Method(NamedTuple):
 
     @property
     def explicit(self) -> bool:
-        """Whether fast eigenvalues limit its steps."""
+        """Whether fast eigenvalues limit the steps of the method."""
         return self.stability > 0.0
 
 
@@ -61,7 +61,7 @@ DOPRI5 = Method(
     advance="dynsim.integrators.driver:advance_dopri5",
     dense=HERMITE,
     stability=3.3,
-    # Hairer, Nørsett, Wanner: Solving Ordinary Differential Equations I, II.6.
+    # Source: Hairer, Nørsett, Wanner: Solving Ordinary Differential Equations I, II.6.
     quartic=(
         -12715105075.0 / 11282082432.0,
         0.0,

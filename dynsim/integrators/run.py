@@ -35,44 +35,44 @@ LINEAR, HERMITE = methods.LINEAR, methods.HERMITE
 
 RUNNING, FINISHED, NOT_FINITE, STEP_TOO_SMALL, NOT_PROJECTED, NO_FORCES = 0, 1, 2, 3, 4, 5
 FORCES_REVERSED, SEVERAL_FORCES, STOPPED = 6, 7, 8
-# Under the unilateral law: no forces agree with Coulomb's law; modes change endlessly.
+# Statuses under the unilateral law: no forces agree with Coulomb's law; modes change endlessly.
 NO_CONTACT_FORCES, CHATTER = 9, 10
-# MOST_TRIALS steps made almost no progress. Set by the caller: wall-clock limit reached; a step does not end.
+# Statuses: MOST_TRIALS steps made almost no progress; set by the caller: wall-clock limit reached; a step does not end.
 NO_PROGRESS, OUT_OF_TIME, STUCK = 11, 12, 13
 
 # Run.clock
 TIME, STEP, LAST_ERROR, END, RTOL, ATOL, STEP_MAX = 0, 1, 2, 3, 4, 5, 6
 NOT_UNIQUE = 7  # end of the rejected step at which the contact forces were not unique [s]
-# A step that would end beyond HOLD is left pending, not accepted; step size proposed before a cut; error norm of the
-# step taken; bracket of the root that is searched, measured from TIME [s].
+# HOLD: a step that would end beyond this time is left pending instead of being accepted; step size proposed before a
+# cut; error norm of the step taken; bracket of the root being searched, measured from TIME [s].
 HOLD, PROPOSED, ERROR, LOW, HIGH = 8, 9, 10, 11, 12
-# Time at which trials were last counted from zero, and the required progress of MOST_TRIALS trials [s].
+# Time at which the count of trials last restarted, and required progress of MOST_TRIALS trials [s].
 COUNTED_SINCE, LEAST_PROGRESS = 13, 14
-INNER = 15  # 2: fractions of the step at which guards are recorded within it
+INNER = 15  # 2: fractions of the step at which guards are recorded
 CLOCK_SIZE = 17
 # Run.count, int
 STEPS, REJECTED, EVALUATIONS, PROJECTIONS, SAMPLE, STATUS, STARTED = 0, 1, 2, 3, 4, 5, 6
-# A step is pending; trials of a root; which end of the bracket moved last; the step ends at an event; it ends at a
-# tick; events in the log; bits of the ticks that need the caller.
+# Flag that a step is pending; number of trials for a root; end of the bracket that moved last; flags that the step ends
+# at an event or at a tick; number of events in the log; bits of the ticks that need the caller.
 PENDING, SEARCHING, TURNED_BACK, FIRED, TRIMMED, LOGGED, TICKED = 7, 8, 9, 10, 11, 12, 13
-NEXT_BREAK = 14  # index of the first break of Run.breaks that is not past
+NEXT_BREAK = 14  # index of the first break in Run.breaks that has not been passed
 MODES_DUE = 15  # contact modes must be chosen at the next start: start of the run, or after a jump of rates
-GRAZING = 16  # how often the step was shortened because it passed over something
-TRIALS = 17  # steps tried, accepted or not, since COUNTED_SINCE
-ASKED = 18  # written by another thread: return at the next step
+GRAZING = 16  # number of times the step was shortened because it passed over an event
+TRIALS = 17  # number of steps tried since COUNTED_SINCE, accepted or not
+ASKED = 18  # written by another thread to request a return at the next step
 COUNT_SIZE = 19
-# Trials of one progress check, and its required progress as a fraction of the duration of the run.
+# Number of trials in a progress check, and required progress as a fraction of the duration of the run.
 MOST_TRIALS, PROGRESS = 10_000, 1e-6
 AT_START, AFTER_JUMP = 1, 2
-# Run.event, and Run.event_table, int
+# Columns of Run.event, and of Run.event_table, int
 EVENT_LEVEL, SIDE, START_VALUE, VALUE, AT_LOW, AT_HIGH = 0, 1, 2, 3, 4, 5
-INNER_VALUE = 6  # 2: at INNER
+INNER_VALUE = 6  # 2: values at the fractions INNER of the step
 EVENT_SIZE = 8
 EVENT_KIND, EVENT_INDEX, DIRECTION, ON_EVENT = 0, 1, 2, 3
 EVENT_TABLE_SIZE = 4
 # Action of an event in addition to its log entry: none, return to the caller, end the run.
 LOG, RETURN, STOP = 0, 1, 2
-# Run.tick, and Run.tick_table, int. Kinds are bits.
+# Columns of Run.tick, and of Run.tick_table, int. The kinds of ticks are bits.
 TICK_PERIOD, TICK_NEXT, TICK_PHASE = 0, 1, 2
 TICK_SIZE = 3
 TICK_KIND, TICK_COUNT = 0, 1
@@ -80,13 +80,13 @@ TICK_TABLE_SIZE = 2
 TAKE_COMMANDS, CALLER = 1, 2
 LOG_LENGTH = 1024
 GAPS_SIZE = 10
-# Entries of Run.log_event from these numbers on belong to contacts, to joint stops, and to joints with dry friction,
-# see dynsim.integrators.contacts.events.
+# Codes in Run.log_event from these numbers on belong to contacts, joint stops, and joints with dry friction; see
+# dynsim.integrators.contacts.events.
 CONTACT_LOG, STOP_LOG, DRY_LOG = 1 << 20, 1 << 40, 1 << 50
 # Run.extremes, per contact
 FORCE_MIN, FORCE_MAX, DRIFT_MAX = 0, 1, 2
 PULLING, LAST_FORCE = 3, 4  # time with a negative normal force [s]; normal force at the last accepted step [N]
-LOCAL_SINCE = 5  # first time at which the contact's entry on the diagonal of J M⁻¹ F was negative [s], otherwise inf
+LOCAL_SINCE = 5  # first time at which the contact's diagonal entry of J M⁻¹ F was negative [s]; inf if never
 EXTREMES_SIZE = 6
 
 
@@ -98,7 +98,7 @@ class Run(NamedTuple):
     layout: StateLayout
     y: np.ndarray  # (m,) state at TIME
     y_new: np.ndarray  # (m,)
-    stage: np.ndarray  # (8, m) stage derivatives; stage[0] belongs to y
+    stage: np.ndarray  # (8, m) stage derivatives; stage[0] is the derivative at y
     dense: np.ndarray  # (4, m) y(θ) = y + θ (d0 + (1−θ)(d1 + θ (d2 + (1−θ) d3)))
     quartic: np.ndarray  # (7,) coefficients of d3 / h, by stage
     clock: np.ndarray  # (CLOCK_SIZE,)
@@ -113,7 +113,7 @@ class Run(NamedTuple):
     event_table: np.ndarray  # (e, EVENT_TABLE_SIZE) int
     tick: np.ndarray  # (k, TICK_SIZE)
     tick_table: np.ndarray  # (k, TICK_TABLE_SIZE) int
-    breaks: np.ndarray  # (b,) increasing times at which derivatives jump or bend: steps end there [s]
+    breaks: np.ndarray  # (b,) increasing times at which derivatives jump or bend and steps must end [s]
     log_time: np.ndarray  # (LOG_LENGTH,) event times [s]
     log_event: np.ndarray  # (LOG_LENGTH,) int: event codes
     hand: np.ndarray  # (3,) scratch
@@ -186,13 +186,13 @@ def new_run(
     breaks : (b,) ndarray, optional
         Times at which derivatives jump or bend [s].
     least_progress : float, optional
-        Required progress of MOST_TRIALS steps [s]; default: PROGRESS of the time until ``end``.
+        Required progress of MOST_TRIALS steps [s]; default: PROGRESS times the time until ``end``.
     support : SupportArrays, optional
         Ground support of a mobile base.
     stepping : SteppingArrays, optional
         Arrays of time stepping.
     lanes : bool, optional
-        RADAU5 evaluates right-hand sides together, see dynsim.integrators.simd.forms.has_forms.
+        If True, RADAU5 evaluates several right-hand sides at once, see dynsim.integrators.simd.forms.has_forms.
 
     Raises
     ------
@@ -201,7 +201,7 @@ def new_run(
     """
     m, p, table = len(y), row_limit(c, couplings), methods.by_number(method)
     if method == TIME_STEPPING and layout.size == layout.scheme:
-        raise ValueError("time stepping requires the block 'scheme' of the state, see dynsim.dynamics.state")
+        raise ValueError("time stepping requires a state with the block 'scheme', see dynsim.dynamics.state")
     clock = np.zeros(CLOCK_SIZE)
     clock[[STEP, LAST_ERROR, END, RTOL, ATOL, STEP_MAX]] = step, 1e-4, end, rtol, atol, step_max
     clock[HOLD] = np.inf
@@ -249,12 +249,15 @@ def new_run(
     )
 
 
-# Statistics of accepted steps: extremes of contact forces and gaps, pulling times; uniqueness of the forces.
+# Statistics of accepted steps: extremes of contact forces and gaps, pulling times, and uniqueness of the forces.
 
 
 @internal_kernel
 def watch(ws: Workspace, run: Run, h):
-    """Update extremes of normal forces and gaps and pulling times (force linear in the step) after an accepted step."""
+    """Update extremes of normal forces and gaps, and pulling times, after an accepted step.
+
+    Pulling times are computed as if the force were linear within the step.
+    """
     state, extremes = ws.contacts, run.extremes
     for k in range(state.shape[0]):
         low = min(extremes[k, LAST_FORCE], state[k, ka.NORMAL_FORCE])
@@ -270,7 +273,7 @@ def watch(ws: Workspace, run: Run, h):
 
 @internal_kernel
 def forces_unique(system: System, ws: Workspace, run: Run, t):
-    """True if the contacts determine their forces at time t, right after ``derivative``; otherwise sets STATUS."""
+    """Return whether contact forces are uniquely determined at time t, after ``derivative``; if not, set STATUS."""
     verdict = force_verdict(ws, run.room, run.extremes[:, LOCAL_SINCE], t)
     if verdict == kq.UNIQUE:
         return True
@@ -291,7 +294,7 @@ def write_output(system: System, ws: Workspace, run: Run, row):
 
 @internal_kernel
 def fill_output(system: System, ws: Workspace, run: Run, out):
-    """Write these outputs without the ground reactions of a mobile base to out, (columns.size,); also for lanes."""
+    """Write the outputs other than states and ground reactions to ``out``, (columns.size,); also for SIMD lanes."""
     joints, state, columns = ws.joints, ws.contacts, run.columns
     force_vectors(ws)
     for i in range(joints.shape[0]):
@@ -313,7 +316,7 @@ def fill_output(system: System, ws: Workspace, run: Run, out):
 
 @internal_kernel
 def fill_energies(system: System, ws: Workspace, run: Run, out):
-    """Write kinetic, potential and magnetic energy of the last sweep and its currents."""
+    """Write the kinetic, potential and magnetic energy at the state of the last sweep."""
     energy = run.columns.energy
     out[energy] = kinetic_energy(system.model, ws)
     out[energy + 1] = potential_energy(system.model, ws)
@@ -322,7 +325,7 @@ def fill_energies(system: System, ws: Workspace, run: Run, out):
 
 @internal_kernel
 def fill_drives(system: System, ws: Workspace, run: Run, out):
-    """Write currents, voltages and shaft torques of the motors, at the accelerations in ``out``."""
+    """Write the currents, voltages and shaft torques of the motors for the accelerations in ``out``."""
     joints, motors, motor, columns = ws.joints, ws.motors, system.drives.motor, run.columns
     for a in range(motors.shape[0]):
         i = system.drives.table[a, ka.DRIVEN]
@@ -340,10 +343,10 @@ def steady_torque(motor, motors, a, v):
 
 @internal_kernel
 def with_rotor(stepping: SteppingArrays | None, steady, inertial, a):
-    """Return the shaft torque of motor a at a constant rate, ``steady``, minus the torque of its rotor, ``inertial``.
+    """Return the shaft torque of motor a: ``steady``, at a constant rate, minus ``inertial``, which turns its rotor.
 
-    Recorded torques exclude impulses. In the steps of an impact, whose accelerations contain an impulse, the torque
-    stays as in the last step without one; at the start of a run it is ``steady``.
+    Recorded torques exclude impulses. In the steps of an impact, whose accelerations contain an impulse, the torque of
+    the last step without an impact is kept; at the start of a run it is ``steady``.
     """
     if stepping is None:  # resolved at compile time
         return steady - inertial
@@ -354,7 +357,7 @@ def with_rotor(stepping: SteppingArrays | None, steady, inertial, a):
 
 @internal_kernel
 def row_forces(unilateral: UnilateralArrays | None, stop, dry, tie):
-    """Write forces of joint stops, (s,), of dry friction, (d,), and of ties, (e,); the arrays may be longer."""
+    """Write the forces of joint stops, (s,), dry friction, (d,), and ties, (e,); the arrays may be longer."""
     if unilateral is None:  # resolved at compile time
         return
     for k in range(unilateral.stop.shape[0]):
@@ -378,7 +381,8 @@ def write_support(system: System, ws: Workspace, run: Run, row):
 # Projection of positions and rates onto the active constraint rows.
 
 
-# A tenth of the specified drift (1e-9 m), and a rate that adds less than this in one step [m, m/s; rad, rad/s].
+# Tolerances of projection [m, m/s; rad, rad/s]: a tenth of the specified drift (1e-9 m), and a rate that adds less than
+# this in one step.
 GAP_TOLERANCE = 1e-10
 RATE_TOLERANCE = 1e-8
 PROJECTION_LIMIT = 6
@@ -386,7 +390,7 @@ PROJECTION_LIMIT = 6
 
 @internal_kernel
 def off_surface(ws: Workspace):
-    """True if the state is off an active row by more than the projection tolerances."""
+    """Return whether the state violates an active row by more than the projection tolerances."""
     rows, active = ws.rows, ws.active
     row_errors(ws)
     for r in range(ws.counts[ka.ROWS]):
@@ -427,7 +431,7 @@ def project_level(system: System, ws: Workspace, y, level):
 
 @internal_kernel
 def settle(system: System, t, y, ws: Workspace, dy, run: Run):
-    """Evaluate the derivative at y, projecting y first if needed. Returns False if the rows cannot be met."""
+    """Evaluate the derivative at y, projecting y first if needed; return False if the rows cannot be satisfied."""
     derivative(system, t, y, ws, dy)
     run.count[EVALUATIONS] += 1
     for _ in range(PROJECTION_LIMIT):
@@ -441,12 +445,12 @@ def settle(system: System, t, y, ws: Workspace, dy, run: Run):
     return not off_surface(ws)
 
 
-# Dense output: the state anywhere within a step, and the samples of the record from it.
+# Dense output: the state at any time within a step, from which the samples of the record are computed.
 
 
 @internal_kernel
 def collocated(newton: NewtonArrays | None, j, whole):
-    """Return the quadratic and cubic coefficients of entry j of the cubic through y, stages and y + ``whole``."""
+    """Return the quadratic and cubic coefficients for entry j of the cubic through y, the stages and y + ``whole``."""
     if newton is None:  # resolved at compile time
         return 0.0, 0.0
     c0, c1 = NODE_RADAU[0], NODE_RADAU[1]
@@ -477,7 +481,7 @@ def fill_dense(run: Run):
 
 @internal_kernel
 def interpolate(run: Run, t, out):
-    """Write the state at time t from ``Run.dense`` to out, (m,); times beyond the end by rounding are clamped."""
+    """Write the state at time t from ``Run.dense`` to out, (m,); clamp times that are beyond the end by rounding."""
     d, x = run.dense, min((t - run.clock[TIME]) / run.clock[STEP], 1.0)
     z = 1.0 - x
     for j in range(out.shape[0]):
@@ -495,7 +499,7 @@ def state_within(run: Run, t, out):
 def sample_step(system: System, ws: Workspace, run: Run):
     """Record every sample time within the step from TIME to TIME + STEP, from the dense output.
 
-    Samples are projected as steps are, so that recorded gaps meet the same tolerance.
+    Samples are projected in the same way as steps, so that recorded gaps satisfy the same tolerance.
     """
     t, h = run.clock[TIME], run.clock[STEP]
     first = run.count[SAMPLE] + waiting_samples(run.newton)
@@ -515,7 +519,7 @@ def sample_step(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def write_sample(system: System, ws: Workspace, run: Run):
-    """Project and record the next sample, whose state is already there."""
+    """Project and record the next sample, whose state has already been computed."""
     s = run.count[SAMPLE]
     settle(system, run.sample_time[s], run.sample[s], ws, run.stage[7], run)
     write_output(system, ws, run, s)
@@ -524,16 +528,16 @@ def write_sample(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def sampled_now(run: Run):
-    """True if the last recorded sample is at TIME, apart from rounding."""
+    """Return whether the last recorded sample is at TIME, up to rounding."""
     s, t = run.count[SAMPLE] - 1, run.clock[TIME]
     return s >= 0 and abs(run.sample_time[s] - t) <= 1e-12 * max(1.0, abs(t))
 
 
 @internal_kernel
 def rewrite_sample(system: System, ws: Workspace, run: Run):
-    """Record the sample at TIME again, with the values from now on, after commands, loads or modes have jumped.
+    """Record the sample at TIME again after commands, loads or modes have jumped, with the values from now on.
 
-    Call right after a start: ``ws`` belongs to the present state, and still does afterwards.
+    Call this function right after a start: ``ws`` must belong to the present state, and still does afterwards.
     """
     if not sampled_now(run):
         return
@@ -546,19 +550,19 @@ def rewrite_sample(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def write_samples(newton: NewtonArrays | None, system: System, ws: Workspace, run: Run, more):
-    """Record ``more`` samples whose states are there; on lanes, up to three of them wait for the next ones."""
+    """Record ``more`` samples whose states are known; with SIMD lanes, up to three of them wait for later samples."""
     for _ in range(more):
         write_sample(system, ws, run)
 
 
 @internal_kernel
 def write_waiting(newton: NewtonArrays | None, system: System, ws: Workspace, run: Run):
-    """Record the samples that wait for others, because something other than a step comes next."""
+    """Record the samples that wait for later samples, because something other than a step comes next."""
 
 
 @internal_kernel
 def waiting_samples(newton: NewtonArrays | None):
-    """Return the number of samples whose states are there but not recorded yet."""
+    """Return the number of samples whose states are known but not yet recorded."""
     if newton is None:  # resolved at compile time
         return 0
     return newton.count[kn.WAITING]

@@ -1,4 +1,4 @@
-"""Error norm, first step and step-size control; tests for the end of a run and for lack of progress."""
+"""Error norm, first step and step-size control; checks for the end of a run and for lack of progress."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from dynsim.jit.kernel import inline_kernel, internal_kernel, kernel
 def error_norm(system: System, ws: Workspace, run: Run, error, slack):
     """Return the RMS of error / (atol + rtol |y|) over positions, rates and currents; quaternions count as angles.
 
-    The atol of rates and currents is ``slack`` times the atol of positions.
+    For rates and currents, atol is multiplied by ``slack``.
     """
     y, y_new, atol, rtol, layout = run.y, run.y_new, run.clock[ki.ATOL], run.clock[ki.RTOL], system.layout
     total, size = 0.0, layout.tracked
@@ -37,7 +37,7 @@ def error_norm(system: System, ws: Workspace, run: Run, error, slack):
 
 @internal_kernel
 def energy_norm(run: Run, j, error):
-    """Return the error of ledger integral j in a step, relative to the tolerance of its value and its change.
+    """Return the error of ledger integral j in a step, relative to the tolerance for its value and its change.
 
     If motors push against a fixed obstacle, only their power changes, and the error of the state does not show that.
     """
@@ -47,7 +47,7 @@ def energy_norm(run: Run, j, error):
 
 @kernel
 def finite(values):
-    """True if no element is NaN or infinite."""
+    """Return whether no element is NaN or infinite."""
     total = 0.0
     for j in range(values.shape[0]):
         total += values[j] * 0.0
@@ -56,7 +56,7 @@ def finite(values):
 
 @inline_kernel
 def finished(run: Run):
-    """True if the run has ended for any reason or was asked to; sets STATUS at END."""
+    """Return whether the run has ended for any reason or was asked to return; set STATUS at END."""
     end = run.clock[ki.END]
     if run.count[ki.STATUS] == ki.RUNNING and end - run.clock[ki.TIME] <= 1e-12 * max(1.0, end):
         run.count[ki.STATUS] = ki.FINISHED
@@ -65,9 +65,9 @@ def finished(run: Run):
 
 @internal_kernel
 def stalled(run: Run):
-    """Count one more trial; True, and STATUS, if the last MOST_TRIALS trials made almost no progress.
+    """Count one more trial; if the last MOST_TRIALS trials made almost no progress, set STATUS and return True.
 
-    This bounds every loop of steps, trials, events and restarts, whatever keeps it going.
+    This bounds every loop of steps, trials, events and restarts, whatever its cause.
     """
     clock, count = run.clock, run.count
     count[ki.TRIALS] += 1
@@ -83,11 +83,11 @@ def stalled(run: Run):
 
 @internal_kernel
 def first_step(system: System, ws: Workspace, run: Run):
-    """Return Hairer's first guess of the step size, which changes the state by a hundredth of its scale."""
+    """Return Hairer's initial step size, with which the state changes by a hundredth of its scale."""
     clock, y, k = run.clock, run.y, run.stage
     size, slope = 0.0, 0.0
     if system.layout.extra > 0:
-        # The guess must be the same for every attitude: only the rotation of a quaternion counts.
+        # The guess must not depend on the attitude, so only the rotation of a quaternion counts.
         for j in range(y.shape[0]):
             run.y_new[j] = y[j]
         size, slope = error_norm(system, ws, run, y, 1.0) ** 2, error_norm(system, ws, run, k[0], 1.0) ** 2
@@ -102,13 +102,13 @@ def first_step(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def choose_step(run: Run):
-    """Trim STEP so that END or a tick is met exactly; halve the remainder rather than leave a sliver at the end."""
+    """Trim STEP so that a step ends exactly at END or a tick; halve the rest if a sliver would remain."""
     clock = run.clock
     until = next_tick(run, clock[ki.END])
     remaining = until - clock[ki.TIME]
     run.count[ki.TRIMMED] = 1 if until < clock[ki.END] and remaining < 2.0 * clock[ki.STEP] else 0
     if run.method == ki.TIME_STEPPING:
-        # A remainder of a millionth of a step would turn the velocity jump of an impact into an acceleration.
+        # With a remainder of a millionth of a step, the velocity jump of an impact would become a huge acceleration.
         if remaining < clock[ki.STEP] * (1.0 + 1e-6):
             clock[ki.STEP] = remaining
     elif remaining <= clock[ki.STEP] * 1.0000001:
@@ -119,7 +119,7 @@ def choose_step(run: Run):
 
 @internal_kernel
 def rejected(ws: Workspace, run: Run, error, order):
-    """True if a step of this error norm must be repeated: shrinks STEP, or sets STATUS if it cannot shrink further."""
+    """Return whether a step with this error norm must be repeated; shrink STEP, or set STATUS if it cannot shrink."""
     clock, count, h = run.clock, run.count, run.clock[ki.STEP]
     if count[ki.STATUS] != ki.RUNNING:
         return True

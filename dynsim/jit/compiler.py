@@ -1,6 +1,6 @@
-"""Compiler pipeline of the kernels: numba's pipeline with changes that save compilation time; variants for SIMD lanes.
+"""Compiler pipeline for kernels: numba's pipeline with changes that reduce compilation time; variants for SIMD lanes.
 
-The changes avoid these costs of numba's pipeline:
+The changes avoid the following costs of numba's pipeline:
 
 - It stores every callee twice, as a separate library and as a copy in its caller, see :class:`_OwnCallees`.
 - It compiles a function again for each set of options of its callers, see :func:`register_part`.
@@ -48,7 +48,7 @@ from numba.core.typing.collections import NamedTupleClassAttribute
 from numba.core.typing.templates import infer, infer_global, make_callable_template, make_overload_template
 from numba.core.typing.typeof import typeof_impl
 
-# Struct types: named tuples in compiled code as memory blocks that are passed by address.
+# Struct types: in compiled code, named tuples are memory blocks that are passed by address.
 
 
 _BYTE, _WORD = llvm.IntType(8), llvm.IntType(64)
@@ -58,8 +58,8 @@ _ADDRESS = _BYTE.as_pointer()
 class Tables(types.NamedTuple):  # type: ignore[misc]
     """Type of a named tuple that is passed by its address.
 
-    Its name is short and does not list the fields: numba's name of a run has ten thousand letters, and is part of the
-    name of each function that takes one.
+    Its name is short and does not list the fields. numba's type name of a ``Run`` has ten thousand letters and is part
+    of the name of every function that has such a parameter.
     """
 
     def __init__(self, kinds: Iterable[Any], cls: type) -> None:
@@ -68,7 +68,7 @@ class Tables(types.NamedTuple):  # type: ignore[misc]
         self.fields = tuple(cls._fields)  # type: ignore[attr-defined]
         self.instance_class = cls
         digest = hashlib.sha256(repr([str(kind) for kind in self.types]).encode()).hexdigest()[:15]
-        self._hash = int(digest, 16)  # the same in every process: types are stored on disk with the kernels
+        self._hash = int(digest, 16)  # the same in every process, because types are stored on disk with the kernels
         types.Type.__init__(self, f"{cls.__name__}.{digest}")
 
     def __hash__(self) -> int:
@@ -79,7 +79,7 @@ class Tables(types.NamedTuple):  # type: ignore[misc]
 
 
 class _OfDynsim(ABC):  # noqa: B024
-    """Named-tuple classes of dynsim's modules, for ``typeof``; numba handles all other classes."""
+    """Named-tuple classes defined in dynsim, for registration with ``typeof``; numba handles all other classes."""
 
     @classmethod
     def __subclasshook__(cls, kind: type) -> bool:
@@ -93,7 +93,7 @@ def _typeof(value: Any, context: Any) -> Tables | None:
 
 
 def constructors(function: Callable[..., Any], typing: Any) -> None:
-    """Let kernels call the named-tuple classes of dynsim that a function names; other code uses numba's ones."""
+    """Let kernels call the dynsim named-tuple classes that a function uses; other code uses numba's constructors."""
     for name in function.__code__.co_names:
         cls = function.__globals__.get(name)
         if isinstance(cls, type) and issubclass(cls, _OfDynsim):
@@ -111,7 +111,7 @@ class _TablesClass(types.NamedTupleClass):  # type: ignore[misc]
 
 class _Constructor(NamedTupleClassAttribute):  # type: ignore[misc]
     def resolve___call__(self, kind: Any) -> Any:
-        if ConfigStack().top().nrt:  # not a kernel: kernels do not count references
+        if ConfigStack().top().nrt:  # the caller is not a kernel, because kernels do not count references
             return super().resolve___call__(kind)
         cls = kind.instance_class
 
@@ -124,7 +124,7 @@ class _Constructor(NamedTupleClassAttribute):  # type: ignore[misc]
 
 @registry.register_default(Tables)
 class _TablesModel(models.DataModel):  # type: ignore[misc]
-    """Data model: the value is the address of the block; as data it is the block itself, in whole words."""
+    """Data model: a value is the address of the block; stored data is the block itself, in whole words."""
 
     def __init__(self, dmm: Any, fe_type: Tables) -> None:
         super().__init__(dmm, fe_type)
@@ -175,7 +175,7 @@ class _TablesModel(models.DataModel):  # type: ignore[misc]
         return builder.bitcast(ptr, _ADDRESS)
 
     def traverse(self, builder: Any) -> list[tuple[Any, Any]]:
-        """Return the parts whose references numba counts; a variable not yet assigned has the null address."""
+        """Return the parts whose references numba counts; an unassigned variable has the null address."""
 
         def getter(value: Any, k: int) -> Any:
             nothing = cgutils.alloca_once(builder, llvm.ArrayType(_BYTE, self.size), zfill=True)
@@ -188,14 +188,14 @@ class _TablesModel(models.DataModel):  # type: ignore[misc]
         return self.parts
 
     def room(self, builder: Any) -> Any:
-        """Allocate a block in the frame of the function."""
+        """Allocate a block in the stack frame of the function."""
         with debuginfo.suspend_emission(builder), builder.goto_entry_block():
             block = builder.alloca(llvm.ArrayType(_BYTE, self.size))
             block.align = self.alignment
             return builder.bitcast(block, _ADDRESS)
 
     def copied(self, builder: Any, value: Any) -> Any:
-        """Return a copy of the block; null for null."""
+        """Return a copy of the block; the null address has no block and is returned unchanged."""
         block = self.room(builder)
         with builder.if_then(cgutils.is_not_null(builder, value)):
             cgutils.raw_memcpy(builder, block, value, _WORD(self.size), 1)
@@ -206,14 +206,14 @@ class _TablesModel(models.DataModel):  # type: ignore[misc]
         return builder.gep(value, [_WORD(self.starts[k])], inbounds=True) if self.starts[k] else value
 
     def part(self, builder: Any, value: Any, k: int) -> Any:
-        """Return part k of the tuple; for a nested tuple its address."""
+        """Return part k of the tuple, or its address if it is a nested tuple."""
         model, start = self.parts[k], self.start(builder, value, k)
         if isinstance(model, _TablesModel):
             return start
         kind = model.get_data_type()
         start = builder.bitcast(start, kind.as_pointer())
         if kind == model.get_value_type():
-            return builder.load(start)  # in one load, which LLVM may split
+            return builder.load(start)  # a single load, which LLVM may split
         return model.load_from_data_pointer(builder, start)
 
     def put(self, builder: Any, block: Any, k: int, value: Any) -> None:
@@ -233,7 +233,7 @@ def parts_of(context: Any, builder: Any, kind: Any, value: Any) -> list[Any]:
 
 
 def build_tuple(context: Any, builder: Any, kind: Tables, values: Sequence[Any]) -> Any:
-    """Build a named tuple of these parts in the frame of the function."""
+    """Build a named tuple from its parts in the stack frame of the function."""
     model = context.data_model_manager[kind]
     block = model.room(builder)
     for k, value in enumerate(values):
@@ -249,7 +249,7 @@ def _constructed(context: Any, builder: Any, sig: Any, args: Any) -> Any:
 
 
 class _Lower(Lower):  # type: ignore[misc]
-    """Lowering of numba, with constructors of :class:`Tables`, and copies of tables assigned in several places."""
+    """numba's lowering with constructors of :class:`Tables`, and copies of tables that are assigned more than once."""
 
     def _lower_call_normal(self, fnty: Any, expr: Any, signature: Any) -> Any:
         if isinstance(fnty, types.NamedTupleClass) and isinstance(signature.return_type, Tables):
@@ -265,11 +265,11 @@ class _Lower(Lower):  # type: ignore[misc]
         }
 
     def loadvar(self, name: str) -> Any:
-        """Copy the tuple, which must survive the next assignment."""
+        """Load a copy of the tuple, because its value must survive the next assignment."""
         return self._copied(super().loadvar(name), name)
 
     def storevar(self, value: Any, name: str, argidx: int | None = None) -> None:
-        """Copy the variable, which must survive the next tuple built in the same block."""
+        """Store a copy of the tuple, because it must survive the next tuple built in the same block."""
         super().storevar(self._copied(value, name), name, argidx)
 
     def _copied(self, value: Any, name: str) -> Any:
@@ -308,7 +308,7 @@ def _borrowed(context: Any, builder: Any, kind: Any, value: Any, k: int) -> Any:
 
 @unbox(Tables)
 def _unboxed(typ: Any, obj: Any, c: Any) -> Any:
-    """Unbox a tuple into a block part by part, as numba's ``unbox_tuple``; the class sets the number of parts."""
+    """Unbox a tuple into a block part by part, like numba's ``unbox_tuple``; its class defines the number of parts."""
     model, cleanups = c.context.data_model_manager[typ], []
     block, is_error = model.room(c.builder), cgutils.alloca_once_value(c.builder, cgutils.false_bit)
     for k, kind in enumerate(typ):
@@ -342,7 +342,8 @@ F = TypeVar("F", bound=Callable[..., Any])
 def packs_formulas() -> bool:
     """Return whether LLVM packs the scalar formulas of 3-vectors and wrenches into vector instructions.
 
-    A right-hand side then takes 8 % less time. numba leaves it off; the variable NUMBA_SLP_VECTORIZE has priority.
+    A right-hand side then takes 8 % less time. numba disables this by default; the environment variable
+    NUMBA_SLP_VECTORIZE takes precedence.
     """
     return bool(config.SLP_VECTORIZE) or "NUMBA_SLP_VECTORIZE" not in os.environ
 
@@ -350,13 +351,14 @@ def packs_formulas() -> bool:
 class _OwnCallees(JITCodeLibrary):
     """Machine code that calls only functions that it contains.
 
-    numba links a copy of every callee into its caller, optimises it again there, and gives all copies the same name:
-    which of them runs then depends on the code loaded earlier in the process, and so do the last bits of a result. As
-    internal functions the copies are private to a library, in the compiling process and in all that load it.
+    numba links a copy of every callee into its caller, optimises it again there, and gives all copies the same name.
+    The copy that runs, and thus the last bits of a result, would then depend on the code loaded earlier in the process.
+    As internal functions, the copies are private to a library, in the compiling process and in all processes that load
+    it.
     """
 
     def _optimize_functions(self, ll_module: Any) -> None:
-        """Do nothing yet: all functions are optimised at the end."""
+        """Do nothing, because all functions are optimised at the end."""
         ll_module.data_layout = self._codegen._data_layout
 
     def finalize(self) -> None:
@@ -374,7 +376,8 @@ class _OwnCallees(JITCodeLibrary):
     def serialize_using_object_code(self) -> tuple[str, str, tuple[bytes, bytes]]:
         """Return machine code and its symbol names for the cache, without the code for inlining into other kernels.
 
-        Parts serve that purpose, see :func:`as_part`; reading it back would take longer than a run of some seconds.
+        Parts serve that purpose, see :func:`as_part`. Reading this code back would take longer than a run of a few
+        seconds.
         """
         self._ensure_finalized()
         module, inside = self._final_module, (Linkage.internal, Linkage.private)
@@ -389,9 +392,9 @@ class _OwnCallees(JITCodeLibrary):
 
 
 class _LeanCompiler(Compiler):
-    """Compiler of numba without passes for features that kernels do not use.
+    """numba's compiler without the passes for features that kernels do not use.
 
-    These are closures, array expressions, ``with`` and loops over types.
+    These features are closures, array expressions, ``with`` and loops over types.
     """
 
     def define_pipelines(self) -> list[PassManager]:
@@ -423,13 +426,13 @@ _PASSES = (
 
 
 class KernelCompiler(_LeanCompiler):
-    """Compiler of kernels, into :class:`_OwnCallees`."""
+    """Compiler that compiles kernels into :class:`_OwnCallees`."""
 
     def compile_extra(self, func: Callable[..., Any]) -> Any:
         check_sources()
         self.state.library = _OwnCallees(self.state.targetctx.codegen(), func.__qualname__)
         self.state.library.enable_object_caching()
-        # All objects are still in use: garbage collection would free nothing and take an eighth of the time.
+        # All objects are still in use, so garbage collection would free nothing and take an eighth of the time.
         collecting = gc.isenabled()
         gc.disable()
         try:
@@ -442,9 +445,9 @@ class KernelCompiler(_LeanCompiler):
 
 @contextmanager
 def _quick_look_ups() -> Iterator[None]:
-    """Speed up two look-ups of numba, which take a quarter of the time, while a kernel is compiled.
+    """Speed up two of numba's look-ups, which take a quarter of the compilation time, while a kernel is compiled.
 
-    The result is the same. Other threads compile before or after, because numba holds its compiler lock meanwhile.
+    The result is the same. Other threads compile before or after this, because numba holds its compiler lock meanwhile.
     """
     replaced = (BaseFunction, "get_call_type", _remembered()), (ir.Inst, "_rec_list_vars", _variables)
     originals = [getattr(owner, name) for owner, name, _ in replaced]
@@ -458,10 +461,10 @@ def _quick_look_ups() -> Iterator[None]:
 
 
 def _remembered() -> Callable[..., Any]:
-    """Return ``get_call_type`` with a cache of operator signatures: numba tries some forty rules for each ``+``.
+    """Return ``get_call_type`` with a cache of operator signatures: numba tries about forty rules for each ``+``.
 
-    Only signatures found among numba's own are cached: functions compiled on demand (``max``) depend on the options of
-    their caller.
+    Only numba's own signatures are cached, because functions compiled on demand (such as ``max``) depend on the options
+    of their caller.
     """
     look_up, signatures = BaseFunction.get_call_type, {}
 
@@ -480,7 +483,7 @@ def _remembered() -> Callable[..., Any]:
 
 
 def _variables(self: Any, value: Any) -> list[ir.Var]:
-    """Return the variables in a value, in order; numba requests those of a whole function some forty times."""
+    """Return the variables in a value, in order; numba requests all variables of a function about forty times."""
     if isinstance(value, ir.Var):
         return [value]
     if isinstance(value, ir.Inst):
@@ -496,7 +499,7 @@ def _variables(self: Any, value: Any) -> list[ir.Var]:
     ]
 
 
-# Types in instructions other than variables.
+# Types that occur in instructions and are not variables.
 _PLAIN = {str, int, float, type(None), ir.Loc, ir.Const, ir.Global, ir.FreeVar, ir.Arg, type(ir.UNDEFINED), type(len)}
 
 
@@ -504,7 +507,7 @@ class _ToLink(JITCodeLibrary):
     """Code that is only linked into other libraries and optimised there; it never becomes machine code itself."""
 
     def finalize(self) -> None:
-        """Link nothing yet: the kernel links each part once."""
+        """Link nothing, because the kernel links each part once."""
         for library in self._linking_libraries:
             self._reload_init.update(library._reload_init)
         self._finalize_dynamic_globals()
@@ -536,14 +539,14 @@ class _ToCall(_ToLink):
     """Code as in :class:`_ToLink` that must not be inlined into its callers."""
 
     def add_llvm_module(self, ll_module: Any) -> None:
-        for function in ll_module.functions:  # only its functions; callees are linked later and may be inlined
+        for function in ll_module.functions:  # only this module's functions; callees are linked later, may be inlined
             if not function.is_declaration:
                 function.add_function_attribute("noinline")
         super().add_llvm_module(ll_module)
 
 
 class PartCompiler(_LeanCompiler):
-    """Compiler of parts, into :class:`_ToLink`."""
+    """Compiler that compiles parts into :class:`_ToLink`."""
 
     library = _ToLink
 
@@ -551,7 +554,7 @@ class PartCompiler(_LeanCompiler):
         self.state.library = self.library(self.state.targetctx.codegen(), func.__qualname__)
         self.state.flags.no_compile = True
         result = super().compile_extra(func)
-        # There is nothing to call: numba only needs an object of this kind.
+        # This entry is never called; numba only requires an object of this kind.
         entry = _dynfunc.make_function(
             result.fndesc.lookup_module(), func.__name__, "", 0, result.environment, (result.library,)
         )
@@ -560,21 +563,21 @@ class PartCompiler(_LeanCompiler):
 
 
 class NoInlineCompiler(PartCompiler):
-    """Compiler of parts, into :class:`_ToCall`."""
+    """Compiler that compiles parts into :class:`_ToCall`."""
 
     library = _ToCall
 
 
 def as_part(function: Callable[..., Any], options: Mapping[str, Any]) -> Any:
-    """Return numba's dispatcher of a function that is linked into its callers; LLVM decides whether to inline it."""
+    """Return a numba dispatcher for a function that is linked into its callers; LLVM decides whether to inline it."""
     return numba.njit(pipeline_class=PartCompiler, **{"forceinline": False, **options, **_NO_ENTRY})(function)
 
 
 def register_part(function: F, compiler: type[Compiler], options: Mapping[str, Any]) -> F:
-    """Register a function as a part and return it; kernels that call it link it in, compiled once per argument types.
+    """Register a function as a part and return it; kernels that call it link it, compiled once per set of types.
 
-    numba's ``register_jitable`` would compile it again for each set of options of its callers, and inherit from them
-    the options that are not set here (``forceinline``).
+    numba's ``register_jitable`` would compile the function again for each set of options of its callers, and the
+    function would inherit options that are not set here (``forceinline``) from its callers.
     """
 
     def implementation(*kinds: Any, **__: Any) -> Any:
@@ -589,12 +592,12 @@ def register_part(function: F, compiler: type[Compiler], options: Mapping[str, A
     return function
 
 
-# Parts with a variant, and the condition on argument types under which it is used.
+# Parts that have a variant, with the condition on the argument types under which the variant is used.
 _FORMS: dict[Callable[..., Any], tuple[Callable[..., Any], Callable[..., bool]]] = {}
 
 
 def form_of(function: Callable[..., Any], when: Callable[..., bool]) -> Callable[[F], F]:
-    """Use the decorated function instead of a registered part if ``when(*types of its arguments)`` is true."""
+    """Use the decorated function instead of a registered part if ``when(*argument types)`` is true."""
 
     def put(form: F) -> F:
         _FORMS[function] = form, when

@@ -1,8 +1,8 @@
-"""Decorators of compiled functions (``@kernel`` and its kinds), and the cache of their machine code on disk.
+"""Decorators for compiled functions (``@kernel`` and its variants), and the cache of their machine code on disk.
 
 The compiler pipeline is in dynsim.jit.compiler. The cache replaces numba's cache, which checks only the file of the
-function itself (after an edit of a callee in another file it would run old machine code) and does not detect damaged
-files, see :class:`_KernelCache`.
+function itself and does not detect damaged files; after an edit of a callee in another file, numba would run old
+machine code. See :class:`_KernelCache`.
 """
 
 from __future__ import annotations
@@ -35,18 +35,19 @@ from dynsim.jit.compiler import KernelCompiler, NoInlineCompiler, PartCompiler, 
 
 _OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract"}, "_nrt": False}
 
-# Packages whose functions are compiled into each other: an edit in one makes all compiled code stale.
+# Packages whose functions are compiled into each other; an edit in one of them makes all compiled code stale.
 _PACKAGES = tuple(Path(__file__).parents[1] / name for name in ("jit", "dynamics", "integrators", "snake"))
 
 F = TypeVar("F", bound=Callable[..., Any])
 
 
 class _KernelCache(_Cache):
-    """Machine code on disk, one file per function and signature: SHA-256 of the rest, then numba's own pickle.
+    """Machine code on disk, with one file per function and signature.
 
-    A file that is damaged or cannot be written costs a compilation, never the run: LLVM aborts the process on broken
-    machine code, so it is loaded only if its digest is right. Unlike numba's cache it does not load the compiler's
-    typing and lowering rules (0.4 s): machine code does not need them, and the compiler loads them when it runs.
+    A file contains the SHA-256 of its content, followed by numba's pickle. If a file is damaged or cannot be written,
+    the kernel is compiled again, and the run continues. LLVM would abort the process on broken machine code, so a file
+    is loaded only if its digest is correct. Unlike numba's cache, this cache does not load the compiler's typing and
+    lowering rules (0.4 s), because machine code does not need them; the compiler loads them when it runs.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
@@ -74,7 +75,7 @@ class _KernelCache(_Cache):
         return CompileResult._rebuild(target_context, *pickle.loads(payload))
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        if data.library.has_dynamic_globals:  # addresses of this process, present if NUMBA_OPT=0
+        if data.library.has_dynamic_globals:  # the code contains addresses of this process, as with NUMBA_OPT=0
             return
         path = self._path(sig, data.codegen)
         payload = serialize.dumps(data._reduce())
@@ -94,9 +95,9 @@ class _KernelCache(_Cache):
             _warn(f"{path}: cannot be saved ({error.strerror}); the next run compiles it again")
 
     def _path(self, sig: Any, codegen: Any) -> Path:
-        """Return a path that depends on processor, signature and numba settings.
+        """Return a path that depends on the processor, the signature and numba's settings.
 
-        For a function of another package it also depends on the source.
+        For a function of another package, it also depends on the source code.
         """
         source = Path(self._function.__code__.co_filename)
         content = b"" if _names_the_folder(source) else source.read_bytes()
@@ -113,7 +114,7 @@ class _KernelCache(_Cache):
 
 
 def _names_the_folder(source: Path) -> bool:
-    """Return whether the name of :func:`cache_folder` depends on this source already."""
+    """Return whether the name of :func:`cache_folder` already depends on this source file."""
     return any(source.is_relative_to(package) for package in _PACKAGES)
 
 
@@ -129,10 +130,10 @@ def _warn(text: str) -> None:
 def cache_folder() -> Path:
     """Return the folder of the compiled kernels; its name changes when its content becomes stale.
 
-    Only this user can write to it. It is in NUMBA_CACHE_DIR, XDG_CACHE_HOME, LOCALAPPDATA (Windows) or ~/.cache,
-    whichever is set first; if that fails, in the temporary directory; if other users can write there, a private folder
-    of this process. A new folder removes its neighbours that no process has used for :data:`UNUSED_S`; younger ones may
-    belong to a dynsim in another environment.
+    Only this user can write to the folder. It is in NUMBA_CACHE_DIR, XDG_CACHE_HOME, LOCALAPPDATA (Windows) or
+    ~/.cache, whichever is set first. If this fails, it is in the temporary directory; if other users can write there,
+    it is a private folder of this process. When a new folder is created, neighbouring folders that no process has used
+    for :data:`UNUSED_S` are removed; more recent ones may belong to dynsim in another environment.
     """
     digest = hashlib.sha256(f"{sys.version} {numba.__version__} {llvmlite.__version__} {np.__version__}".encode())
     for source in (file for package in _PACKAGES for file in sorted(package.rglob("*.py"))):
@@ -141,13 +142,13 @@ def cache_folder() -> Path:
     roots = [os.environ.get(variable) for variable in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME", "LOCALAPPDATA")]
     home = os.path.expanduser(next((root for root in roots if root), "~/.cache"))
     temporary = Path(tempfile.gettempdir(), f"cache-{_USER}")
-    # For a user without a home the tilde remains.
+    # For a user without a home directory, the tilde remains.
     for root in (temporary,) if home.startswith("~") else (Path(home), temporary):
         try:
             folder = (root / name).resolve()
             new = not folder.exists()
             _make_private(folder)
-            os.utime(folder)  # in use
+            os.utime(folder)  # mark the folder as in use
         except OSError as error:
             _warn(f"{root / name}: not used for compiled kernels: {error.strerror}")
             continue
@@ -160,18 +161,19 @@ def cache_folder() -> Path:
     return folder
 
 
-# None on Windows, whose files have no owner numbers.
+# None on Windows, where files do not have numeric user IDs.
 _USER = os.getuid() if hasattr(os, "getuid") else None
 
-# Kernels that no process has used for this time are removed [s]: 30 days.
+# Kernels that no process has used for this time [s], 30 days, are removed.
 UNUSED_S = 30 * 86400.0
 
 
 def _make_private(folder: Path) -> None:
     """Create the folder if needed; raise OSError if users other than this one and root can change its content.
 
-    Loading machine code executes it. A user who can write to a parent folder can replace the folder, unless the parent
-    is sticky. On systems without user numbers the folder is accepted: file modes do not show who can write to it.
+    Loading machine code executes it. A user who can write to a parent folder can replace the folder, unless the sticky
+    bit of the parent is set. On systems without numeric user IDs, the folder is accepted, because file modes do not
+    show who can write to it.
     """
     trusted = 0, _USER
     for part in (*reversed(folder.parents), folder):
@@ -180,17 +182,17 @@ def _make_private(folder: Path) -> None:
         if _USER is None:
             continue
         status = part.lstat()
-        # The user's own group and root's may write, other groups may not.
+        # The user's own group and the root group may have write access; other groups may not.
         writable = status.st_mode & (stat.S_IWOTH if status.st_gid in trusted else stat.S_IWOTH | stat.S_IWGRP)
         sticky = part != folder and status.st_mode & stat.S_ISVTX
         if not stat.S_ISDIR(status.st_mode) or status.st_uid not in trusted or (writable and not sticky):
-            raise OSError(errno.EPERM, f"others own {part} or can write to it")
+            raise OSError(errno.EPERM, f"another user owns {part} or can write to it")
     if not os.access(folder, os.W_OK | os.X_OK):
         raise OSError(errno.EACCES, os.strerror(errno.EACCES))
 
 
 def _remove_unused(folder: Path) -> None:
-    """Remove the neighbouring folders of kernels that have been unused for :data:`UNUSED_S`."""
+    """Remove neighbouring kernel folders that have been unused for :data:`UNUSED_S`."""
     with suppress(OSError):
         for other in folder.parent.iterdir():
             if re.fullmatch("[0-9a-f]{16}", other.name) and time.time() - other.lstat().st_mtime > UNUSED_S:
@@ -205,7 +207,7 @@ def _of_this_process() -> tempfile.TemporaryDirectory[str]:
 
 @contextmanager
 def on_compilation(report: Callable[[], None]) -> Iterator[None]:
-    """Call ``report`` once before a kernel that is not on disk is compiled in this process, which takes long."""
+    """Call ``report`` once before this process compiles a kernel that is not on disk, because this takes long."""
 
     def once() -> None:
         _listeners.remove(once)
@@ -225,27 +227,27 @@ _listeners: list[Callable[[], None]] = []
 def kernel(function: F) -> F:
     """Compile ``function`` on first call and store the machine code on disk.
 
-    Fast-math is limited to contraction (a·b + c in one rounding): reordering would let the compiler assume that there
-    are no NaNs, and NaN must stay NaN so that divergence is detected. ``error_model="numpy"``: a division by zero gives
-    inf or NaN and does not branch. Kernels allocate nothing, so numba's reference counting of arrays is switched off
-    (``_nrt``): its atomic operations cost a tenth of a right-hand side.
+    Fast-math is limited to contraction (a·b + c with one rounding). Full fast-math would let the compiler assume that
+    NaN does not occur, but NaN must be preserved so that divergence is detected. With ``error_model="numpy"``, a
+    division by zero gives inf or NaN and does not branch. Kernels do not allocate memory, so numba's reference counting
+    of arrays is switched off (``_nrt``); its atomic operations would cost a tenth of a right-hand side.
     """
     return _compile(function)
 
 
 def free_kernel(function: F) -> F:
-    """Compile as :func:`kernel`, and release the interpreter lock while it runs, so that other threads can run.
+    """Compile like :func:`kernel`, and release the interpreter lock during calls, so that other threads can run.
 
-    For long-running functions that only Python calls: see dynsim.engine.stopping.
+    This decorator is for long-running functions that only Python calls; see dynsim.engine.stopping.
     """
     return _compile(function, nogil=True)
 
 
 def inline_kernel(function: F) -> F:
-    """Compile as :func:`kernel`, for callers of the right-hand side: inlined into their caller before compilation.
+    """Compile like :func:`kernel`, and inline the function into its caller before compilation.
 
-    A compiled function includes the code of all its callees, so each extra level would compile the right-hand side
-    again.
+    This decorator is for functions that call the right-hand side. A compiled function includes the code of all its
+    callees, so each additional level would compile the right-hand side again.
     """
     return _compile(function, inline="always")
 
@@ -259,17 +261,19 @@ def internal_kernel(function: F) -> F:
 
 
 def noinline_kernel(function: F) -> F:
-    """Compile as :func:`internal_kernel`, for functions rarely called from the right-hand side: never inlined.
+    """Compile like :func:`internal_kernel`, but never inline the function into its callers.
 
-    Inlined, it would occupy registers of the code that runs every time.
+    This decorator is for functions that the right-hand side rarely calls. If they were inlined, they would occupy
+    registers of the code that runs every time.
     """
     return register_part(function, NoInlineCompiler, _OPTIONS)
 
 
 def exact_kernel(function: F) -> F:
-    """Compile as :func:`internal_kernel`, with every product rounded, for functions inlined in several places.
+    """Compile like :func:`internal_kernel`, but round every product.
 
-    Which products of a sum are contracted depends on the place, and so would the last bits of the result.
+    This decorator is for functions that are inlined in several places. The products of a sum that the compiler
+    contracts depend on the place, and so would the last bits of the result.
     """
     return register_part(function, PartCompiler, {**_OPTIONS, "fastmath": False, "forceinline": True})
 
@@ -277,8 +281,8 @@ def exact_kernel(function: F) -> F:
 class FixedSignature:
     """Kernel that is called repeatedly with arguments of the same types as in the first call.
 
-    Numba checks the types of all arguments in each call; for a hundred tables that takes as long as many kernels do.
-    Here nothing is checked: an array of another type would be misread.
+    Numba checks the types of all arguments in each call; for a hundred tables, this takes as long as running many
+    kernels. This class does not check types, so an array of another type would be misread.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
@@ -295,7 +299,7 @@ def _compile(function: F, **options: Any) -> F:
     compiled = numba.njit(pipeline_class=KernelCompiler, no_cfunc_wrapper=True, **_OPTIONS, **options)(function)
     if not config.DISABLE_JIT:
         compiled._cache = _KernelCache(function)
-        if not options:  # other kernels include it: they need no separate entry
+        if not options:  # other kernels include this function and do not need a separate entry
             part = as_part(function, _OPTIONS)
             compiled.get_call_template, compiled.get_overload = part.get_call_template, part.get_overload
     return compiled
@@ -308,10 +312,10 @@ def every(mask):
 
 
 def reals(values: Any) -> np.ndarray:
-    """Return the canonical float array of every kernel argument: float64, C order, writable, a copy."""
+    """Return a copy of ``values`` as a float array for kernels: float64, in C order, writable."""
     return np.array(values, dtype=np.float64, order="C")
 
 
 def integers(values: Any) -> np.ndarray:
-    """Return the canonical integer array of every kernel argument: int64, C order, writable, a copy."""
+    """Return a copy of ``values`` as an integer array for kernels: int64, in C order, writable."""
     return np.array(values, dtype=np.int64, order="C")

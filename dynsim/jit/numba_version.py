@@ -1,9 +1,9 @@
-"""Parts of numba that dynsim replaces in its own compilations, and the numba version for which this was written.
+"""Parts of numba that dynsim replaces in its own compilations, and the numba version for which it replaces them.
 
-The replaced internals of another numba version could give wrong machine code without an error. Another minor version is
-therefore rejected when this module is imported, before numba's internals are imported; changed source of a replaced
-part is rejected before a kernel is compiled. After a review of such changes, ``python -m dynsim.jit.numba_version``
-prints the new table.
+With another numba version, the replacements could produce wrong machine code without an error. Another minor version is
+therefore rejected when this module is imported, before numba's internals are imported; a change in the source of a
+replaced part is rejected before a kernel is compiled. After a review of such changes,
+``python -m dynsim.jit.numba_version`` prints the new table.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ REPLACED = {
 
 
 def source_hash(name: str) -> str:
-    """Return the first 32 digits of the SHA-256 of the source of a function or getter of numba; empty if not found."""
+    """Return the first 32 digits of the SHA-256 of the source of a numba function or property; empty if not found."""
     try:
         function = pkgutil.resolve_name(name)
         source = inspect.getsource(getattr(function, "fget", function))
@@ -65,12 +65,12 @@ def source_hash(name: str) -> str:
 
 @cache
 def check_sources() -> None:
-    """Check the parts of numba that are replaced.
+    """Check that the replaced parts of numba are unchanged.
 
     Raises
     ------
     ImportError
-        If a part differs from the version for which this was written.
+        If a part differs from the numba version for which the replacements were written.
     """
     for name, digest in REPLACED.items():
         if source_hash(name) != digest:

@@ -28,23 +28,23 @@ INT32 = ir.IntType(32)
 
 
 class Lanes(types.Type):
-    """N doubles."""
+    """Compiler type of N doubles, one per lane."""
 
     def __init__(self, count: int) -> None:
         self.lanes = count
         super().__init__(name=f"Lanes({count})")
 
     def unify(self, typingctx: Any, other: Any) -> Any:
-        """Return lanes for a variable that is first a number and later lanes."""
+        """Return the lanes type for a variable that is first assigned a number and later lanes."""
         return self if isinstance(other, (types.Float, types.Integer)) else None
 
     def can_convert_from(self, typingctx: Any, other: Any) -> Any:
-        """Allow a number to be converted to equal lanes."""
+        """Allow the conversion of a number to lanes that all contain it."""
         return Conversion.unsafe if isinstance(other, (types.Float, types.Integer)) else None
 
 
 class Mask(types.Type):
-    """N booleans."""
+    """Compiler type of N booleans, one per lane."""
 
     def __init__(self, count: int) -> None:
         self.lanes = count
@@ -68,7 +68,7 @@ def _vector(count: int) -> ir.VectorType:
 
 
 def spread(context: Any, builder: Any, value: Any, kind: Any, count: int) -> Any:
-    """Return a value as lanes: itself, or a number in all of them."""
+    """Return a value as lanes: the value itself, or lanes that all contain a number."""
     if isinstance(kind, Lanes):
         return value
     vector = _vector(count)
@@ -84,7 +84,7 @@ def _cast(context: Any, builder: Any, kind: Any, to: Lanes, value: Any) -> Any:
 
 
 def lanes_of(*kinds: Any) -> int:
-    """Return the lane count of the first of these types that has lanes; tuples and arrays have those of their parts."""
+    """Return the lane count of the first type that has lanes; tuples and arrays have the lanes of their parts."""
     for kind in kinds:
         lanes = getattr(kind, "lanes", 0)
         if not lanes and isinstance(kind, types.Array):
@@ -97,7 +97,7 @@ def lanes_of(*kinds: Any) -> int:
 
 
 def _operation(function: Any, result: Callable[[int], types.Type], emit: Callable[..., Any]) -> None:
-    """Define ``function`` for lanes, and for lanes and numbers; ``emit(builder, count, *vectors)``."""
+    """Define ``function`` for lanes, and for lanes mixed with numbers, by ``emit(builder, count, *vectors)``."""
 
     class Template(AbstractTemplate):
         key = function
@@ -173,14 +173,14 @@ for _function, _name in ((math.sqrt, "sqrt"), (np.rint, "rint"), (np.floor, "flo
     _operation(_function, Lanes, _llvm(_name))
 _operation(operator.neg, Lanes, lambda builder, count, a: builder.fsub(ir.Constant(_vector(count), [-0.0] * count), a))
 _operation(operator.pow, Lanes, lambda builder, count, a, b: _call(builder, count, "pow", a, b))
-# As numba does for numbers, which defines the treatment of NaN.
+# These definitions treat NaN as numba does for numbers.
 _operation(min, Lanes, lambda builder, count, a, b: builder.select(builder.fcmp_ordered("<", b, a), b, a))
 _operation(max, Lanes, lambda builder, count, a, b: builder.select(builder.fcmp_ordered(">", b, a), b, a))
 
 
 @intrinsic
 def select(typingctx: Any, mask: Any, a: Any, b: Any) -> Any:
-    """Return lanes of a where the mask is true, of b elsewhere; numbers fill all lanes."""
+    """Return, for each lane, a if the mask is true and b otherwise; a number counts as equal lanes."""
     result = Lanes(mask.lanes)
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:

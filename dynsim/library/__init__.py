@@ -1,1 +1,1 @@
-"""Types that a scenario selects with `type`: plants, motors, surfaces, controllers, paths."""
+"""Types that a scenario can select with `type`: plants, motors, surfaces, controllers and paths."""

@@ -1,9 +1,10 @@
 """Families of types that a scenario selects with ``type``: modules of dynsim or of plug-ins.
 
-``type: snake`` of a plant is the module ``dynsim.library.plants.snake``, or else the entry point ``snake`` in the group
-``dynsim.plants`` of an installed package. No other registry exists. Entry points are searched only if dynsim has no
-member with that name (a search takes milliseconds with few packages installed, more with many), and a plug-in is
-imported only when a scenario uses it; ``dynsim list``, ``dynsim schema`` and ``dynsim check`` import all plug-ins.
+For a plant, ``type: snake`` selects the module ``dynsim.library.plants.snake`` or, if there is no such module, the
+entry point ``snake`` in the group ``dynsim.plants`` of an installed package. No other registry exists. Entry points are
+searched only if dynsim has no member with that name; a search takes milliseconds with few packages installed and longer
+with many. A plug-in is imported only when a scenario uses it; ``dynsim list``, ``dynsim schema`` and ``dynsim check``
+import all plug-ins.
 """
 
 from __future__ import annotations
@@ -115,7 +116,7 @@ def faults() -> list[str]:
 
 
 def libraries() -> dict[str, str]:
-    """Return the distributions of the imported plug-ins with their versions."""
+    """Return the versions of the distributions that contain the imported plug-ins."""
     points = [_entry_points(family)[name][0] for family, name in _imported]
     return dict(sorted((p.dist.name, p.dist.version) if p.dist else (p.value, "unknown") for p in points))
 
@@ -148,7 +149,8 @@ def build(family: str, config: Any, context: BuildContext, expected: type[T] | U
     Raises
     ------
     ModelError
-        If the member rejects the configuration or returns another type, or the ``build`` of a plug-in fails.
+        If the member rejects the configuration or returns an object of another type, or if a plug-in's ``build``
+        fails.
     """
     module = member(family, config.type)
     try:
@@ -213,12 +215,12 @@ def _unusable(family: str, point: EntryPoint, reason: str) -> str:
 
 
 def _title(point: EntryPoint) -> str:
-    """Return name and version of an entry point's distribution."""
+    """Return the name and version of an entry point's distribution."""
     return f"{point.dist.name} {point.dist.version}" if point.dist else point.value
 
 
 def _defect(module: Any, family: str, name: str) -> str:
-    """Return why a module cannot be a member with this name, or "" if it can."""
+    """Return the reason why a module cannot be a member with this name, or "" if it can."""
     if not isinstance(module, ModuleType):
         return "is not a module; the entry point must refer to a module"
     config, build_ = getattr(module, "Config", None), getattr(module, "build", None)
@@ -232,7 +234,7 @@ def _defect(module: Any, family: str, name: str) -> str:
     try:
         inspect.signature(build_).bind(None, None)
     except (TypeError, ValueError):
-        return "has a build that does not accept (config, context)"
+        return "has a function build that does not accept (config, context)"
     for text in FAMILIES[family]:
         if not isinstance(getattr(module, text, None), str):
             return f'has no string {text}, such as "dynamics"'
@@ -268,7 +270,7 @@ class MemberField:
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
         return core_schema.no_info_plain_validator_function(
             self._validate,
-            # Serialize each value by its class: the schema does not contain the classes of plug-ins.
+            # Serialize each value with its own class, because the schema does not contain the classes of plug-ins.
             serialization=core_schema.wrap_serializer_function_ser_schema(_dump, schema=core_schema.any_schema()),
         )
 
@@ -298,7 +300,7 @@ def _validator(family: str, names: tuple[str, ...]) -> SchemaValidator:
 
 def _tagged(configs: Mapping[str, type[StrictConfig]]) -> core_schema.CoreSchema:
     for config in configs.values():
-        config.model_rebuild()  # schemas are built on first use
+        config.model_rebuild()  # build the schema, which is otherwise built on first use
     choices = {name: config.__pydantic_core_schema__ for name, config in configs.items()}
     return core_schema.tagged_union_schema(choices, discriminator="type", from_attributes=True)
 

@@ -1,1 +1,1 @@
-"""Descriptions of machines in SI units: bodies, joints, drives, surfaces, contacts; URDF in and out, MJCF out."""
+"""Machines in SI units: bodies, joints, drives, surfaces, contacts; URDF import, URDF and MJCF export."""

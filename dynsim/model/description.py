@@ -1,9 +1,10 @@
 """Bodies, joints, frames, contacts, couplings, ties, loads and the robot as plain frozen data in SI units.
 
-Drives: :mod:`dynsim.model.drives`, surfaces: :mod:`dynsim.model.surfaces`.
+Drives are in :mod:`dynsim.model.drives`, surfaces in :mod:`dynsim.model.surfaces`.
 
-A :class:`Robot` is a tree of :class:`Link`; each link is one joint and the body it carries. Frames: the body's frame B
-moves with the joint; at q = 0 it is the joint frame J, placed in the parent's body frame by ``R_PJ`` and ``p_PJ``.
+A :class:`Robot` is a tree of :class:`Link`; each link is one joint and the body it carries. The body's frame B moves
+with the joint. At q = 0 it coincides with the joint frame J, whose pose in the parent's body frame is ``R_PJ`` and
+``p_PJ``.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ class Inertia:
     com : (3,) ndarray
         Centre of mass in B [m].
     tensor : (3, 3) ndarray
-        Inertia about the centre of mass, axes of B [kg m²].
+        Inertia tensor about the centre of mass, in the axes of B [kg m²].
     """
 
     mass: float
@@ -52,12 +53,12 @@ class Inertia:
 
     @classmethod
     def solid_sphere(cls, mass: float, radius: float, center: Array) -> Inertia:
-        """Return a sphere about ``center``: I = 2 m r²/5; a point mass if the radius is zero."""
+        """Return a solid sphere about ``center``: I = 2 m r²/5; a point mass if the radius is zero."""
         return cls(mass, center, np.eye(3) * (0.4 * mass * radius**2))
 
     @classmethod
     def solid_cylinder(cls, mass: float, radius: float, length: float) -> Inertia:
-        """Return a cylinder along +z from the frame's origin: I_x = I_y = m (3 r² + l²)/12, I_z = m r²/2."""
+        """Return a solid cylinder along +z from the frame's origin: I_x = I_y = m (3 r² + l²)/12, I_z = m r²/2."""
         side = mass * (3.0 * radius**2 + length**2) / 12.0
         return cls(mass, vector(0.0, 0.0, 0.5 * length), np.diag([side, side, 0.5 * mass * radius**2]))
 
@@ -83,13 +84,13 @@ class Inertia:
     def check(self, name: str) -> None:
         """Raise :class:`ModelError` unless a real body can have these mass properties.
 
-        Files have rounded moments, and rotations round them again: errors count as zero if they are below 1e-9 of the
-        largest moment, or below the moment of the mass at one micrometre from its centre.
+        Moments in files are rounded, and rotations add rounding errors. Violations are therefore ignored if they are
+        below 1e-9 of the largest moment, or below the moment of the mass at a distance of one micrometre.
         """
         if not (np.isfinite(self.mass) and self.mass >= 0.0):
             raise ModelError(f"{name}: mass {self.mass} kg must be zero or positive")
         small = 1e-12 * self.mass
-        # Written so that NaN fails too.
+        # The condition is written so that NaN also fails.
         if not np.abs(self.tensor - self.tensor.T).max() <= 1e-9 * np.abs(self.tensor).max() + small:
             raise ModelError(f"{name}: the inertia tensor must be symmetric")
         moments = np.linalg.eigvalsh(self.tensor)
@@ -120,21 +121,25 @@ class Link:
     damping : float
         Viscous loss D of the joint [N m s/rad or N s/m].
     friction : float
-        Dry friction of the bearing, which also holds it at rest [N m or N]; unilateral law only.
+        Dry friction of the bearing, which can also hold the joint at rest [N m or N]; unilateral law only.
     lower, upper, velocity_limit, effort_limit : float
-        Limits of the joint [rad or m; rad/s or m/s; N m or N]. They are not enforced: a run that exceeds one warns.
+        Limits of the joint [rad or m; rad/s or m/s; N m or N]. They are not enforced; a run that exceeds a limit causes
+        a warning.
     parameter : float
-        Extra parameter of some kinds of joint.
+        Additional parameter that some kinds of joint require.
     armature : float
-        Inertia that only turns with the joint, in addition to its motor's inertia [kg m² or kg].
+        Inertia that turns only with the joint, in addition to the inertia of its motor [kg m² or kg].
     joint_of_rows : str or None
         Name of the joint with several rows to which this row belongs; None for a joint with one row.
     radius : float
-        Radius of a cylinder about the body's axis [m], zero if unknown; a run warns if a surface is penetrated deeper.
+        Radius of a cylinder about the body's axis [m], zero if unknown. A run warns if the axis is deeper below a
+        surface.
     tip : (3,) ndarray or None
-        Other end of the axis in B [m], starting at the joint; None: the joints that the body carries, and the hand.
+        End point of the body's axis in B [m]; the axis starts at the joint. None: the axis ends at the joints that the
+        body carries, or at the hand.
     shapes : tuple of Shape
-        Visual shapes of the body, in B; empty: a cylinder about its axis, if ``radius`` and ``tip`` are known.
+        Visual shapes of the body, in B. If empty, a cylinder about its axis is drawn if ``radius`` and ``tip`` are
+        known.
     """
 
     name: str
@@ -173,7 +178,7 @@ class Link:
 
     @property
     def geometry(self) -> tuple[str, str | None, str, Array, Array, Array, float, Array | None]:
-        """Everything that determines position and reach of the body, without its mass."""
+        """Everything that determines the position and extent of the body, without its mass."""
         return self.name, self.parent, self.kind, self.axis, self.R_PJ, self.p_PJ, self.radius, self.tip
 
     @property
@@ -183,7 +188,7 @@ class Link:
 
     @property
     def coordinates(self) -> tuple[str, ...]:
-        """Names of the coordinates that begin with this row: all coordinates of the joint; none for a later row."""
+        """Names of all coordinates of the joint if this is its first row; empty for a later row."""
         row = self.row
         return tuple(f"{self.joint_of_rows}.{name}" for name in row.names) or (self.joint,) * len(row.neutral)
 
@@ -194,7 +199,7 @@ def without_body(link: Link) -> Link:
 
 
 def in_rows(link: Link, rows: Sequence[tuple[str, str, Array]]) -> tuple[Link, ...]:
-    """Return a joint of several rows, (suffix, kind, axis); the last carries the body of ``link``, others no mass."""
+    """Return a joint of several rows, (suffix, kind, axis); only the last row carries the body of ``link``."""
     made: list[Link] = []
     for suffix, kind, axis in rows:
         turned = np.asarray(axis, dtype=np.float64)
@@ -209,7 +214,7 @@ def in_rows(link: Link, rows: Sequence[tuple[str, str, Array]]) -> tuple[Link, .
 
 @dataclass(frozen=True)
 class Frame:
-    """Named frame fixed on a body, such as a tool flange: rotation and origin in the body's frame.
+    """Named frame that is fixed to a body, such as a tool flange: rotation and origin in the body's frame.
 
     ``body`` is None for a frame fixed to the world: it has a name, but no moving part can be attached to it.
     """
@@ -231,19 +236,19 @@ class Contact:
     friction : float
         Kinetic coefficient μ.
     slip_smoothing : float
-        v_s [m/s] of the direction v_t/√(v_t² + v_s²); bilateral law only.
+        Speed v_s [m/s] in the smoothed slip direction v_t/√(v_t² + v_s²); bilateral law only.
     pulling_friction : str
-        "signed" (f_t = μ f_n as [WM] prints it) or "dissipative" (f_t = μ |f_n|); bilateral law only.
+        "signed" (f_t = μ f_n as printed in [WM]) or "dissipative" (f_t = μ |f_n|); bilateral law only.
     static_friction : float or None
-        Coefficient μ_s at rest; None: μ. This and all following attributes: unilateral law only.
+        Static coefficient μ_s; None: μ. This and all following attributes apply only to the unilateral law.
     stribeck : float
-        Speed [m/s] of μ + (μ_s − μ) exp(−(v/v_s)²); 0: μ as soon as it slips.
+        Stribeck speed v_s [m/s] in μ + (μ_s − μ) exp(−(v/v_s)²); 0: the coefficient is μ as soon as the point slips.
     viscous_friction : float
-        Increase of the coefficient with speed [s/m].
+        Increase of the friction coefficient with slip speed [s/m].
     restitution : float
-        Ratio of normal speeds after and before an impact.
+        Ratio of the normal speeds after and before an impact.
     grip_axis : (3,) ndarray or None
-        Axis in the body's frame along which friction is ``grip`` times the friction across; time stepping only.
+        Axis in the body's frame along which friction is ``grip`` times the friction across it; time stepping only.
     stiffness, damping : float
         Stiffness and damping of body and surface along the normal [N/m, N s/m], 0: rigid; time stepping only.
     radius : float
@@ -252,7 +257,7 @@ class Contact:
         Other end of a capsule's axis, in the same frame [m]. If the surface curves away from the free side, the nearest
         point of the axis touches, otherwise ``point``.
     left_out : bool
-        No joint moves it along the normal in any posture, so that it never touches.
+        True if no joint moves the point along the normal in any posture, so that it never touches.
     """
 
     name: str
@@ -282,7 +287,7 @@ class Contact:
 
     @property
     def geometry(self) -> tuple[str, str, Array, Surface, float, Array | None]:
-        """Everything that determines its location and the surface that it can touch, without its law."""
+        """Everything that determines the location of the contact and the surface that it can touch, without its law."""
         return self.name, self.body, self.point, self.surface, self.radius, self.tip
 
 
@@ -290,8 +295,8 @@ class Contact:
 class Foot:
     """Sphere of a body that can touch a surface of the scenario, independent of the declared contact points.
 
-    On a body that spins about the centre of the sphere it is a wheel: the touching point belongs to the sphere, so it
-    rolls.
+    On a body that spins about the centre of the sphere, the foot is a wheel: the touching point belongs to the sphere,
+    so the sphere rolls.
 
     Attributes
     ----------
@@ -302,7 +307,7 @@ class Foot:
     surface : str
         Name of the surface in the scenario.
     grip_axis : (3,) ndarray or None
-        Axis in the body's frame without friction along it, as for a wheel without mass.
+        Axis in the body's frame along which there is no friction, as for a massless wheel.
     """
 
     name: str
@@ -315,9 +320,9 @@ class Foot:
 
 @dataclass(frozen=True)
 class Coupling:
-    """Joint that follows another one, q = ratio q_leader + offset: a gear, a belt, a URDF mimic joint.
+    """Joint that follows another joint, q = ratio q_leader + offset: a gear, a belt or a URDF mimic joint.
 
-    It is an exact constraint without losses, with any force that it needs.
+    It is an exact, lossless constraint whose force is not limited.
     """
 
     joint: str
@@ -330,9 +335,10 @@ class Coupling:
 class Tie:
     """One direction in which two bodies are connected by a spring, a damper and a bound; time stepping only.
 
-    The force on ``body``, along the axis or about it, and its opposite on ``other`` is f = −k (x − x_0) − c dx/dt
-    within its bound, x = axis · (point − other point), or the part along the axis of the rotation of ``body`` relative
-    to ``other``. Beyond the bound x_0 moves. The bodies may belong to different trees; ``other`` may be the world.
+    The force or torque on ``body``, along or about the axis, is f = −k (x − x_0) − c dx/dt within its bound; the
+    opposite force acts on ``other``. x = axis · (point − other point), or the component along the axis of the rotation
+    of ``body`` relative to ``other``. Beyond the bound, x_0 moves. The bodies may belong to different trees; ``other``
+    may be the world.
 
     Attributes
     ----------
@@ -341,19 +347,19 @@ class Tie:
     axis : (3,) ndarray
         Axis in the frame of ``body``.
     stiffness, damping : float
-        k, c [N/m, N s/m; N m/rad, N m s/rad].
+        Stiffness k and damping c [N/m, N s/m; N m/rad, N m s/rad].
     bound : float
-        Largest force [N or N m].
+        Maximum force or torque [N or N m].
     turns : bool
-        The tie acts about the axis, not along it.
+        True if the tie acts about the axis, not along it.
     pushes : bool
-        One-sided: it only pushes ``body`` along the axis, without a bound.
+        True for a one-sided tie, which only pushes ``body`` along the axis, without a bound.
     rest : float
-        x_0 [m or rad]; NaN: x when the tie begins.
+        x_0 [m or rad]; NaN: the value of x when the tie begins.
     attitude : (3, 3) ndarray
-        Rotation of ``other`` in the axes of ``body`` without deflection, for a torsion whose rest is a number.
+        Rotation of ``other`` in the axes of ``body`` without deflection, for a torsional tie with a numeric rest value.
     holds : bool
-        Active from the start.
+        True if the tie is active from the start.
     """
 
     name: str
@@ -387,7 +393,7 @@ class Load:
     knots : (K + 1,) ndarray
         Increasing times [s].
     coefficients : (K, 6, 4) ndarray
-        Ascending powers of t - knots[k], force x, y, z [N], then torque x, y, z [N m].
+        Coefficients of ascending powers of t - knots[k], for force x, y, z [N], then torque x, y, z [N m].
     hold : bool
         Whether the first and last values are held outside the knots; otherwise the load is zero there.
     """
@@ -429,7 +435,7 @@ class Robot:
     q0 : (nq,) ndarray or None
         Initial configuration [rad or m]; None: zero.
     frames : tuple of Frame
-        Further names to which points can be attached.
+        Additional named frames to which points can be attached.
     fixed_shapes, fixed_inertia : tuple of Shape, Inertia
         Shapes and mass of the parts fixed to the world.
     couplings : tuple of Coupling
@@ -437,11 +443,11 @@ class Robot:
     ties : tuple of Tie
         Ties between bodies.
     base : MobileBase or None
-        Mobile base; None: the robot is fixed or floats.
+        Mobile base; None if the robot is fixed or floats.
     feet : tuple of Foot
         Parts designed to touch surfaces, such as wheels.
     hand_frame : (3, 3) ndarray
-        Axes of the frame named for the hand, whose orientation is controlled, in the axes of its body.
+        Axes of the hand's frame, whose orientation is controlled, in the axes of the body that carries the hand.
     """
 
     name: str
@@ -460,7 +466,7 @@ class Robot:
     hand_frame: Array = field(default_factory=lambda: np.eye(3))
 
     def holding(self, name: str) -> list[Tie]:
-        """Return the ties by which a gripper of the robot can hold the named object: none."""
+        """Return the ties by which a gripper of the robot can hold the named object; empty without a gripper."""
         return []
 
     @property
@@ -470,7 +476,7 @@ class Robot:
 
     @property
     def bodies(self) -> tuple[str, ...]:
-        """Names of the links that carry a body, in their order."""
+        """Names of the links that carry a body, in the order of the links."""
         carriers = self.carriers
         return tuple(link.name for link in self.links if link.name not in carriers)
 
@@ -483,7 +489,7 @@ class Robot:
         )
 
     def attach(self, name: str, point: Array) -> tuple[int, Array]:
-        """Return the index of a body, given its name or a frame's name, and a point of that frame in its axes [m].
+        """Return the index of a body, given its name or the name of a frame, and a point of the frame in body axes [m].
 
         Raises
         ------
@@ -499,7 +505,7 @@ class Robot:
         return np.eye(3) if frame is None else frame.R
 
     def tree_of(self, body: str) -> NDArray[np.bool_]:
-        """Return a mask, (n,), of the links in the tree of ``body``: the same ancestor is attached to the world."""
+        """Return a mask, (n,), of the links in the same tree as ``body``: they have the same ancestor on the world."""
         roots: dict[str, str] = {}
         for link in self.links:
             roots[link.name] = link.name if link.parent is None else roots[link.parent]
@@ -527,13 +533,16 @@ class Robot:
         return self.configuration({}) if self.q0 is None else np.asarray(self.q0, dtype=np.float64)
 
     def configuration(self, positions: Mapping[str, float]) -> Array:
-        """Return coordinates [rad or m], (nq,): given values by joint, followers from their leaders, others neutral."""
+        """Return coordinates [rad or m], (nq,), from values by joint.
+
+        Followers follow their leaders; all other joints are neutral.
+        """
         leads = {coupling.joint: coupling for coupling in self.couplings if coupling.joint not in positions}
         q = np.array([value for link in self.links for value in link.row.neutral])
 
         def position(joint: str) -> float:
             chain: list[Coupling] = []
-            # A cycle of couplings has no position; compilation refuses it.
+            # A cycle of couplings determines no position; compilation rejects it.
             while joint in leads and len(chain) <= len(leads):
                 chain.append(leads[joint])
                 joint = chain[-1].leader

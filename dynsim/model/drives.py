@@ -16,7 +16,7 @@ from dynsim.dynamics.drive import law as law
 
 Array = NDArray[np.float64]
 SMOOTHING = 1e-2
-"""Default of the speed below which smoothed gear friction decreases to zero [rad/s]."""
+"""Default speed below which smoothed gear friction decreases to zero [rad/s]."""
 
 
 @dataclass(frozen=True)
@@ -28,23 +28,24 @@ class Motor:
     joint : str
         Name of the joint.
     torque_constant : float
-        K [N m/A = V s/rad].
+        Torque constant K [N m/A = V s/rad].
     resistance, inductance, rotor_inertia : float
-        R [Ω], L [H], I_m [kg m²].
+        Resistance R [Ω], inductance L [H], rotor inertia I_m [kg m²].
     gear_ratio, gear_damping : float
-        k, and d_m on the motor side [N m s/rad].
+        Gear ratio k, and gear damping d_m on the motor side [N m s/rad].
     voltage_limit : float
-        Largest voltage [V]; infinite if unlimited.
+        Maximum voltage [V]; infinite if unlimited.
     mass : float
-        Point mass on the link before the joint [kg]; no effect if that link is fixed to the world.
+        Point mass on the link before the joint [kg]; it has no effect if that link is fixed to the world.
     mass_point : (3,) ndarray or None
         Position of the mass in that link's frame [m]; None: at the joint.
     current_limit : float
-        Largest current of its driver [A]; infinite if unlimited.
+        Maximum current of the motor's driver [A]; infinite if unlimited.
     nominal_current, nominal_torque : float
-        Continuous ratings [A] and at the joint [N m or N]; infinite if unknown.
+        Continuous ratings of the current [A] and of the torque or force at the joint [N m or N]; infinite if unknown.
     dry_friction : float
-        Dry friction of the gear, at the joint, which also holds the joint at rest [N m or N]; unilateral law only.
+        Dry friction of the gear, referred to the joint, which can also hold the joint at rest [N m or N]; unilateral
+        law only.
     """
 
     joint: str
@@ -64,50 +65,50 @@ class Motor:
 
     @property
     def greatest_current(self) -> float:
-        """Current limit [A], as for a servo."""
+        """Current limit [A]; same interface as for a servo."""
         return self.current_limit
 
     @property
     def joint_constant(self) -> float:
-        """K_m = K k [N m/A = V s/rad] at the joint."""
+        """Torque constant at the joint, K_m = K k [N m/A = V s/rad]."""
         return self.torque_constant * self.gear_ratio
 
     @property
     def armature(self) -> float:
-        """J_m = I_m k² [kg m², or kg at a prismatic joint]."""
+        """Rotor inertia at the joint, J_m = I_m k² [kg m², or kg at a prismatic joint]."""
         return self.rotor_inertia * self.gear_ratio**2
 
     @property
     def reflected_damping(self) -> float:
-        """D_m = d_m k² [N m s/rad, or N s/m]."""
+        """Gear damping at the joint, D_m = d_m k² [N m s/rad, or N s/m]."""
         return self.gear_damping * self.gear_ratio**2
 
 
 @dataclass(frozen=True)
 class Servo:
-    """Position servo on a revolute joint, all values at its output shaft; for its law see dynsim.dynamics.drive.law.
+    """Position servo on a revolute joint; all values refer to its output shaft. See dynsim.dynamics.drive.law.
 
     Attributes
     ----------
     joint : str
         Name of the joint.
     torque_constant, resistance : float
-        K_m [N m/A = V s/rad], R [Ω].
+        Torque constant K_m [N m/A = V s/rad] and resistance R [Ω].
     k_p, k_d : float
         Gains of the position loop [V/rad, V s/rad].
     k_v : float
         Gain of the velocity loop [V s/rad].
     velocity_mode : bool
-        The loop follows the rate of the reference, not its position.
+        True if the loop follows the rate of the reference, not its position.
     armature, reflected_damping : float
-        J_m [kg m²], D_m [N m s/rad].
+        Armature J_m [kg m²] and reflected damping D_m [N m s/rad].
     coulomb_friction : float
-        τ_c [N m].
+        Coulomb friction τ_c of the gear [N m].
     coulomb_speed : float or None
-        v_s, speed below which the friction fades [rad/s]; None: SMOOTHING, or under the unilateral law dry friction
-        that holds at rest.
+        v_s, speed below which the friction decreases to zero [rad/s]; None: SMOOTHING, or, under the unilateral law,
+        dry friction that can hold the joint at rest.
     voltage_limit, current_limit, torque_limit : float
-        Limits [V], [A], and of the current as torque K_m i [N m]; infinite if unlimited.
+        Limits of voltage [V], of current [A], and of current expressed as torque K_m i [N m]; infinite if unlimited.
     nominal_current, nominal_torque, mass, mass_point
         As for :class:`Motor`.
     free_drag : float
@@ -136,17 +137,17 @@ class Servo:
 
     @property
     def joint_constant(self) -> float:
-        """K_m [N m/A = V s/rad] at the joint."""
+        """Torque constant K_m at the joint [N m/A = V s/rad]."""
         return self.torque_constant
 
     @property
     def dry_friction(self) -> float:
-        """Gear friction that is not smoothed if the method supports dry friction [N m]."""
+        """Gear friction [N m] that is not smoothed, provided that the method supports dry friction."""
         return self.coulomb_friction if self.coulomb_speed is None else 0.0
 
     @property
     def greatest_current(self) -> float:
-        """Smaller of the limits of current and torque, as a current [A]."""
+        """Smaller of the current limit and the torque limit, expressed as a current [A]."""
         return min(self.current_limit, self.torque_limit / self.torque_constant)
 
     @property
@@ -157,7 +158,7 @@ class Servo:
 
 @dataclass(frozen=True)
 class TorqueSource:
-    """Ideal torque source: the reference is the torque, within ``torque_limit`` [N m or N]; the rest as for a motor."""
+    """Ideal torque source whose reference is its torque, up to ``torque_limit`` [N m or N]; see :class:`Motor`."""
 
     joint: str
     torque_limit: float = np.inf
@@ -173,12 +174,12 @@ Drive = Motor | Servo | TorqueSource
 
 
 def limit(value: float | None) -> float:
-    """Return the value of an optional limit: infinite for None."""
+    """Return the value of an optional limit; None becomes infinity."""
     return np.inf if value is None else value
 
 
 class DriveParameters(StrictConfig):
-    """Motor of any kind: mass and continuous rating."""
+    """Parameters of all kinds of motor: mass and continuous rating."""
 
     mass_kg: NonNegative = default(0.0, "mass of motor and gear, a point mass on the link before the joint")
     mass_point_m: Vector3 | None = default(
@@ -207,7 +208,7 @@ class DriveParameters(StrictConfig):
 
 
 class MotorParameters(DriveParameters):
-    """L di/dt = u − R i − K k v; joint torque K k i − I_m k² v̇ − d_m k² v."""
+    """DC motor with L di/dt = u − R i − K k v and joint torque K k i − I_m k² v̇ − d_m k² v."""
 
     torque_constant_N_m_per_A: Positive
     resistance_ohm: Positive
@@ -231,9 +232,9 @@ class MotorParameters(DriveParameters):
     @field_validator("inductance_H", mode="before")
     @classmethod
     def _not_zero(cls, value: Any) -> Any:
-        """Reject L = 0, a common textbook circuit, with a hint."""
+        """Reject L = 0, which textbooks often assume, with a hint."""
         if value == 0:
-            raise ValueError("must be positive; to neglect it use 1e-6 with integrator.method: auto or radau5")
+            raise ValueError("must be positive; to neglect it, use 1e-6 with integrator.method: auto or radau5")
         return value
 
     def motor(self, joint: str) -> Motor:
@@ -264,12 +265,12 @@ GAINS = {"position": ("k_p_V_per_rad", "k_d_V_s_per_rad"), "velocity": ("k_v_V_s
 
 
 class ServoParameters(DriveParameters):
-    """Values at the output shaft: K_m = U / ω_0 and R = U K_m / τ_stall at ``voltage_V``, which limits the voltage.
+    """Servo parameters at the output shaft: K_m = U/ω_0 and R = U K_m/τ_stall at ``voltage_V``, the voltage limit U.
 
     The servo has its own gains; the gains of the controller are for DC motors.
     """
 
-    voltage_V: Positive = Field(description="supply voltage of stall torque and no-load speed")
+    voltage_V: Positive = Field(description="supply voltage at which stall torque and no-load speed are rated")
     stall_torque_N_m: Positive
     no_load_speed_rad_per_s: Positive
     mode: Literal["position", "velocity"] = default("position", "part of the reference that the servo follows")
@@ -295,7 +296,7 @@ class ServoParameters(DriveParameters):
     @model_validator(mode="before")
     @classmethod
     def _gains_of_the_mode(cls, data: Any) -> Any:
-        """Set the default gains of the other mode to 0: the user did not write them, and they have no effect."""
+        """Set the default gains of the other mode to 0, because the user did not write them and they have no effect."""
         if not isinstance(data, Mapping):
             return data
         mode = data.get("mode", cls.model_fields["mode"].default)
@@ -338,7 +339,8 @@ class ServoParameters(DriveParameters):
         )
 
 
-# Servos outside the compiled kernels: parameter row of the kernels, and the servo law for arrays of servos.
+# Use of servos outside the compiled kernels: their parameter row for the kernels, and the servo law for arrays of
+# servos.
 
 
 def servo_row(m: Servo) -> Array:
@@ -367,7 +369,7 @@ class ServoBank:
     def command(
         self, enabled: NDArray[np.bool_], in_position_mode: NDArray[np.bool_], position: Array, velocity: Array
     ) -> None:
-        """Set modes and set points [rad, rad/s] from now on, all (N,); servos that are not ``enabled`` are off."""
+        """Set modes and set points [rad, rad/s], all (N,), from now on; servos that are not ``enabled`` are off."""
         modes = np.where(in_position_mode, ka.POSITION_MODE, ka.VELOCITY_MODE)
         self._mode, self._position, self._velocity = np.where(enabled, modes, ka.OFF), position, velocity
 

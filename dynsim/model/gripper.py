@@ -1,7 +1,7 @@
 """Soft gripper that hardens around an object, like the omni-gripper of [T].
 
 A soft gripper holds nothing. A hardened one holds an object by six ties, each with a spring, a damper and a bound.
-Beyond a bound the object slips, and stays in its new position.
+Beyond a bound, the object slips and keeps its new position in the gripper.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _GRASP = ".grasp"
 
 
 class HoldingLaw(NamedTuple):
-    """Spring, damper and bound of a hardened gripper [N/m, N s/m, N; about an axis N m/rad, N m s/rad, N m]."""
+    """Spring, damper and bound of a hardened gripper [N/m, N s/m, N; for rotation N m/rad, N m s/rad, N m]."""
 
     stiffness: float
     damping: float
@@ -32,17 +32,17 @@ class Gripper:
     Attributes
     ----------
     body : str
-        Body that carries it.
+        Body that carries the gripper.
     tip : (3,) ndarray
         Tip in the frame of that body; the gripper points along its x axis [m].
     capture_distance, capture_angle : float
-        Largest distances from the grasp frame of an object at which it captures it [m, rad].
+        Maximum distance [m] and angle [rad] to the grasp frame of an object at which the gripper captures the object.
     hardening, softening : float
-        Durations [s].
+        Durations of hardening and softening [s].
     along, about : HoldingLaw
-        Laws along each axis and about it, when hardened.
+        Laws along each axis and about each axis in the hardened state.
     lost_distance, lost_angle : float
-        Slip of an object from which it counts as lost [m, rad].
+        Slip beyond which an object counts as lost [m, rad].
     """
 
     body: str
@@ -58,11 +58,11 @@ class Gripper:
 
     @property
     def laws(self) -> dict[str, HoldingLaw]:
-        """Law in each of the :data:`DIRECTIONS`."""
+        """Holding law in each of the :data:`DIRECTIONS`."""
         return {direction: self.about if len(direction) > 1 else self.along for direction in DIRECTIONS}
 
     def ties(self, object_name: str) -> list[Tie]:
-        """Return the ties that hold an object at its grasp frame; inactive at the start."""
+        """Return the ties that hold an object at its grasp frame; they are inactive at the start."""
         return [
             Tie(
                 tie_name(object_name, direction),
@@ -85,10 +85,10 @@ def grasp_frame(name: str) -> str:
 
 
 def graspable(robot: Robot) -> tuple[str, ...]:
-    """Return the names of the objects with such a frame."""
+    """Return the names of the objects that have a grasp frame."""
     return tuple(frame.name.removesuffix(_GRASP) for frame in robot.frames if frame.name.endswith(_GRASP))
 
 
 def tie_name(name: str, direction: str) -> str:
-    """Return the name of the tie in one of the :data:`DIRECTIONS`."""
+    """Return the name of the tie that holds an object in one of the :data:`DIRECTIONS`."""
     return f"gripper.{name}.{direction}"

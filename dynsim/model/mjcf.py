@@ -1,9 +1,9 @@
 """MJCF export: a robot as a MuJoCo file with the same mass matrix and bias forces.
 
-Exported are bodies, joints with limits, viscous losses, dry friction and rotor inertia, couplings, gravity and the
-initial posture, which MuJoCo's format represents exactly. Motors become torques on their joints, bounded by their
-current limits; circuits, smoothed gear friction and controllers are omitted. Contact points become sites and surfaces
-become shapes without contact, because MuJoCo's contacts are soft.
+The export contains bodies, joints with limits, viscous losses, dry friction and rotor inertia, couplings, gravity and
+the initial posture. MuJoCo's format represents all of these exactly. Motors become torques on their joints, bounded by
+their current limits; circuits, smoothed gear friction and controllers are omitted. Contact points become sites and
+surfaces become shapes without contact, because MuJoCo's contacts are soft.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from dynsim.record.quaternion import of_matrix
 from dynsim.record.scene import HERE, SceneSurface, Shape
 from dynsim.record.urdf_text import Element, numbers, xml_text
 
-# MuJoCo refuses bodies without mass or inertia; these values are negligible in any robot [kg, kg m²].
+# MuJoCo rejects bodies without mass or inertia; these values are negligible in any robot [kg, kg m²].
 LEAST = 1e-12
-# Half the edge of the drawn part of a plane [m].
+# Half the edge length of the part of a plane that is drawn [m].
 _PLANE = 5.0
 _SIMPLE = {"revolute": "hinge", "prismatic": "slide"}
 _BALL = ["ball_x", "ball_y", "ball_z"]
@@ -42,13 +42,13 @@ def write_mjcf(
     Parameters
     ----------
     robot : Robot
-        Robot with the masses of its motors on its links.
+        Robot whose links include the masses of its motors.
     contacts : sequence of Contact
         Contact points, which become sites ``contact_NAME``; the hand is the site ``hand``.
     surfaces : sequence of SceneSurface
-        Planes, spheres, cylinders and boxes are drawn.
+        Surfaces; only planes, spheres, cylinders and boxes are drawn.
     damping, armature : (n,) ndarray
-        Values of each row of the joints [N m s/rad, kg m²; N s/m, kg].
+        Damping and armature of each row of the joints [N m s/rad, kg m²; N s/m, kg].
     rubs : mapping of str to float
         Dry friction of bearing and gear, for each joint that has any [N m or N].
 
@@ -106,7 +106,7 @@ def write_mjcf(
 
 
 def _joints(robot: Robot) -> list[list[Link]]:
-    """Return the rows of each joint, checked to be of kinds that MJCF has."""
+    """Return the rows of each joint, after checking that MJCF has such a joint."""
     groups: dict[str, list[Link]] = {}
     for link in robot.links:
         groups.setdefault(link.joint_of_rows or link.joint, []).append(link)
@@ -114,7 +114,7 @@ def _joints(robot: Robot) -> list[list[Link]]:
         kinds = [link.kind for link in group]
         if [kind for kind in kinds if kind not in (*_SIMPLE, *_BALL)]:
             raise ModelError(
-                f"{name}: is made of {', '.join(kinds)}; MJCF has no such joint, nor wheels that roll without slip: "
+                f"{name}: is made of {', '.join(kinds)}; MJCF has no such joint, and no wheels that roll without slip; "
                 "export an arm on a fixed base"
             )
     return list(groups.values())
@@ -123,7 +123,7 @@ def _joints(robot: Robot) -> list[list[Link]]:
 def _add_joints(
     body: Element, group: Sequence[Link], rubs: Mapping[str, float], damping: Array, armature: float
 ) -> None:
-    """Add the joints of a body; three slides and a ball of a body that is free in the world become one free joint."""
+    """Add the joints of a body; three slides and a ball joint of a body free in the world become one free joint."""
     kinds = [link.kind for link in group]
     first = group[0]
     loose = kinds == ["prismatic"] * 3 + _BALL and not damping.any() and armature == 0.0
@@ -174,7 +174,7 @@ def _add_shapes(body: Element, shapes: Sequence[Shape]) -> None:
 
 def _add_surface(world: Element, surface: SceneSurface) -> None:
     geom = {"name": f"surface_{surface.name}", "rgba": "0.7 0.7 0.7 0.5"}
-    # A surface around the free side would hide it.
+    # A drawn surface that encloses its free side would hide everything on that side.
     if surface.kind == "plane":
         geom |= {"type": "plane", "size": f"{_PLANE} {_PLANE} 0.1", "zaxis": numbers(surface.direction)}
     elif surface.kind == "sphere" and (surface.radius or 0.0) > 0.0:

@@ -15,22 +15,22 @@ SUPPORTS = ("left", "right", "caster")
 
 @dataclass(frozen=True)
 class MobileBase:
-    """Base on two driven wheels and a caster ([WM] II.E); its frame is on the ground below the axle, x ahead.
+    """Base on two driven wheels and a caster ([WM] II.E); its frame is on the ground below the axle, with x forward.
 
     Attributes
     ----------
     body : str
-        Name of the link that carries it.
+        Name of the link that carries the base.
     wheels : tuple of str
-        Joints of the left and of the right wheel; a positive rate rolls ahead.
+        Joints of the left and of the right wheel; at positive rates the base rolls forward.
     wheel_radius, track : float
-        r [m], and T, the distance between the wheels' contact points [m].
+        Wheel radius r [m], and distance T between the wheels' contact points [m].
     caster : (3,) ndarray
         Contact point of the caster with the ground, in the base's frame [m].
     spin_inertia : float
         Inertia of one wheel about its axle [kg m²].
     wheel_friction : float
-        μ between wheels and ground, for the traction demand.
+        Friction coefficient μ between wheels and ground, for the traction demand.
     stop_on_overturn : bool
         Whether a run ends when the base tips; otherwise it continues with a base that cannot tip.
     """

@@ -32,7 +32,7 @@ class Quadric:
     def __post_init__(self) -> None:
         shapes = np.shape(self.Q), np.shape(self.b)
         if shapes != ((3, 3), (3,)):
-            raise ModelError(f"a quadric requires Q of shape (3, 3), b of shape (3,); got {shapes[0]} and {shapes[1]}")
+            raise ModelError(f"a quadric requires Q of shape (3, 3), b of shape (3,), got {shapes[0]} and {shapes[1]}")
         rounding = 1e-9 * float(np.abs(self.Q).max())
         if not np.allclose(self.Q, np.transpose(self.Q), rtol=0.0, atol=rounding, equal_nan=True):
             raise ModelError("Q of a quadric must be symmetric; use (Q + Qᵀ)/2 for the same surface")
@@ -53,7 +53,7 @@ class Quadric:
         return float(surface_distance(value, slope, float(normal @ self.Q @ normal)))
 
     def gaps(self, positions: Array) -> Array:
-        """Return :meth:`gap` of many points, (T, 3) → (T,) [m]; also if ∇C vanishes, as in a sphere's centre."""
+        """Return :meth:`gap` of many points, (T, 3) → (T,) [m]; even if ∇C vanishes, as at a sphere's centre."""
         if not self.Q.any():
             return np.asarray((positions @ self.b + self.c) / np.linalg.norm(self.b))
         Qr = positions @ self.Q
@@ -91,12 +91,12 @@ class Quadric:
 
     @cached_property
     def drawn(self) -> SceneSurface:
-        """Surface of the matching simple kind with its parameters, if there is one; without a name."""
+        """Unnamed scene surface of the matching simple kind with its parameters; None if there is no such kind."""
         return SceneSurface.of_quadric("", self.Q, self.b, self.c)
 
 
 class _Shaped:
-    """Distances by the kernels of dynsim.dynamics.contact.distance."""
+    """Surface whose distances are computed by the kernels of dynsim.dynamics.contact.distance."""
 
     def gap(self, position: Array) -> float:
         """Return the signed distance of a point, (3,), along the normal [m]."""
@@ -201,7 +201,8 @@ def _spline(values: Array) -> Array:
 def shape_arrays(entries: Sequence[tuple[Surface | None, float, Array, bool]]) -> ShapeArrays:
     """Return tables of candidates from surface, radius [m], axis in the body [m], and if its nearest point touches.
 
-    The surface is None for a point on a quadric.
+    Each entry contains the surface (None for a point on a quadric), the radius [m], the axis in the body's frame [m],
+    and whether the nearest point of the axis touches.
     """
     # Imported here because the kernels take a second to load and configurations do not need them.
     from dynsim.dynamics.contact import distance as kd

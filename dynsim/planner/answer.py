@@ -23,12 +23,12 @@ from dynsim.scenario import Scenario, require_scenario
 from dynsim.scenario.schema import Payload
 from dynsim.system.arguments import names_wrong_types
 
-# Relative difference of the heats below which two rounds agree.
+# Relative difference of the heats below which two search rounds agree.
 AGREE = 0.01
 # Gain k_p of plans that are not verified or have no braces [V/rad].
 K_P = 500.0
 GAP = (
-    "statistical: best result of independent search rounds with local optima, and number of rounds within 1 % of it; "
+    "statistical: best local optimum of independent search rounds, and number of rounds within 1 % of it; "
     "not a proven bound"
 )
 
@@ -48,12 +48,12 @@ class Size:
     verdict : Verdict or None
         Result of the verification; None if the plan was not verified.
     agreed, rounds : int
-        Number of search rounds that found this heat, and number of rounds.
+        Number of search rounds that found this heat, and total number of rounds.
     reason : str
-        Why no plan was found, or why the plan was rejected; otherwise empty.
+        Reason why no plan was found or why the plan was rejected; otherwise empty.
     tolerance : tuple of float or None
-        Tolerated error of the surface height [m] and of friction (relative), each alone. None unless requested, or if
-        the nominal run is already rejected.
+        Tolerated error of the surface height [m] and tolerated relative error of friction, each determined alone. None
+        if not requested, or if the nominal run is already rejected.
     cheaper : tuple
         Brace sets with less heat that were rejected, each with the reason.
     """
@@ -90,13 +90,13 @@ class Size:
 
     @property
     def expected(self) -> float:
-        """Heat for ranking plans [W]: simulated heat of the nominal run if verified, else the planned heat."""
+        """Heat used to rank plans [W]: simulated heat of the nominal run if verified, otherwise the planned heat."""
         nominal = self.nominal
         return self.heat if nominal is None or math.isnan(nominal.heat_W) else nominal.heat_W
 
     @property
     def survives(self) -> bool | None:
-        """Whether all corners are accepted; None if the plan was not verified."""
+        """Whether all corner cases are accepted; None if the plan was not verified."""
         return None if self.verdict is None else self.verdict.survives
 
     @property
@@ -106,7 +106,7 @@ class Size:
 
     @property
     def label(self) -> str:
-        """Names of the points and surfaces, or "none"."""
+        """Names of the brace points and surfaces, or "none"."""
         return ", ".join(brace.label for brace in self.braces) or "none"
 
     @property
@@ -128,9 +128,10 @@ class BracePlan:
     tally : Tally
         Statistics of the search.
     singles : dict of str to float
-        Least heat of a single brace at one posture [W], by candidate.
+        Least heat with a single brace at one posture [W], by candidate.
     ranked : dict of int to list
-        Brace sets with a whole path and their heat [W], by number of braces, starting with the chosen set.
+        Brace sets that were solved along the whole path, with their heat [W], by number of braces, starting with the
+        chosen set.
 
     Examples
     --------
@@ -156,12 +157,12 @@ class BracePlan:
 
     @property
     def answered(self) -> list[Size]:
-        """Sizes with a plan."""
+        """Entries of all numbers of braces for which a plan was found."""
         return [size for size in self.sizes if size.planned is not None]
 
     @property
     def best(self) -> Size | None:
-        """Plan of least expected heat, preferably one that passed the verification; None without any plan."""
+        """Plan of least expected heat, preferably among verified plans that survive; None if no plan was found."""
         return min(self.answered, key=lambda size: (size.survives is False, size.expected), default=None)
 
     def size(self, count: int) -> Size:
@@ -196,16 +197,16 @@ class BracePlan:
                     raise ScenarioError(f"no plan with {count} braces: {size.reason}")
                 return size
         asked = ", ".join(str(size.count) for size in self.sizes)
-        raise ScenarioError(f"no plan with {count} braces was requested (requested: {asked})")
+        raise ScenarioError(f"no plan with {count} braces was requested, only with: {asked}")
 
     @cached_property
     def table(self) -> list[dict[str, Any]]:
-        """Rows with the main results of each size; the names of the values contain the units."""
+        """Rows with the main results for each number of braces; the keys contain the units."""
         return [_row(self.task, size) for size in self.sizes]
 
     @property
     def pareto(self) -> list[tuple[int, float]]:
-        """Numbers of braces with their expected heat [W], if it is lower than for all smaller numbers."""
+        """Numbers of braces whose expected heat is lower than for all smaller numbers, each with this heat [W]."""
         points: list[tuple[int, float]] = []
         for size in self.answered:
             if not points or size.expected < points[-1][1]:
@@ -274,7 +275,7 @@ class BracePlan:
 
     @property
     def yaml(self) -> dict[str, Any]:
-        """All plans as one scenario with one variant per size, starting with the best plan."""
+        """All plans as one scenario with one variant per number of braces, starting with the best plan."""
         best = self.best
         variants = {
             size.variant: planned_scenario.plan_sections(self.task, size.braces, size.dense, size.k_p)
@@ -308,7 +309,7 @@ class BracePlan:
 
 
 def _row(task: Task, size: Size) -> dict[str, Any]:
-    """Return the row of one size for a table."""
+    """Return the table row for one number of braces."""
     row: dict[str, Any] = {"count": size.count, "braces": size.label if size.planned else "not found"}
     if size.planned is None:
         return row | {"reason": size.reason}
@@ -344,7 +345,7 @@ def _row(task: Task, size: Size) -> dict[str, Any]:
 
 
 def _size_json(task: Task, size: Size) -> dict[str, Any]:
-    """Return the entry of one size in ``plan.json``."""
+    """Return the entry for one number of braces in ``plan.json``."""
     braces = [{"body": b.body, "point_m": list(b.point_m), "surface": b.surface, "name": b.name} for b in size.braces]
     entry: dict[str, Any] = {"count": size.count, "braces": braces}
     if size.planned is None:
@@ -383,7 +384,7 @@ def _size_json(task: Task, size: Size) -> dict[str, Any]:
 
 
 def _number(value: float) -> float | None:
-    """Return a number for JSON, which has no NaN or infinity: None instead."""
+    """Return a number for JSON; NaN and infinity, which JSON lacks, become None."""
     return float(value) if math.isfinite(value) else None
 
 
@@ -422,7 +423,7 @@ def plan_braces(
         Points that may become braces: links (at their joint), ranges ``first:last`` of links, frames, or contact
         points; default: all links except the first two, and all contact points.
     along : sequence of float, optional
-        Fractions of the link length with additional candidates, above 0 and at most 1.
+        Fractions of the link length, above 0 and at most 1, at which there are additional candidates.
     radius_m : float, optional
         Radius of the candidates [m]; default: the radius of the link.
     count : tuple of int, optional
@@ -430,17 +431,18 @@ def plan_braces(
     surfaces : sequence of str, optional
         Surfaces that braces may use; default: all.
     peak_W_per_N_m : float, optional
-        Extra cost of the maximum torque of revolute joints [W/(N m)]; forces of prismatic joints have no extra cost.
+        Additional cost of the maximum torque of revolute joints [W/(N m)]; forces of prismatic joints have no such
+        cost.
     clearance_m : float, optional
         Minimum distance of unbraced joints from surfaces [m].
     min_N : float, optional
         Minimum normal force of each brace [N].
     verify : bool, optional
-        Simulate the corners of ``tolerances``, and choose gains that tolerate them.
+        If True, simulate the corner cases of ``tolerances``, and choose gains that tolerate them.
     explain : bool, optional
-        For rejected plans, find the largest error they tolerate, by bisection.
+        If True, find by bisection the largest error that rejected plans tolerate.
     exhaustive : bool, optional
-        Try every set of candidates instead of growing sets from the best smaller ones (slow).
+        If True, try every set of candidates instead of growing sets from the best smaller sets (slow).
     starts : int, optional
         Number of independent search rounds.
     seed : int, optional
@@ -475,7 +477,7 @@ def plan_braces(
     require_scenario(scenario)
     least, most = count
     if not 0 <= least <= most:
-        raise ScenarioError(f"count = {least}:{most}: minimum must not exceed maximum, and both must be ≥ 0")
+        raise ScenarioError(f"count = {least}:{most}: the minimum must not exceed the maximum, and both must be ≥ 0")
     for key, number, smallest in (("starts", starts, 1), ("seed", seed, 0), ("jobs", jobs, 1)):
         if number < smallest:
             raise ScenarioError(f"{key} = {number}: must be at least {smallest}")
@@ -508,7 +510,7 @@ def plan_braces(
                 stacklevel=2,
             )
         if not np.any(problem.arm.model.robot.gravity):
-            raise ScenarioError("plant.gravity_m_s2 = [0, 0, 0]: must not be zero; without gravity braces are useless")
+            raise ScenarioError("plant.gravity_m_s2 = [0, 0, 0]: must not be zero; braces are useless without gravity")
         search = Search(problem, tell)
         ranked = search.run()
         sizes = [_answered(search, size, ranked[size]) for size in range(least, most + 1)]
@@ -521,13 +523,13 @@ def plan_braces(
 
 
 def _ranked(size: Size, planned: Sequence[Planned]) -> list[tuple[str, float]]:
-    """Return the sets of a size with their heat, starting with the chosen set."""
+    """Return the sets with the same number of braces and their heat, starting with the chosen set."""
     names = [(", ".join(b.label for b in plan.braces) or "none", plan.heat) for plan in planned]
     return sorted(names, key=lambda item: (item[0] != size.label, item[1]))
 
 
 def _answered(search: Search, count: int, ranked: Sequence[Planned]) -> Size:
-    """Return the best plan of a size before verification, or the reason why there is no plan."""
+    """Return the best plan for a number of braces before verification, or the reason why there is no plan."""
     heats = search.tally.heats.get(count, [])
     if ranked:
         best = min([*heats, search.least_heat.get(count, math.inf)])
@@ -536,7 +538,7 @@ def _answered(search: Search, count: int, ranked: Sequence[Planned]) -> Size:
 
 
 def _failure(search: Search, count: int) -> str:
-    """Return why no plan of a size was found."""
+    """Return the reason why no plan was found for a number of braces."""
     tally, options = search.tally, search.task.options
     if not tally.drawn_on:
         if within := search.never_clear():
@@ -557,10 +559,10 @@ def _failure(search: Search, count: int) -> str:
     missed = sum(len(braces) == count for braces in tally.missed)
     tried = missed + sum(len(braces) == count for braces in tally.reached)
     if tried == 0:
-        return f"no set of {count - 1} braces was found to start from"
+        return f"no set of {count - 1} braces was found from which the search could start"
     return (
-        f"no posture was found for any of the {tried} sets tried, but one may exist; try more --starts than "
-        f"{options.starts}, other --candidates or a smaller --min-force"
+        f"no posture was found for any of the {tried} sets tried, but one may exist; try more than {options.starts} "
+        "--starts, other --candidates or a smaller --min-force"
     )
 
 
@@ -574,7 +576,7 @@ def _verified(
     explain: bool,
     tell: Tell,
 ) -> list[Size]:
-    """Verify the best set of each size; if it is rejected, choose the next set that survives."""
+    """Verify the best set for each number of braces; if it is rejected, choose the next set that survives."""
     verifier = Verifier(problem, tolerances, jobs)
     open_ = {size.count: list(ranked[size.count]) for size in sizes if size.planned is not None}
     verdicts: dict[int, list[tuple[Planned, Verdict]]] = {count: [] for count in open_}

@@ -18,13 +18,14 @@ from dynsim.model.surfaces import Surface, shape_arrays
 from dynsim.planner import compiled
 from dynsim.planner.compiled import Arm, Course, Points, Work
 
-# Distance from joint limits in plans [rad or m], and its maximum as a fraction of the range: a margin for soft gains.
+# Distance that plans keep from joint limits [rad or m], and its maximum as a fraction of the joint range. It is a
+# margin for low gains.
 FROM_STOP, FROM_STOP_SHARE = 0.05, 0.05
 
 
 @dataclass(frozen=True)
 class MovingArm:
-    """Joints of a robot that a plan moves, in order, on a fixed base.
+    """Joints of a robot on a fixed base that a plan moves, in the order of the links.
 
     Attributes
     ----------
@@ -93,7 +94,7 @@ def moving_arm(model: Model, surfaces: Mapping[str, Surface]) -> MovingArm:
             )
         motor = motors.get(link.joint)
         if not isinstance(motor, Motor):
-            raise ModelError(f"plan: {link.joint} has no DC motor, whose heat is minimised; set its motor in plant")
+            raise ModelError(f"plan: {link.joint} has no DC motor, whose heat can be minimised; set its motor in plant")
         heat.append(motor.resistance / motor.joint_constant**2)
         current = min(motor.greatest_current, motor.voltage_limit / motor.resistance)
         greatest.append(min(motor.joint_constant * current, link.effort_limit))
@@ -142,9 +143,10 @@ def moving_arm(model: Model, surfaces: Mapping[str, Surface]) -> MovingArm:
 
 
 def axis_points(arm: MovingArm, shares: Sequence[float]) -> list[tuple[int, Array, float, float]]:
-    """Return points along the axes of all links: index of the joint, point [m], radius [m], fraction of the length.
+    """Return points along the axes of all links.
 
-    An axis runs from the link's joint to an end from :func:`dynsim.compile.clearance.axis_ends`.
+    Each entry is the index of the joint, the point [m], the radius [m] and the fraction of the link length. An axis
+    runs from the link's joint to an end from :func:`dynsim.compile.clearance.axis_ends`.
     """
     robot = arm.model.robot
     ends = axis_ends(robot)
@@ -167,7 +169,7 @@ def axis_lines(arm: MovingArm, q: Array) -> Array:
     return np.array(lines).reshape(-1, 2, 3)
 
 
-# Local solver: postures along the path and brace forces of least heat for one set of braces.
+# Local solver: it finds postures along the path and brace forces of least heat for one set of braces.
 
 
 # Maximum number of constraints in one step.
@@ -202,7 +204,7 @@ class Problem:
         compiled.statics(self.arm, self.points, self.course, self.work, Q, F, self.min_force, False)
 
     def forces(self, Q: Array) -> Array:
-        """Return the normal forces of least heat, shape (E, c) [N]; the workspace has the corresponding torques."""
+        """Return the normal forces of least heat, shape (E, c) [N]; the workspace contains the resulting torques."""
         F = np.zeros((len(self.course.knot), len(self.points.friction)))
         compiled.statics(self.arm, self.points, self.course, self.work, Q, F, self.min_force, True)
         return F
@@ -212,13 +214,13 @@ class Problem:
         return float(self.course.share @ (self.work.torque**2 @ self.arm.heat))
 
     def retract(self, Q: Array, steps: int = 12, tolerance: float = compiled.ON) -> float:
-        """Project postures onto hand path and braces, in place; return the residual [m]."""
+        """Project postures in place, so that the hand is on its path and the braces touch; return the residual [m]."""
         return float(compiled.project(self.arm, self.points, self.course, self.work, Q, steps, tolerance))
 
 
 @dataclass(frozen=True)
 class Local:
-    """Local optimum: postures at the knots, (K, n), forces at the instants, (E, c) [N], heat and cost [W], steps."""
+    """Local optimum: postures at knots, (K, n), forces at instants, (E, c) [N], heat and cost [W], number of steps."""
 
     Q: Array
     F: Array
@@ -244,7 +246,7 @@ def workspace(n: int, points: Points, course: Course) -> Work:
 
 
 def solve(problem: Problem, start: Array, turns: int = 40, tolerance: float = 1e-4) -> Local | None:
-    """Minimise the cost from a start, shape (K, n); return None if it cannot be projected onto path and surfaces."""
+    """Minimise the cost from start postures, (K, n); return None if they cannot be projected onto path and surfaces."""
     Q, F = reals(start), np.zeros((len(problem.course.knot), len(problem.points.friction)))
     tables = problem.arm, problem.points, problem.course, problem.work
     cost, heat, steps = compiled.solve(*tables, Q, F, problem.min_force, problem.peak, turns, tolerance)

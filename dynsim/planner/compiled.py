@@ -5,10 +5,11 @@ The arm has a fixed base and joints with one coordinate each. Brace forces and j
     F_c = f_c (n − μ v_t / √(|v_t|² + v_s²)),    τ = g(q) + (D + D_m) v − Σ_c J_cᵀ F_c
 
 for braces c with the surface normal n at the brace and the velocity v_t of the contact point along the surface.
-Postures q_k belong to knots. Instants e are between knots, at q_e = Σ_k blend_ek q_k with velocities
-v_e = Σ_k chord_ek q_k. On a path that goes back and forth each posture has two instants.
+Each knot k has a posture q_k. Instants e are between knots, with postures q_e = Σ_k blend_ek q_k and velocities
+v_e = Σ_k chord_ek q_k. On a path that goes back and forth, there are two instants for each posture.
 
-All functions are in one file, because in this package the cache of compiled code only checks the file of the function.
+All functions are in one file, because in this package the cache of compiled code checks only the file that contains a
+function.
 """
 
 from __future__ import annotations
@@ -39,9 +40,9 @@ from dynsim.dynamics.tree.spatial import (
 )
 from dynsim.jit.kernel import internal_kernel, kernel
 
-# Independent fraction of a constraint row below which the row counts as dependent.
+# A constraint row counts as dependent if the part of it that is independent of the other rows is below this fraction.
 DEPENDENT = 1e-9
-# Tolerance of the distance from hand path and surfaces [m].
+# Tolerance of the distances from the hand path and the surfaces [m].
 ON = 1e-9
 # Initial damping of the steps and its bounds, relative to the cost.
 DAMPING, DAMPING_MIN, DAMPING_MAX = 1e-3, 1e-7, 1e6
@@ -49,29 +50,30 @@ DAMPING, DAMPING_MIN, DAMPING_MAX = 1e-3, 1e-7, 1e6
 REACH = 0.6
 # Maximum step of a coordinate in one iteration of a projection [rad or m].
 PROJECTION_REACH = 2.0 * REACH / 3.0
-# Points whose distance from a surface exceeds their margin by more than this are ignored in a step [m].
+# In a step, points are ignored if their distance from a surface exceeds their margin by more than this [m].
 NEARBY = 0.5
-# Number of projection steps within which the residual must halve, or the projection fails.
+# The projection fails if the residual does not halve within this number of steps.
 PATIENCE = 12
-# Fraction of the torque limits above which torques have an extra cost, and its factor relative to the heat.
+# Fraction of the torque limits above which torques have an additional cost, and the factor of this cost relative to the
+# heat.
 NEAR_LIMIT, LIMIT_COST = 0.98, 100.0
 # Exponent of the power mean that approximates the peak torque.
 PEAK_POWER = 12
-# Threshold, relative to the scale of multipliers and forces, below which releasing a bound brings no gain.
+# Threshold, relative to the scale of multipliers and forces, below which it is not worthwhile to release a bound.
 NO_GAIN = 1e-11
 
 
 class Arm(NamedTuple):
     """Joints with one coordinate each and the bodies they carry; n joints, parents before children."""
 
-    parent: np.ndarray  # (n,) int, −1: the fixed base
+    parent: np.ndarray  # (n,) int, index of the parent joint; −1: the fixed base
     prismatic: np.ndarray  # (n,) int, 1 or 0
     rotation: np.ndarray  # (n, 9) joint frame at q = 0 in the parent's frame, or in W on the base
     origin: np.ndarray  # (n, 3) origin of that frame [m]
     axis: np.ndarray  # (n, 3)
     mass: np.ndarray  # (n,) [kg]
     com: np.ndarray  # (n, 3) centre of mass in the body's frame [m]
-    # For prismatic joints: forces instead of torques, metres instead of radians.
+    # For prismatic joints, read forces instead of torques, and metres instead of radians.
     losses: np.ndarray  # (n,) D + D_m [N m s/rad]
     heat: np.ndarray  # (n,) R / K_m² [W/(N m)²]
     greatest: np.ndarray  # (n,) maximum torque at rest [N m]; inf: no limit
@@ -97,12 +99,12 @@ class Points(NamedTuple):
 class Course(NamedTuple):
     """Knots k with targets of the hand, and instants e; the instants of one posture are consecutive."""
 
-    target: np.ndarray  # (K, h) position of the hand [m]; with an orientation also the components of two axes
+    target: np.ndarray  # (K, h) position of the hand [m]; with an orientation, also two of its axes
     knot: np.ndarray  # (E,) int, last knot before the instant
     blend: np.ndarray  # (E, K)
     chord: np.ndarray  # (E, K) [1/s]
     share: np.ndarray  # (E,) fraction of the time; the sum is 1
-    smooth: np.ndarray  # (K, K) SᵀS of the smoothness S q
+    smooth: np.ndarray  # (K, K) SᵀS, where S q measures the smoothness of q
     slip_scale: np.ndarray  # (1,) v_s: slip at which friction approaches its full value [m/s]
 
 
@@ -166,7 +168,7 @@ class Work(NamedTuple):
 
 @internal_kernel
 def poses(arm: Arm, work: Work, q):
-    """Compute the frames of all bodies, the joint axes in W, and mass and first moment carried by each joint."""
+    """Compute the frames of all bodies, the joint axes in W, and the mass and first moment that each joint carries."""
     n, below = arm.parent.shape[0], work.below
     for j in range(n):
         i, u = arm.parent[j], vector(arm.axis, j, 0)
@@ -192,7 +194,7 @@ def poses(arm: Arm, work: Work, q):
 
 @internal_kernel
 def body_point(work: Work, body, point, i):
-    """Return the position in W of row i of a table of points on a body [m]."""
+    """Return the position in W of the point in row i of a table, fixed to a body [m]."""
     return transform(vector(work.p, body, 0), rotation(work.R, body, 0), vector(point, i, 0))
 
 
@@ -228,14 +230,17 @@ def dot(a, b):
 
 @internal_kernel
 def geometry(arm: Arm, points: Points, work: Work, q, k, count):
-    """Compute row k of hand and gaps, with rates, for the first ``count`` points; for braces also force geometry."""
+    """Compute row k of hand and gaps with their rates, for the first ``count`` points.
+
+    For braces, the geometry of the forces is also computed.
+    """
     n, c, hand, jacobian = arm.parent.shape[0], points.friction.shape[0], arm.hand[0], work.turn
     poses(arm, work, q)
     x = body_point(work, hand, arm.hand_point, 0)
     rates(arm, work, hand, x, jacobian)
     put_vector(work.hand, k, 0, x)
     copy(jacobian.T, work.hand_rate[k, :3])
-    # With an orientation: the z axis of the hand's body, then its x axis.
+    # With an orientation, write the z axis of the hand's body, then its x axis.
     for row in range(3, work.hand.shape[1], 3):
         R = rotation(work.R, hand, 0)
         axis = third_axis(R) if row == 3 else first_axis(R)
@@ -263,7 +268,7 @@ def geometry(arm: Arm, points: Points, work: Work, q, k, count):
         put_vector(work.normal, i, 0, normal)
         touch, shift, turned = work.touch[i], work.shift[i], work.turned[i]
         rates(arm, work, body, along(x, normal, -radius), touch)
-        # The contact point moves by J_centre − ρ ∂n/∂q, the material at this point by J_touch.
+        # The contact point moves by J_centre − ρ ∂n/∂q, whereas the material point there moves by J_touch.
         for j in range(n):
             centre = vector(jacobian, j, 0)
             dn = times_inertia((xx, xy, xz, yy, yz, zz), centre)
@@ -349,7 +354,7 @@ def statics(arm: Arm, points: Points, course: Course, work: Work, Q, F, min_forc
 
 @internal_kernel
 def force_derivatives(arm: Arm, points: Points, work: Work, v, f, i, e):
-    """Add the derivatives by direction and point of application of brace i's force at instant e.
+    """Add the derivatives due to the direction and the point of application of brace i's force at instant e.
 
     ∂F = f (∂n − μ G ∂w), w = v_t, G = (1 − u uᵀ)/s, s = √(|w|² + v_s²), u = w/s.
     """
@@ -362,13 +367,14 @@ def force_derivatives(arm: Arm, points: Points, work: Work, v, f, i, e):
         if not arm.prismatic[j]:
             whole = along(whole, vector(work.a, j, 0), v[j])
         j = arm.parent[j]
-    # From tip to base: carried = Σ J_i v_i over joint j and the joints it carries, before = Σ a_i v_i over its parents.
+    # Go from tip to base, with carried = Σ J_i v_i over joint j and the joints it carries, and before = Σ a_i v_i over
+    # its parents.
     before, carried = whole, ZERO_VECTOR
     j = body
     while j >= 0:
         rate, a, dn = vector(touch, j, 0), vector(work.a, j, 0), vector(turned, j, 0)
         carried = along(carried, rate, v[j])
-        # Another material point becomes the contact point.
+        # As the joint moves, another material point becomes the contact point.
         dw = cross(whole, vector(shift, j, 0))
         if not arm.prismatic[j]:
             before = along(before, a, -v[j])
@@ -394,16 +400,16 @@ def force_derivatives(arm: Arm, points: Points, work: Work, v, f, i, e):
 
 @internal_kernel
 def factor(A, skyline, done, n):
-    """Factorise the leading n × n part of A = L Lᵀ (Cholesky) in its lower half; lost pivots become very large.
+    """Factorise the leading n × n part of A = L Lᵀ (Cholesky) in its lower half; vanishing pivots become very large.
 
     Parameters
     ----------
     A : ndarray
         Symmetric matrix; its lower half is overwritten by L.
     skyline : (n,) ndarray of int
-        Output: first nonzero column of each row; L is also zero to its left.
+        Output: first nonzero column of each row of A; L is also zero to the left of it.
     done : int
-        Number of rows that are already rows of L.
+        Number of leading rows that already contain L.
     n : int
         Size of the leading part.
     """
@@ -454,8 +460,8 @@ def nonnegative(work: Work, G, h, x, known, m):
     h, x : (m,) ndarray
         Linear term, and the solution.
     known : int
-        Number of leading entries of x that solve the problem without the other entries; ``work.passive`` marks the
-        positive entries.
+        Number of leading entries of x that already solve the problem without the remaining entries; ``work.passive``
+        marks the positive ones.
     m : int
         Number of unknowns.
     """
@@ -515,7 +521,7 @@ def nonnegative(work: Work, G, h, x, known, m):
 
 @internal_kernel
 def least_heat(arm: Arm, work: Work, min_force, f, e):
-    """Compute the normal forces of least heat at instant e, shape (c,), from its torques without forces.
+    """Compute the normal forces of least heat at instant e, shape (c,), from the torques without brace forces.
 
     The forces are at least ``min_force`` [N].
     """
@@ -544,7 +550,7 @@ def least_heat(arm: Arm, work: Work, min_force, f, e):
 def costs(arm: Arm, course: Course, work: Work, Q, peak):
     """Compute cost and heat [W] of the torques in the workspace, and ``weight`` and ``pull`` of the quadratic model.
 
-    Torques near their limits have an extra cost. ``peak`` is the cost of the maximum torque of revolute joints
+    Torques near their limits have an additional cost. ``peak`` is the cost of the maximum torque of revolute joints
     [W/(N m)], approximated by a power mean; forces of prismatic joints are excluded.
     """
     E, n = work.torque.shape
@@ -589,7 +595,7 @@ def costs(arm: Arm, course: Course, work: Work, Q, peak):
 
 @internal_kernel
 def constraint_rows(points: Points, work: Work, k):
-    """Write the rates of hand and braces at knot k to ``work.rows``; return the number of rows."""
+    """Write the constraint rows of hand and braces at knot k to ``work.rows``; return their number."""
     c, h = points.friction.shape[0], work.hand.shape[1]
     copy(work.hand_rate[k], work.rows)
     copy(work.gap_rate[k, :c], work.rows[h:])
@@ -600,8 +606,8 @@ def constraint_rows(points: Points, work: Work, k):
 def project(arm: Arm, points: Points, course: Course, work: Work, Q, steps, tolerance):
     """Project the postures of all knots onto hand path and braces, clear of surfaces and within joint limits.
 
-    Damped Gauss–Newton steps on the violated constraints keep the change small. Returns the residual of the worst knot
-    [m], up to the first knot that fails.
+    Damped Gauss–Newton steps on the violated constraints keep the change small. Returns the largest residual of a knot
+    [m], considering the knots up to the first that fails.
 
     Parameters
     ----------
@@ -635,7 +641,7 @@ def project(arm: Arm, points: Points, course: Course, work: Work, Q, steps, tole
                     for j in range(n):
                         rows[m, j] = work.gap_rate[k, i, j]
                     right[m] = short + 0.5 * tolerance
-                    # A point that is too close only by rounding counts as clear.
+                    # A point that is too close only because of rounding counts as clear.
                     left = max(left, short - tolerance)
                     m += 1
             for j in range(n):
@@ -680,8 +686,8 @@ def project(arm: Arm, points: Points, course: Course, work: Work, Q, steps, tole
 def null_space(work: Work, k, m):
     """Write an orthonormal basis to ``work.basis`` whose last columns span the null space of m rows of ``work.rows``.
 
-    Householder reflections with pivoting on the rows; dependent rows are skipped. Returns the number of null-space
-    columns.
+    The basis is computed by Householder reflections with row pivoting; dependent rows are skipped. Returns the number
+    of null-space columns.
     """
     rows, Z, u = work.rows, work.basis[k], work.g
     n = rows.shape[1]
@@ -758,7 +764,7 @@ def prepare(arm: Arm, points: Points, course: Course, work: Work, Q, damping):
     n, c = arm.parent.shape[0], points.friction.shape[0]
     K, E = Q.shape[0], course.knot.shape[0]
     H, g, B, column, start = work.H, work.g, work.B, work.column, work.start
-    # Coupled unknowns are close to each other, so that the matrix is banded.
+    # Number coupled unknowns close to each other, so that the matrix is banded.
     N, behind = 0, 0
     for k in range(K):
         work.free[k] = null_space(work, k, constraint_rows(points, work, k))
@@ -829,7 +835,7 @@ def prepare(arm: Arm, points: Points, course: Course, work: Work, Q, damping):
 def add_dual_rows(work: Work, N, before, m):
     """Add rows ``before`` to m − 1 of the dual problem and multiply the normals of these constraints by L⁻¹.
 
-    The loop is over rows of the normals, which the compiler can vectorise; most of their leading entries are zero.
+    The loop runs over rows of the matrix of normals, which the compiler can vectorise; most leading entries are zero.
     """
     L, normals, dual, right = work.H, work.normals, work.dual, work.dual_right
     for a in range(before, m):
@@ -856,9 +862,9 @@ def add_dual_rows(work: Work, N, before, m):
 def step(arm: Arm, points: Points, course: Course, work: Work, Q, F, min_force, N):
     """Compute the step that minimises the model of :func:`prepare` within clearances, limits and minimum forces.
 
-    The matrix is factorised in place. Violated constraints are added step by step, and the dual problem
-    min ½ λᵀ A H⁻¹ Aᵀ λ − λ·(b − A x_0) of the constraints so far is solved. The change of the postures is in
-    ``work.change``. Returns twice the decrease of the model, −g·x − λ·b.
+    The matrix is factorised in place. Violated constraints are added one after the other, and the dual problem
+    min ½ λᵀ A H⁻¹ Aᵀ λ − λ·(b − A x_0) of the constraints added so far is solved. The change of the postures is written
+    to ``work.change``. Returns twice the decrease of the model, −g·x − λ·b.
     """
     n, c, P = arm.parent.shape[0], points.friction.shape[0], points.body.shape[0]
     K, E = Q.shape[0], course.knot.shape[0]

@@ -1,4 +1,4 @@
-"""Dense references of a plan: postures on hand path and surfaces at many instants, with their heat."""
+"""Dense references of a plan: postures at many instants that keep hand and braces on path and surfaces; their heat."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from dynsim.scenario import build
 
 # Minimum number of instants per pass along the path (at least two per knot), and maximum time between instants [s].
 INSTANTS, SPACING = 50, 0.1
-# Hand speed below which the hand is at rest [m/s].
+# Hand speed below which the hand counts as at rest [m/s].
 REST_SPEED = 1e-2
 # Number of instants at which links are checked for contact with each other.
 CHECKS = 11
@@ -41,9 +41,9 @@ class Dense:
     rests : bool
         Whether the references start and end at rest.
     fine : (M,) ndarray
-        Times of the statics [s].
+        Times at which the statics are evaluated [s].
     torques : (M, n) ndarray
-        Torques of the moved joints [N m, or N if prismatic].
+        Torques of the moving joints [N m, or N if prismatic].
     forces : (M, c) ndarray
         Normal forces of the braces [N].
     heat : float
@@ -68,9 +68,9 @@ class Dense:
 def references(task: Task, braces: tuple[Candidate, ...], knots: Array, Q: Array, factor: int = 1) -> Dense | str:
     """Compute dense references through postures at knots.
 
-    The references are a spline through the knots, projected onto path and surfaces at every instant. Their heat is
-    computed with :func:`dynsim.compile.references.inverse_kinematics.pressing`, including accelerations and losses, and
-    with the full friction of a creeping brace.
+    The references are a spline through the knots that is projected onto path and surfaces at every instant. Their heat
+    is computed with :func:`dynsim.compile.references.inverse_kinematics.pressing`, including accelerations and losses,
+    and with the full friction of a creeping brace.
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ def references(task: Task, braces: tuple[Candidate, ...], knots: Array, Q: Array
     Q : (K, n) ndarray
         Postures at the knots [rad or m].
     factor : int, optional
-        Factor on the number of instants.
+        Factor by which the number of instants is multiplied.
 
     Returns
     -------
@@ -169,7 +169,7 @@ def nearest(
 ) -> tuple[float, str, float]:
     """Find the smallest distance of an unbraced point from a surface.
 
-    Links with both ends braced may rest on the surface.
+    A link that is braced at both ends may rest on the surface.
 
     Parameters
     ----------
@@ -218,9 +218,9 @@ def nearest(
 
 
 def touching_links(task: Task, times: Array, q: Array) -> str:
-    """Check at some instants of the first pass whether links touch each other, except neighbours.
+    """Check whether links that are not neighbours touch each other, at some instants of the first pass.
 
-    Returns a text with the links and the time; empty if none touch.
+    Returns a text with the links and the time; empty if no links touch.
     """
     chosen = np.unique(np.linspace(0, np.searchsorted(times, task.span), CHECKS).astype(int))
     arm, links = task.arm, task.arm.model.robot.links
@@ -230,7 +230,7 @@ def touching_links(task: Task, times: Array, q: Array) -> str:
     lines = np.array([axis_lines(arm, row) for row in q[chosen]])
     a, b = np.triu_indices(len(segments), 1)
     first, second = lines[:, a], lines[:, b]
-    # Neighbours share a joint, also across a link of zero length.
+    # Neighbours share a joint, possibly across a link of zero length.
     apart = np.linalg.norm(first[:, :, :, None] - second[:, :, None], axis=-1).min(axis=(0, 2, 3)) > 1e-9
     joints, radii = (np.array([segment[i] for segment in segments]) for i in (0, 2))
     parents = arm.tables.parent[joints]

@@ -23,8 +23,8 @@ def check_plan_folder(folder: Path) -> None:
 def save_plan(plan: BracePlan, folder: Path, figures: bool = True, kind: str = "png") -> None:
     """Write the files of a plan to a folder and replace the files of an earlier plan.
 
-    If no plan was found, only plan.json and the tables are written; without ``figures`` view.html is omitted. Other
-    files of an earlier plan are removed, because they would not match the new numbers.
+    If no plan was found, only plan.json and the tables are written. Without ``figures``, the figures and view.html are
+    omitted. Remaining files of an earlier plan are removed, because they would not match the new numbers.
     """
     folder.mkdir(parents=True, exist_ok=True)
     drawn = [folder / "view.html", *(folder / "figures").glob("plan_*")]

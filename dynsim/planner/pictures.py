@@ -1,4 +1,4 @@
-"""Figures of a plan, and a 3D page of the best plan next to the unbraced arm."""
+"""Figures of a plan, and a 3D page that shows the best plan next to the unbraced arm."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def _view(task: Task) -> Projection:
 
 
 def _poses(task: Task, size: Size, view: Projection) -> list[Pose]:
-    """Return the arm at some instants of the first pass."""
+    """Return the poses of the arm at several instants of the first pass."""
     arm, model, dense = task.arm, task.arm.model, size.dense
     surfaces = build.surfaces(task.scenario)
     poses = []

@@ -1,4 +1,4 @@
-"""Plan as a runnable scenario: initial posture, joint references, pressing braces and gains."""
+"""Plan as a runnable scenario: initial posture, joint references, brace forces and gains."""
 
 from __future__ import annotations
 
@@ -13,11 +13,12 @@ from dynsim.planner.problem import Candidate, Task
 from dynsim.scenario import Scenario
 from dynsim.scenario.reading import scenario_from_resolved
 
-# Decimal places of the waypoints: accurate to a nanometre at the hand.
+# Number of decimal places of the waypoints, which makes the hand accurate to a nanometre.
 DIGITS = 10
-# Gain of joints that press no brace [V/rad], and fraction of the largest lever below which a joint presses no brace.
+# Gain of joints that do not press any brace [V/rad], and fraction of the largest lever arm below which a joint counts
+# as such.
 STIFF, FREE = 500.0, 0.05
-# Number of instants at which levers are compared.
+# Number of instants at which lever arms are compared.
 SAMPLES = 12
 # Keys of the controller that a plan replaces.
 REPLACED = (
@@ -39,21 +40,22 @@ def method(task: Task) -> str:
     """Return the integration method for plans.
 
     If several braces stick at the turning points of a path, an event-driven method may open and close them endlessly.
-    The heats of both methods agree to 1e-4. A mobile base requires events, to detect tipping.
+    The heats of both methods agree to 1e-4. A mobile base requires an event-driven method, which detects tipping.
     """
     return "time_stepping" if task.arm.model.robot.base is None else "auto"
 
 
 def damping_gain(k_p: float) -> float:
-    """Return k_d [V s/rad] for k_p [V/rad], scaled from the published arm (500 and 20) with the square root of k_p."""
+    """Return k_d [V s/rad] for k_p [V/rad], scaled from the gains of the published arm (k_p 500, k_d 20) by √k_p."""
     return 20.0 * float(np.sqrt(k_p / 500.0))
 
 
 def stiffness_gains(task: Task, braces: tuple[Candidate, ...], dense: Dense, k_p: float) -> Array:
     """Return k_p of each moved joint, shape (n,): ``k_p`` for joints that press braces, otherwise at least STIFF.
 
-    A joint that moves no brace along the normal tolerates any error of the surface at any stiffness, e.g. the yaw of
-    an arm on a floor, and joints beyond the last brace. With low gains these joints would not hold the hand in place.
+    A joint that moves no brace along the normal tolerates any surface error at any stiffness. Examples are the yaw
+    joint of an arm on a floor, and joints beyond the last brace. With low gains these joints would not hold the hand in
+    place.
     """
     if not braces:
         return np.full(task.arm.n, k_p)
@@ -128,7 +130,7 @@ def scenario(
     variant: str = "",
     more: Mapping[str, Any] | None = None,
 ) -> Scenario:
-    """Return the plan as a scenario; ``more`` has additional sections."""
+    """Return the plan as a scenario; ``more`` contains additional sections."""
     shared, own = shared_sections(task), plan_sections(task, braces, dense, k_p)
     return scenario_from_resolved(
         {

@@ -21,17 +21,18 @@ from dynsim.planner.arm import MovingArm, Problem, axis_points, moving_arm, work
 from dynsim.planner.compiled import Course, Points
 from dynsim.scenario import Scenario, build
 
-# Weight of the curvature of the postures along the path [W/rad²], for uniqueness; excluded from the reported cost.
+# Weight of the curvature of the postures along the path [W/rad²]. It makes the solution unique and is excluded from the
+# reported cost.
 SMOOTHNESS = 1e-3
-# Positions along links with a required clearance, in addition to the ends, as fractions of the length.
+# Points along links that must keep a clearance, in addition to the ends, as fractions of the link length.
 ALONG = (0.33, 0.67)
 # Clearance of these points [m].
 LINK_CLEARANCE = 2e-3
-# Slip v_s [m/s] at which friction approaches its full value. The final value charges a creeping brace with the full
-# friction; planned voltages use a smoother friction, so that they do not oscillate. The search starts with larger
-# values, which allow long steps and have few local optima.
+# Slip v_s [m/s] at which friction approaches its full value. With the final value, a creeping brace has the full
+# friction. Planned voltages use smoother friction, so that they do not oscillate. The search starts with larger values,
+# which allow long steps and have few local optima.
 FINAL_SLIP_SCALE, FINE_SLIP_SCALE, COARSE_SLIP_SCALE = 1e-3, 3e-3, 1e-2
-# Maximum distance between equal targets [m].
+# Distance below which two targets count as equal [m].
 SAME = 1e-6
 
 Kind = Literal["there_and_back", "closed", "open"]
@@ -70,7 +71,7 @@ class Candidate:
 
     @property
     def location(self) -> tuple[str, tuple[float, float, float]]:
-        """Body and point, without the surface; a point can use only one surface at a time."""
+        """Body and point of the candidate, without its surface; a point can use only one surface at a time."""
         return self.body, self.point_m
 
     @property
@@ -110,7 +111,7 @@ Key = tuple[int, int, tuple[float, ...]]
 
 
 def key(joint: int, surface: int, point: Array) -> Key:
-    """Return a key that is equal for equal points and surfaces, given the indices of joint and surface."""
+    """Return a key that is the same for equal points and surfaces, given the indices of joint and surface."""
     return joint, surface, tuple(point.round(9).tolist())
 
 
@@ -124,7 +125,7 @@ class Options:
         Links, ranges of links ``first:last``, frames or declared contact points; empty: all links except the first
         two, and all declared points.
     along : tuple of float
-        Fractions of the link length with additional candidates, 0 to 1.
+        Fractions of the link length, 0 to 1, at which there are additional candidates.
     radius_m : float or None
         Radius of the candidates [m]; None: the radius of the link or of the declared point.
     count : tuple of int
@@ -170,7 +171,7 @@ class Task:
 
     @property
     def without_radius(self) -> list[str]:
-        """Names of candidates that have radius zero because their link has no radius."""
+        """Names of the candidates whose radius is zero because their link has no radius."""
         if self.options.radius_m is not None:
             return []
         declared = self.scenario.config.contacts.points
@@ -207,7 +208,7 @@ class Task:
 
     @property
     def span(self) -> float:
-        """Time that the knots cover [s]: half of the duration for a path there and back."""
+        """Time that the knots cover [s], which is half of the duration for a path there and back."""
         return 0.5 * self.duration if self.kind == "there_and_back" else self.duration
 
     def times(self, count: int) -> Array:
@@ -220,7 +221,7 @@ class Task:
 
     @cached_property
     def clear(self) -> dict[Key, Clear]:
-        """Points that must stay clear unless they are braced; for planes the ends of links are sufficient."""
+        """Points that must stay clear of surfaces unless they are braced; for planes, the ends of links suffice."""
         robot, arm = self.arm.model.robot, self.arm
         points: dict[Key, Clear] = {}
         rng = np.random.default_rng(0)
@@ -265,11 +266,11 @@ class Task:
         )
 
     def course(self, count: int) -> Course:
-        """Return ``count`` knots, and instants halfway between neighbouring knots with the chord as velocity.
+        """Return ``count`` knots, and instants halfway between neighbouring knots, whose velocities are chord slopes.
 
-        Both are second-order accurate in the knot spacing. With the slopes of a spline the optimiser would make the
-        slip vanish at the knots and slide in between; with chords at the postures of the knots it would avoid much of
-        the real friction by joints that turn against each other.
+        Both are second-order accurate in the knot spacing. If velocities were the slopes of a spline, the optimiser
+        would make the slip vanish at the knots and slide in between. If chords were used at the postures of the knots,
+        it would avoid much of the real friction by turning joints against each other.
         """
         times, closed = self.times(count), self.kind == "closed"
         pairs = [(k, (k + 1) % count) for k in range(count if closed else count - 1)] if count > 1 else []
@@ -298,7 +299,7 @@ class Task:
     def problem(self, braces: Sequence[Candidate], count: int, slip_scale: float = COARSE_SLIP_SCALE) -> Problem:
         """Return the problem for one brace set and ``count`` knots.
 
-        Its targets are private; its workspace is shared by all sets of the same size.
+        Each problem has its own targets, but shares its workspace with all sets of the same size.
         """
         course = self._cached(count, lambda: self.course(count))
         points = self._cached(tuple(braces), lambda: self.points(braces))
@@ -322,7 +323,7 @@ def task(scenario: Scenario, options: Options) -> Task:
         raise ModelError("plan: the scenario has no surfaces; add one, or use --count 0:0")
     hand = getattr(scenario.controller, "hand", None)
     if hand is None:
-        raise ModelError("plan: the scenario has no controller.hand.path; add a path of the hand")
+        raise ModelError("plan: the scenario has no controller.hand.path; add a path for the hand")
     path = families.build("path", hand.path, BuildContext(scenario.duration_s), HandPath)
     arm = moving_arm(model, surfaces)
     unknown = [name for name in options.surfaces if name not in surfaces]
@@ -331,18 +332,18 @@ def task(scenario: Scenario, options: Options) -> Task:
     chosen = options.surfaces or tuple(surfaces)
     candidates = _candidates(scenario, arm, options, chosen)
     if not candidates and options.count[1] > 0:
-        raise ModelError("plan: no candidates for braces; list links or contact points in --candidates")
+        raise ModelError("plan: there are no candidates for braces; list links or contact points in --candidates")
     points = len({candidate.location for candidate in candidates})
     if options.count[0] > points:
         raise ModelError(
-            f"plan: {options.count[0]} braces requested, but only {points} candidates exist; lower --count"
+            f"plan: {options.count[0]} braces are requested, but there are only {points} candidates; lower --count"
         )
     kind = _kind(path, scenario.duration_s)
     return Task(scenario, options, arm, path, kind, tuple(candidates), scenario.config.contacts.friction)
 
 
 def _kind(path: HandPath, duration: float) -> Kind:
-    """Return whether a path returns along itself, returns to its start, or is open."""
+    """Return the kind of a path: it goes there and back, returns to its start, or is open."""
     times = np.linspace(0.0, duration, 33)
     there = np.asarray(path.position(times))
     if np.abs(there - there[::-1]).max() <= SAME and np.ptp(there, axis=0).max() > SAME:

@@ -1,8 +1,8 @@
-"""Search over sets of braces that grow by one brace at a time from the best smaller sets.
+"""Search over sets of braces, which grow from the best smaller sets by one brace at a time.
 
-For each number of braces, all sets are solved at one posture of the path without slip, and the best sets at a few knots
-with slip; the best of these get one more brace. A set without a solution is "not found", not "impossible", because the
-solver starts from postures of other sets.
+For each number of braces, all sets are solved at one posture of the path without slip, then the best sets are solved at
+a few knots with slip. The best of these are extended by one more brace. A set without a solution is "not found", not
+"impossible", because the solver starts from postures of other sets.
 """
 
 from __future__ import annotations
@@ -21,23 +21,25 @@ from dynsim.planner.arm import Local, solve
 from dynsim.planner.dense import Dense, references, touching_links
 from dynsim.planner.problem import COARSE_SLIP_SCALE, FINAL_SLIP_SCALE, FINE_SLIP_SCALE, Candidate, Task
 
-# Number of sets per size that continue to the next stage and to the next size.
+# Number of sets with the same number of braces that continue to the next stage and to the next number of braces.
 BEAM = 3
 # Number of start postures per round, and maximum number of random postures tried to find them.
 POSTURES, DRAWS = 4, 60
 # Range of the standard deviation of random joint angles [rad], and standard deviation of prismatic joints [m].
 SPREAD, PRISMATIC_SPREAD = (0.3, 1.5), 0.2
-# Number of sets per size and round that are solved along the whole path, and per size that are refined at the end.
+# Number of sets of each size that are solved along the whole path in each round, and number of sets of each size that
+# are refined at the end.
 PATHS, KEPT = 4, 3
-# Number of sets per size whose neighbours are tried along the whole path.
+# Number of sets of each size whose neighbours are tried along the whole path.
 NEIGHBOURS = 5
-# Maximum ratio of a neighbour's cost to the least cost of its size.
+# Maximum ratio of a neighbour's cost to the least cost of all sets of its size.
 PROMISING = 1.25
 # Relative difference below which two costs of a set belong to the same path; maximum ratio of a path's cost to the
-# least cost for further refinement; maximum number of refined paths per set.
+# least cost up to which the path is refined further; maximum number of refined paths per set.
 SAME_COST, NEAR, ALTERNATIVES = 1e-3, 1.1, 6
-# Number of knots of closed and of other whole paths. For the sets that are kept, and for the best set, the knots are
-# doubled up to the next two numbers, or until the dense references cost less than the last factor times the knots.
+# Number of knots of closed paths and of other whole paths. The number of knots is doubled up to the third number for
+# the sets that are kept, and up to the fourth for the best set, or until the dense references cost less than the last
+# factor times the cost at the knots.
 CLOSED_KNOTS, PATH_KNOTS, FINE_KNOTS, MOST_KNOTS, CONVERGED = 24, 17, 30, 60, 1.01
 
 Set = tuple[Candidate, ...]
@@ -60,7 +62,7 @@ class Planned:
 
 
 class PosturePath(NamedTuple):
-    """Cost of a set at few knots [W], and its solution along the whole path; None if the path is out of reach."""
+    """Cost of a set at few knots [W], and its solution along the whole path, None if the path is out of reach."""
 
     coarse: float
     local: Local | None
@@ -75,13 +77,13 @@ class Tally:
     solves : int
         Number of local problems solved.
     drawn, drawn_on : int
-        Number of random postures tried, and number that could be projected onto the path.
+        Number of random postures tried, and number of these that could be projected onto the path.
     reached, missed : set
-        Sets with and without a posture.
+        Sets for which a posture was found, and sets for which none was found.
     heats : dict
-        Best heat of each round along the path at the knots [W], by number of braces; inf without a path.
+        Best heat of each round along the path, at the knots [W], by number of braces; inf if no path was found.
     refused : dict
-        Rejected sets, with the reason.
+        Rejected sets, each with the reason.
     """
 
     solves: int = 0
@@ -100,7 +102,7 @@ class Search:
         self.task, self.tally, self.kept = task, Tally(), KEPT
         self._tell = tell or (lambda text, share: None)
         self.single_heats: dict[Set, float] = {}
-        # Number of braces → least heat of a whole path at its knots [W], over rounds and exchanges.
+        # Least heat of a whole path at its knots [W] over rounds and exchanges, by number of braces.
         self.least_heat: dict[int, float] = {}
         self._rng = np.random.default_rng(task.options.seed)
         self.coarse = 4 if task.kind == "closed" else 3
@@ -109,7 +111,7 @@ class Search:
     def solve(
         self, braces: Set, start: Array, count: int, turns: int = 40, slip_scale: float = COARSE_SLIP_SCALE
     ) -> Local | None:
-        """Find the local optimum from postures at other knots, or from one posture."""
+        """Find the local optimum, starting from postures at other knots or from one posture."""
         self.tally.solves += 1
         return solve(self.task.problem(braces, count, slip_scale), self.spread(start, count), turns)
 
@@ -124,7 +126,7 @@ class Search:
         return reals(np.stack([np.interp(wanted, times, column) for column in known.T], axis=1))
 
     def _starts(self, first: bool) -> list[Array]:
-        """Return random postures with the hand in the middle of the path, clear of all surfaces.
+        """Return random postures that are clear of all surfaces, with the hand at the middle of the path.
 
         The first round also tries the initial posture.
         """
@@ -142,14 +144,14 @@ class Search:
         return postures
 
     def draw(self) -> Array:
-        """Draw a random posture around the initial posture, with a random spread."""
+        """Draw a random posture near the initial posture; its standard deviation is also random."""
         tables, rng = self.task.arm.tables, self._rng
         initial = self.task.arm.model.robot.initial[list(self.task.arm.columns)]
         spread = np.where(tables.prismatic, PRISMATIC_SPREAD, rng.uniform(*SPREAD))
         return np.clip(initial + spread * rng.normal(size=len(spread)), tables.lower, tables.upper)
 
     def never_clear(self) -> list[str]:
-        """Return the points that violate their clearance in all of some random postures."""
+        """Return the points that violate their clearance in every one of a number of random postures."""
         problem, greatest = self.task.problem((), 1), np.full(len(self.task.clear), -np.inf)
         for _ in range(DRAWS):
             problem.evaluate(reals(self.draw())[None], np.zeros((1, 0)))
@@ -158,10 +160,10 @@ class Search:
         return [point.label for point, gap in zip(points, greatest, strict=True) if gap < point.margin]
 
     def run(self) -> dict[int, list[Planned]]:
-        """Search; return the best sets of each size, sorted by heat along their dense references.
+        """Run the search and return the best sets of each size, sorted by heat along their dense references.
 
-        The list of a size may be empty. Rounds are independent searches from different postures; how often they agree
-        is the only measure of the distance to the optimum.
+        The list of a size may be empty. Rounds are independent searches from different postures. The number of rounds
+        that agree is the only indication of how close the result is to the optimum.
         """
         least, most = self.task.options.count
         paths: dict[Set, list[PosturePath]] = {}
@@ -183,7 +185,8 @@ class Search:
     def _path(self, known: list[PosturePath], cost: float, braces: Set, Q: Array) -> float:
         """Solve a whole path from postures at few knots, add it to the known paths of its set, and return its heat [W].
 
-        Nearly equal costs at few knots belong to the same path; a cost far above the least cost is ignored (inf).
+        Nearly equal costs at few knots belong to the same path. A path whose cost is far above the least cost is
+        ignored (inf).
         """
         if cost > NEAR * min((path.coarse for path in known), default=math.inf):
             return math.inf
@@ -195,9 +198,10 @@ class Search:
         return math.inf if local is None else local.heat
 
     def _exchange(self, paths: dict[Set, list[PosturePath]], most: int) -> None:
-        """Solve whole paths of the neighbours of the best sets, with one brace less or more, until none are new.
+        """Solve whole paths for the neighbours of the best sets, with one brace less or more, until no new sets remain.
 
-        Sets rank differently along the path than at few knots, and few sets are close to a random posture.
+        This is useful because the ranking of sets along the path differs from their ranking at few knots, and because
+        few sets are close to a random posture.
         """
         changes = [*((size, -1) for size in range(most, 1, -1)), *((size, 1) for size in range(most))]
         changed, going_on = set[tuple[Set, int, float]](), True
@@ -217,7 +221,7 @@ class Search:
                             least = min(least, local.cost)
 
     def _best(self, paths: Mapping[Set, list[PosturePath]], size: int) -> list[tuple[Local, Set]]:
-        """Return the best path of each set of a size, sorted by cost."""
+        """Return the best path of each set with ``size`` braces, sorted by cost."""
         best = [
             (min((path.local for path in some if path.local is not None), key=_cost), braces)
             for braces, some in paths.items()
@@ -244,7 +248,7 @@ class Search:
                 slipping += self._slipping(self._cheap(swaps, True), 2)
                 slipping.sort(key=lambda item: item[0])
             best[size] = slipping[:BEAM]
-            # If no set of this size has a path, its best single postures still serve as starts of larger sets.
+            # If no set of this size has a path, the best single postures still serve as starts for larger sets.
             front = [(braces, [Q[len(Q) // 2]]) for _, braces, Q in best[size]] or [
                 (braces, [cheap[braces].Q]) for braces in sorted(cheap, key=lambda braces: cheap[braces].cost)[:BEAM]
             ]
@@ -339,7 +343,7 @@ class Search:
         return [self._finest(plan, MOST_KNOTS) for plan in planned[:1]] + planned[1:]
 
     def _finer(self, braces: Set, coarse: Local, count: int) -> Planned | str:
-        """Solve a path with more knots and its dense references; return the reason as text if they are not feasible."""
+        """Solve a path with more knots and its dense references; if they are infeasible, return the reason as text."""
         local = self.solve(braces, coarse.Q, count, 20, FINAL_SLIP_SCALE) or coarse
         times = self.task.times(len(local.Q))
         dense = references(self.task, braces, times, local.Q)
@@ -348,7 +352,7 @@ class Search:
         return touching_links(self.task, dense.times, dense.q) or Planned(braces, times, local, dense)
 
     def _finest(self, plan: Planned, most: int) -> Planned:
-        """Double the knots until the dense references cost the same as the knots, up to ``most`` knots."""
+        """Double the number of knots, up to ``most``, until the dense references cost the same as the knots."""
         while plan.heat > CONVERGED * plan.local.heat and len(plan.times) < most:
             finer = self._finer(plan.braces, plan.local, 2 * len(plan.times) - (self.task.kind != "closed"))
             if isinstance(finer, str) or finer.heat >= plan.heat:
@@ -357,7 +361,7 @@ class Search:
         return plan
 
     def _walked(self, braces: Set, Q: Array, count: int) -> Local | None:
-        """Solve a path knot by knot from a posture in the middle, if solving all knots at once fails."""
+        """Solve a path knot by knot, starting from a posture in the middle; used if solving all knots at once fails."""
         whole = self.task.problem(braces, count)
         targets, middle = whole.course.target, count // 2
         single = self.task.problem(braces, 1)
@@ -383,5 +387,5 @@ def _fits(braces: Sequence[Candidate]) -> bool:
 
 
 def _same(cost: float, other: float) -> bool:
-    """Return whether two paths of a set have the same cost, and so are the same path."""
+    """Return whether two paths of a set have the same cost and therefore count as the same path."""
     return abs(cost - other) <= SAME_COST * other

@@ -1,4 +1,4 @@
-"""Verification of plans by simulation with planned and changed friction, and with displaced surfaces."""
+"""Verification of plans by simulation with planned and modified friction, and with displaced surfaces."""
 
 from __future__ import annotations
 
@@ -21,24 +21,25 @@ from dynsim.studies.batch import simulate_batch
 
 # Fraction of a driver's current limit at which the limit counts as reached.
 AT_LIMIT = 0.999
-# Distance from a joint limit at which the joint touches its stop [rad or m].
+# Distance from a joint limit at which the joint counts as at its stop [rad or m].
 AT_STOP = 1e-6
-# Depth beyond which an unbraced point touches a surface [m]; allows for sampling and the tolerance of references.
+# Depth beyond which an unbraced point counts as touching a surface [m]; it allows for sampling and for the tolerance of
+# references.
 DEPTH_MAX = 1e-4
 # Maximum number of gains tried per plan.
 TRIES = 3
-# Number of bisections for the tolerated error.
+# Number of bisections to find the tolerated error.
 STEPS = 5
 
 
 @dataclass(frozen=True)
 class Tolerances:
-    """Corners to simulate, and the limits that a plan must meet in all of them.
+    """Corner cases to simulate, and the limits that a plan must meet in all of them.
 
     Attributes
     ----------
     friction : tuple of float
-        Factors on μ.
+        Factors by which μ is multiplied.
     shift_m : tuple of float
         Displacements of all surfaces upwards, against gravity [m].
     heat : float
@@ -50,7 +51,7 @@ class Tolerances:
     turn_rad : float
         Maximum rms angle between the hand's orientation and its reference [rad].
     wall_s : float
-        Maximum wall-clock time of a corner [s].
+        Maximum wall-clock time of the simulation of a corner case [s].
     gains : tuple of float
         Gains k_p to choose from, in decreasing order [V/rad].
     """
@@ -77,12 +78,12 @@ class Tolerances:
 
 @dataclass(frozen=True)
 class Corner:
-    """Run with changed friction and surfaces.
+    """Corner case: a run with modified friction and surfaces.
 
     Attributes
     ----------
     friction_factor : float
-        Factor on μ.
+        Factor by which μ is multiplied.
     surface_shift_m : float
         Displacement of all surfaces upwards [m].
     heat_W : float
@@ -96,9 +97,9 @@ class Corner:
     hand_turn_rms_rad : float
         Rms error of the hand's orientation [rad]; NaN without a reference orientation.
     closed_fraction : dict
-        Fraction of the time that each brace touches.
+        Fraction of the time during which each brace touches its surface.
     reason : str
-        Why the corner is rejected, with time and quantity; empty if it is accepted.
+        Reason why the corner case is rejected, with time and quantity; empty if it is accepted.
     """
 
     friction_factor: float
@@ -119,19 +120,19 @@ class Corner:
 
 @dataclass(frozen=True)
 class Verdict:
-    """Corners of one plan with its gain; the first corner is the nominal run."""
+    """Corner cases of one plan with its gain; the first corner case is the nominal run."""
 
     k_p: float
     corners: tuple[Corner, ...]
 
     @property
     def reason(self) -> str:
-        """Reason of the first rejected corner; empty if all are accepted."""
+        """Reason for rejecting the first rejected corner case; empty if all are accepted."""
         return next((f"{c.label}: {c.reason}" for c in self.corners if c.reason), "")
 
     @property
     def survives(self) -> bool:
-        """Whether all corners are accepted."""
+        """Whether all corner cases are accepted."""
         return bool(self.corners) and not self.reason
 
     @property
@@ -141,21 +142,22 @@ class Verdict:
 
     @property
     def nominal(self) -> Corner | None:
-        """Nominal run; None without corners."""
+        """Nominal run; None if there are no corner cases."""
         return self.corners[0] if self.corners else None
 
 
 class Verifier:
-    """Simulation of the corners of plans, several at a time."""
+    """Simulation of the corner cases of several plans at a time."""
 
     def __init__(self, task: Task, tolerances: Tolerances, jobs: int = 1) -> None:
         self.task, self.tolerances, self.jobs = task, tolerances, jobs
 
     def verify(self, plans: Sequence[tuple[tuple[Candidate, ...], Dense]]) -> list[Verdict]:
-        """Return the verdict of each plan with the largest gain that survives, or with the last gain tried.
+        """Return the verdict on each plan for the largest gain with which it survives, or for the last gain tried.
 
-        Statics determine the first gain: a displacement δ changes the force of a brace by δ/(J K⁻¹ Jᵀ), K = K_m k_p/R.
-        Smaller gains follow. The nominal run is simulated first; if it fails, the other corners are skipped.
+        The first gain follows from statics: a displacement δ changes the force of a brace by δ/(J K⁻¹ Jᵀ), with
+        K = K_m k_p/R. Then smaller gains are tried. The nominal run is simulated first; if it fails, the other corners
+        are skipped.
         """
         gains = self.tolerances.gains
         first, *others = [(mu, shift) for shift in self.tolerances.shift_m for mu in self.tolerances.friction]
@@ -173,12 +175,12 @@ class Verifier:
             for k, n in enumerate(sound):
                 corners = corners_of_all[k * len(others) : (k + 1) * len(others)]
                 verdicts[n] = Verdict(trial[n], (*verdicts[n].corners, *corners))
-            # If the nominal run fails, smaller gains make it worse.
+            # If the nominal run fails, it would be even worse with smaller gains.
             left = {n: tried for n, tried in left.items() if tried and n in sound and not verdicts[n].survives}
         return [verdicts[number] for number in range(len(plans))]
 
     def _runs(self, runs: Sequence[tuple[tuple[Candidate, ...], Dense, float, tuple[float, float]]]) -> list[Corner]:
-        """Simulate corners of several plans in parallel."""
+        """Simulate corner cases of several plans in parallel."""
         if not runs:
             return []
         scenarios = [self.perturbed(braces, dense, k_p, *corner) for braces, dense, k_p, corner in runs]
@@ -194,7 +196,7 @@ class Verifier:
     def perturbed(
         self, braces: tuple[Candidate, ...], dense: Dense, k_p: float, friction: float = 1.0, shift: float = 0.0
     ) -> Scenario:
-        """Return the plan's scenario with changed friction and displaced surfaces."""
+        """Return the plan's scenario with modified friction and displaced surfaces."""
         more: dict[str, Any] = {}
         if friction != 1.0 or shift != 0.0:
             more["surface_error"] = {"shift_m": (shift * self._up).tolist(), "friction_factor": friction}
@@ -208,7 +210,7 @@ class Verifier:
         return -gravity / np.linalg.norm(gravity)
 
     def _tolerates(self, braces: tuple[Candidate, ...], dense: Dense, k_p: float) -> bool:
-        """Return whether, by statics, the heat stays within its limit at the maximum displacement of the surfaces."""
+        """Return whether, according to statics, the heat stays within its limit at the maximum surface displacement."""
         worst = self.tolerances.most_shift
         if not braces or worst == 0.0:
             return True
@@ -276,14 +278,14 @@ class Verifier:
         return Corner(mu, shift, heat, rms, energy, rate, turn, closed, reason)
 
     def _touches(self, braces: tuple[Candidate, ...], record: Record, shift: float) -> str:
-        """Return a text about an unbraced point that touches a surface; empty if none does."""
+        """Return a text about an unbraced point that touches a surface; empty if no such point does."""
         arm = self.task.arm
         places = np.array([record.labels["q"].index(joint) for joint in arm.joints])
         q = record["q"][:, places]
         # The surfaces of the run are displaced by the shift.
         distance, part, when = nearest(self.task, braces, record.time, q, shift * self._up)
         if distance < -DEPTH_MAX:
-            return f"{part}: touches without being a brace, {-1e3 * distance:.3g} mm deep at t = {when:.3g} s"
+            return f"{part}: touches although it is not a brace, {-1e3 * distance:.3g} mm deep at t = {when:.3g} s"
         return ""
 
     def _limits(self, record: Record) -> str:
@@ -311,9 +313,9 @@ class Verifier:
         return ""
 
     def tolerance(self, braces: tuple[Candidate, ...], dense: Dense, k_p: float) -> tuple[float | None, float | None]:
-        """Find the largest tolerated error of the surface height [m] and of friction (relative), each by bisection.
+        """Find the largest tolerated error of surface height [m] and relative error of friction, each by bisection.
 
-        An entry is None if the tolerances include no such error.
+        An entry is None if the tolerances do not include such an error.
         """
 
         def tolerates(corner: tuple[float, float]) -> bool:

@@ -1,4 +1,4 @@
-"""Records: signals, events and scene of a run in memory and as a file, independent of the engine that made them."""
+"""Records: signals, events and scene of a run, in memory and as a file, independent of the engine that created them."""
 
 from dynsim.record.content import FORMAT, TIME, Event, Signal
 from dynsim.record.record import Record

@@ -1,4 +1,4 @@
-"""Contents of a record (signals on time axes, events, scene) and the checks that reject invalid values."""
+"""Content of a record (signals on time axes, events, scene) and checks that reject invalid values."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Signal:
     description : str
         Short description.
     axis : str
-        Name of its time axis, which has T times.
+        Name of the signal's time axis, which has T times.
     """
 
     data: NDArray[Any]
@@ -55,7 +55,7 @@ class Event:
     kind : str
         Kind of the event, such as "contact opens"; all events of a kind share this text.
     name : str
-        Name of the contact, joint, … concerned; empty for the whole run.
+        Name of the contact, joint or other part that the event concerns; empty if it concerns the whole run.
     value : float or None
         Associated number in SI units.
     description : str
@@ -92,7 +92,7 @@ def check_name(kind: str, name: str) -> None:
         If ``name`` is empty or a dot, or contains a slash or a null character.
     """
     if name in ("", ".") or "/" in name or "\0" in name:
-        raise RecordError(f"{kind} {name!r}: a name must not be empty or a dot, or contain a slash")
+        raise RecordError(f"{kind} {name!r}: a name must not be empty, be a dot, or contain a slash")
 
 
 def check_time(time: NDArray[Any], axis: str = TIME) -> None:
@@ -121,7 +121,7 @@ def check_signal(name: str, signal: Signal, samples: Mapping[str, int]) -> None:
     signal : Signal
         Signal to check.
     samples : mapping of str to int
-        Number of times of every time axis.
+        Number of times on each time axis.
 
     Raises
     ------
@@ -146,5 +146,5 @@ def check_signal(name: str, signal: Signal, samples: Mapping[str, int]) -> None:
 
 
 def is_numeric(dtype: Any) -> bool:
-    """Return whether a record can store arrays of this type: real numbers of at most 8 bytes."""
+    """Return whether a record can store arrays of this type, which must be real numbers of at most 8 bytes."""
     return bool(dtype.kind in "biuf" and dtype.itemsize <= 8)

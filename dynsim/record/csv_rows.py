@@ -13,19 +13,20 @@ from typing import Any
 from dynsim.errors import DynsimError
 from dynsim.system.inputs import read_text
 
-# Maximum file size [bytes], a few million rows.
+# Maximum file size [bytes], enough for a few million rows.
 SIZE_LIMIT = 100_000_000
-# float() also accepts "1_0" and digits of other scripts, which other programs would not read as numbers.
+# The pattern is needed because float() also accepts "1_0" and digits of other scripts, which other programs would not
+# read as numbers.
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?", re.ASCII | re.IGNORECASE)
 
 
 def read_rows(file: str, *headers: Sequence[str], kind: str) -> list[list[float]]:
-    """Return the rows of :func:`read_table`; their number of columns shows which header the file has."""
+    """Return the rows of :func:`read_table`; the number of columns shows which of the headers the file has."""
     return read_table(file, *headers, kind=kind)[1]
 
 
 def read_table(file: str, *headers: Sequence[str], kind: str) -> tuple[tuple[str, ...], list[list[float]]]:
-    """Read a header and at least two rows; the first column must increase.
+    """Read a header and at least two rows; the values in the first column must increase.
 
     Parameters
     ----------
@@ -62,7 +63,7 @@ def read_table(file: str, *headers: Sequence[str], kind: str) -> tuple[tuple[str
                 "it must increase from row to row"
             )
     if len(rows) < 2:
-        raise ValueError(f"{file}: {len(rows)} rows below the header; {kind} needs two or more")
+        raise ValueError(f"{file}: {len(rows)} rows below the header; {kind} requires two or more")
     return columns, rows
 
 
@@ -80,7 +81,7 @@ def read_grid(file: str) -> list[list[float]]:
         columns = columns or [str(k + 1) for k in range(content.count(",") + 1)]
         rows.append(_row(content, columns, f"{file}:{number}"))
     if not rows:
-        raise ValueError(f"{file}: no rows of numbers")
+        raise ValueError(f"{file}: contains no rows of numbers")
     return rows
 
 
@@ -93,7 +94,7 @@ def _lines(file: str) -> list[str]:
 
 
 def _contents(lines: Iterable[str], first: int) -> Iterator[tuple[int, str]]:
-    """Yield the lines that contain more than a comment, with their line numbers."""
+    """Yield the lines that are not empty and not only a comment, with their line numbers."""
     for number, line in enumerate(lines, first):
         if content := line.partition("#")[0].strip(" \t"):
             yield number, content
@@ -103,9 +104,9 @@ def _row(line: str, columns: Sequence[str], location: str) -> list[float]:
     cells = [cell.strip(" \t") for cell in line.split(",")]
     if len(cells) != len(columns):
         names = f": {','.join(columns)}" if columns[0] != "1" else ", as in the first row"
-        raise ValueError(f"{location}: {len(cells)} values; there must be {len(columns)}{names}")
+        raise ValueError(f"{location}: has {len(cells)} values; there must be {len(columns)}{names}")
     if not all(_NUMBER.fullmatch(cell) and math.isfinite(float(cell)) for cell in cells):
-        raise ValueError(f"{location}: {_shown(line)} must be {len(columns)} finite numbers in digits 0 to 9")
+        raise ValueError(f"{location}: {_shown(line)} must be {len(columns)} finite numbers, written in digits 0 to 9")
     return [float(cell) for cell in cells]
 
 

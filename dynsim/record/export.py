@@ -71,9 +71,9 @@ def to_xarray(record: Content) -> xarray.Dataset:
     Returns
     -------
     xarray.Dataset
-        Signals over ``time`` or their other time axes, with the attributes ``units`` and ``long_name``. Signals with
-        the same labels share a dimension, which is named after the first of them (``q_label``). The third axis of
-        vectors is ``axis`` (x, y, z), that of quaternions ``axis_4`` (w, x, y, z). Summary, provenance, events and
+        Signals over ``time`` or over their own time axes, with the attributes ``units`` and ``long_name``. Signals with
+        the same labels share a dimension, which is named after the first of them (``q_label``). The third axis is named
+        ``axis`` (x, y, z) for vectors and ``axis_4`` (w, x, y, z) for quaternions. Summary, provenance, events and
         scene are attributes, as JSON.
 
     Raises

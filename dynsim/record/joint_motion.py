@@ -22,7 +22,7 @@ from dynsim.system.files import replacing
 Format = Literal["csv", "joint-trajectory", "urdf-log"]
 SUFFIX: dict[str, str] = {"csv": ".csv", "joint-trajectory": ".trajectory.yaml", "urdf-log": ".jsonl"}
 RATES = {"q": "v", "phi": "phi_dot", "rho": "rho_dot"}
-"""Position signals of records, and the signals of their rates."""
+"""Position signals of records, each with the signal of its rates."""
 _YAML_WORDS = {"y", "n", "yes", "no", "on", "off", "true", "false", "null"}
 
 
@@ -43,8 +43,8 @@ def export_record(record: Record, path: Path, format_: Format, *, rate: float | 
     format_ : {"csv", "joint-trajectory", "urdf-log"}
         File format.
     rate : float, optional
-        Resample to this rate [Hz] (cubic Hermite), with a last row at the end of the record; default: the samples of
-        the record.
+        Rate to which the record is resampled [Hz] (cubic Hermite), with a last row at the end of the record; default:
+        the samples of the record.
 
     Returns
     -------
@@ -58,7 +58,7 @@ def export_record(record: Record, path: Path, format_: Format, *, rate: float | 
     """
     joints, time, position, velocity = joint_motion(record)
     if len(time) < 2:
-        raise RecordError("the record has only one sample; a motion needs two")
+        raise RecordError("the record has only one sample; a motion requires two")
     if rate is not None:
         if not 0 < rate < np.inf:
             raise RecordError(f"--rate must be positive, not {rate}")
@@ -85,7 +85,7 @@ def export_record(record: Record, path: Path, format_: Format, *, rate: float | 
 
 
 def joint_motion(record: Record) -> tuple[list[str], Array, Array, Array]:
-    """Return joint names, time from 0 [s], positions and rates [rad, rad/s; m, m/s] of a record.
+    """Return joint names, times starting at 0 [s], positions and rates [rad, rad/s; m, m/s] of a record.
 
     Raises
     ------
@@ -116,8 +116,10 @@ def joint_motion(record: Record) -> tuple[list[str], Array, Array, Array]:
 
 
 def _in_both(record: Record, name: str, rate: str) -> list[str]:
-    """Return joints with a column in both signals: coordinates of a planar mobile base, or of a ball joint, have no
-    rate column with the same name."""
+    """Return the joints that have a column in both signals.
+
+    The coordinates of a planar mobile base or of a ball joint have no rate column with the same name.
+    """
     for signal in (name, rate):
         if record[signal].ndim != 2 or len(record[signal]) != len(record):
             raise RecordError(
@@ -145,12 +147,12 @@ def _write_joint_trajectory(file: TextIO, joints: list[str], time: Array, q: Arr
 
 
 def _yaml_text(joint: str) -> str:
-    """Return a name unchanged if YAML reads it as text, otherwise in quotes, which YAML reads like JSON."""
+    """Return a name unchanged if YAML reads it as text, otherwise as a quoted JSON string, which YAML can read."""
     return joint if re.fullmatch(r"[A-Za-z_][\w.-]*", joint) and joint.lower() not in _YAML_WORDS else json.dumps(joint)
 
 
 def _flow(values: Array) -> str:
-    # YAML 1.1 reads "1e-05" as text: a float needs its point.
+    # Use fixed notation, because YAML 1.1 reads "1e-05" as text: a float needs a decimal point.
     return f"[{', '.join(f'{value:.9f}' for value in values)}]"
 
 

@@ -1,9 +1,9 @@
-"""Export of a record to an MCAP file of ROS 2 messages, for rosbag2, Foxglove, PlotJuggler and RViz; needs no ROS.
+"""Export of a record to an MCAP file of ROS 2 messages for rosbag2, Foxglove, PlotJuggler and RViz, without ROS.
 
 Topics: ``/joint_states``, ``/tf`` and ``/tf_static`` (each body relative to its parent; the root is ``world``),
-``/robot_description`` (see :mod:`dynsim.record.urdf_text`), and ``/contacts/NAME`` for each contact point: the force of
-its surface on it. The frame ``contact_NAME`` of this force has the axes of the world. Its origin is the point where the
-force acts (for a sphere or capsule the point of contact), so that the torque is zero.
+``/robot_description`` (see :mod:`dynsim.record.urdf_text`), and ``/contacts/NAME`` for each contact point, with the
+force that the surface exerts on it. The frame ``contact_NAME`` of this force has the axes of the world. Its origin is
+the point where the force acts (for a sphere or capsule the point of contact), so that the torque is zero.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ from dynsim.record.scene import WORLD
 from dynsim.record.urdf_text import WORLD_LINK, scene_urdf
 from dynsim.system.files import replacing
 
-# Late subscribers receive the last message too, as is usual in ROS 2 for descriptions and static frames.
+# With this setting, late subscribers also receive the last message, as is usual in ROS 2 for descriptions and static
+# frames.
 _LATCHED = (
     "- history: 1\n  depth: 1\n  reliability: 1\n  durability: 1\n  deadline: {sec: 2147483647, nsec: 4294967295}\n"
     "  lifespan: {sec: 2147483647, nsec: 4294967295}\n  liveliness: 1\n"
@@ -36,7 +37,7 @@ _LATCHED = (
 def write_mcap(record: Record, path: Path) -> Path:
     """Write joint states, frames, contact forces and the robot description at all samples of a record.
 
-    Time zero is the first sample. ``effort`` is the joint torque, NaN for joints without a motor.
+    Time zero is the first sample. ``effort`` is the joint torque; it is NaN for joints without a motor.
 
     Parameters
     ----------
@@ -60,7 +61,7 @@ def write_mcap(record: Record, path: Path) -> Path:
         writer_module = importlib.import_module("mcap.writer")
         typesys = importlib.import_module("rosbags.typesys")
     except ImportError as error:
-        raise RecordError(f"MCAP files need mcap and rosbags: pip install 'dynsim[ros]' ({error})") from error
+        raise RecordError(f"MCAP files require mcap and rosbags: pip install 'dynsim[ros]' ({error})") from error
     with replacing(path) as stream:
         bag = _Bag(writer_module.Writer(stream), typesys.get_typestore(typesys.Stores.ROS2_JAZZY))
         bag.writer.start(profile="ros2", library=f"dynsim {__version__}")
@@ -71,7 +72,7 @@ def write_mcap(record: Record, path: Path) -> Path:
 
 
 class _Bag:
-    """Create messages by type name, and write each to the channel of its topic."""
+    """Writer that creates messages by type name and writes each to the channel of its topic."""
 
     def __init__(self, writer: Any, types: Any) -> None:
         self.writer, self._types = writer, types
@@ -98,7 +99,7 @@ class _Bag:
 
 
 def _messages(record: Record, bag: _Bag) -> list[tuple[int, str, str, Any]]:
-    """Return all messages: time [ns], topic, type, content."""
+    """Return all messages as tuples of time [ns], topic, type and content."""
     joints, time, position, velocity = joint_motion(record)
     stamps = np.rint(time * 1e9).astype(np.int64).tolist()
     effort = np.zeros((len(time), 0))
@@ -122,7 +123,7 @@ def _messages(record: Record, bag: _Bag) -> list[tuple[int, str, str, Any]]:
 
 
 def _frames(record: Record, bag: _Bag, stamps: list[int]) -> list[tuple[int, str, str, Any]]:
-    """Return the robot description and the frames of bodies and contact points; nothing without a scene."""
+    """Return the robot description and the frames of bodies and contact points; the list is empty without a scene."""
     scene = record.scene
     if scene is None or not scene.bodies:
         return []

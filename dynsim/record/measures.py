@@ -1,4 +1,4 @@
-"""Quantities from the signals of a record, for summaries and figures: energy sinks, hand errors, base loads."""
+"""Quantities computed from a record's signals, for summaries and figures: energy sinks, hand errors, base loads."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import numpy as np
 from dynsim.record import Record
 from dynsim.record.quaternion import Array
 
-# Sinks of the electrical energy, in the order in which they are drawn and printed.
+# Sinks of the electrical energy, in the order in which they are plotted and printed.
 SINKS = ("heat_joule", "loss_gear", "loss_joint", "heat_friction")
-# Further sinks, under the unilateral law or with time stepping. Elastic energy counts from the start of the run.
+# Additional sinks under the unilateral law or with time stepping. Elastic energy is relative to the start of the run.
 MORE_SINKS = ("loss_impact", "loss_stop", "loss_damper", "energy_elastic", "loss_scheme")
 STORES = ("energy_kinetic", "energy_potential", "energy_magnetic")
 
@@ -20,12 +20,12 @@ STORES = ("energy_kinetic", "energy_potential", "energy_magnetic")
 RESIDUAL_LIMIT = 1e-6
 # Smallest fraction of a run that is not printed as 0.0 %.
 SHORT = 5e-4
-# Smaller fractions of the duration of a run are rounding errors.
+# Fractions of the duration of a run that are smaller than this are rounding errors.
 ROUNDED = 1e-9
 
 # States of a gripper, indexed by the signal ``gripper_state``.
 GRIPPER_STATES = ("soft", "hardening", "hardened", "softening")
-# Kind of the event at which a mobile base tips: its margin passes zero, located between samples.
+# Kind of the event at which a mobile base tips: its tip margin passes zero. The event is located between samples.
 TIP_OVER = "tip_over"
 
 
@@ -54,7 +54,10 @@ def energy_turnover(record: Record) -> float:
 
 
 def hand_target(record: Record) -> Array | None:
-    """Return the target of the hand, (T, 3) [m], or None: on the path or, for a measured run, at the joint goals."""
+    """Return the target of the hand, (T, 3) [m], or None.
+
+    The target is on the hand path; in a measured run, it is the position of the hand at the joint goals.
+    """
     return next((record[name] for name in ("target_position", "hand_position_goal") if name in record), None)
 
 
@@ -93,26 +96,26 @@ def hand_turn_error(record: Record, settle: float) -> dict[str, float | None]:
 def least_loads(record: Record, steps: Array) -> Array:
     """Return the minimum loads of wheels and caster, (3,) [N], over all samples and over all steps.
 
-    ``steps`` is the array of :func:`base_summary`; if it is empty, only the samples count.
+    ``steps`` is the array described in :func:`base_summary`; if it is empty, only the samples count.
     """
     loads = record["wheel_load"].min(axis=0, initial=np.inf)
     return np.minimum(loads, steps[:3]) if len(steps) else loads
 
 
 def base_summary(record: Record, settle: float, steps: Array, travel: Array) -> dict[str, Any]:
-    """Summarise motion and stability of a mobile base; a value that is not defined is None.
+    """Summarise motion and stability of a mobile base; undefined values are None.
 
     Parameters
     ----------
     record : Record
         Record of a mobile base.
     settle : float
-        Time from which ``tip_margin_min_settled`` and ``overturns_settled_at_s`` count [s].
+        Time from which ``tip_margin_min_settled`` and ``overturns_settled_at_s`` are evaluated [s].
     steps : ndarray, shape (4,) or (0,)
         Minimum loads [N] and minimum tip margin over all integration steps, which are closer together than the samples;
         empty if unknown.
     travel : ndarray, shape (T,)
-        Distance travelled by the midpoint of the axle along the heading, backwards negative [m].
+        Distance travelled by the midpoint of the axle along the heading [m]; negative: backwards.
     """
     pose, load, margin = record["base_pose"], record["wheel_load"], record["tip_margin"]
     tips = [event.time for event in record.events if event.kind == TIP_OVER]
@@ -141,7 +144,7 @@ def base_summary(record: Record, settle: float, steps: Array, travel: Array) -> 
 
 
 def overturns_settled(record: Record, settle: float) -> float | None:
-    """Return the first time from ``settle`` on at which a mobile base tips or has tipped [s], or None."""
+    """Return the first time [s], not before ``settle``, at which a mobile base tips or has tipped, or None."""
     time, margin = record.time, record["tip_margin"]
     late = [event.time for event in record.events if event.kind == TIP_OVER and event.time >= settle]
     late += time[(time >= settle) & (margin < 0.0)][:1].tolist()

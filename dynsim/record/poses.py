@@ -18,9 +18,9 @@ POSITION, ORIENTATION, TOUCHING = "body_position", "body_orientation", "contact_
 def add_body_poses(record: Record) -> bool:
     """Add the poses of all bodies over time as signals; return False if the positions of a joint were not recorded.
 
-    ``body_position`` (T, bodies, 3) [m] and ``body_orientation`` (T, bodies, 4), quaternions w, x, y, z without sign
-    jumps. Both are in single precision (0.1 µm at 1 m), which is enough for drawing; scene and joint positions give
-    them in double precision.
+    The signals are ``body_position`` (T, bodies, 3) [m] and ``body_orientation`` (T, bodies, 4), quaternions w, x, y, z
+    without sign jumps. Both are in single precision (0.1 µm at 1 m), which is enough for drawing. They can be computed
+    in double precision from the scene and the joint positions.
     """
     scene = record.scene
     if scene is None or not scene.bodies or not all(_recorded(record, body.joint) for body in scene.bodies):
@@ -71,7 +71,7 @@ def relative_pose(record: Record, body: Body) -> tuple[Array, Array]:
     Raises
     ------
     MissingEntry
-        If the record does not contain the positions of its joint.
+        If the record does not contain the positions of the body's joint.
     """
     columns = _columns(record, body.joint.signal) if body.joint.labels else {}
     moved = np.array([columns[label] for label in body.joint.labels])
@@ -91,7 +91,7 @@ def point_positions(record: Record, point: Point, rows: slice | int | NDArray[np
     record : Record
         Record with body poses.
     point : Point
-        Point of its scene.
+        Point in the scene of the record.
     rows : slice, int or ndarray of int, optional
         Samples; default: all.
 
@@ -109,10 +109,10 @@ def point_positions(record: Record, point: Point, rows: slice | int | NDArray[np
 
 
 def contact_positions(record: Record, point: Point, rows: slice | int | NDArray[np.intp] = slice(None)) -> Array:
-    """Return the positions where the contact force acts on a contact point, (…, 3) [m].
+    """Return the positions at which the contact force acts on a contact point, (…, 3) [m].
 
-    For a sphere or capsule this is its point nearest to the surface. Records of older versions contain only the centre
-    of a sphere and one end of a capsule.
+    For a sphere or capsule, this is the point that is nearest to the surface. Records of older versions contain only
+    the centre of a sphere and one end of a capsule.
 
     Raises
     ------
@@ -139,9 +139,9 @@ def _pose(body: Body, moved: Array, parent: tuple[Array, Array] | None, shape: t
     Parameters
     ----------
     moved : (k, …) ndarray
-        Positions of its joint [rad or m].
+        Positions of the body's joint [rad or m].
     shape : tuple of int
-        Shape of the times: () for one time, (T,) for all samples.
+        Shape of the time dimension: () for one time, (T,) for all samples.
     """
     joint = body.joint
     p, q = parent or (np.zeros((3, *shape)), np.array([np.ones(shape), *np.zeros((3, *shape))]))

@@ -19,7 +19,7 @@ def of_turn(axis: ArrayLike, angle: ArrayLike) -> Array:
 def of_matrix(R: ArrayLike) -> Array:
     """Return the quaternion with w ≥ 0 of a rotation matrix, (3, 3) → (4,)."""
     R = np.asarray(R, dtype=np.float64)
-    # 4 q_k q for the largest component q_k; dividing by a small one would lose precision.
+    # Compute 4 q_k q for the largest component q_k, because division by a small component would lose precision.
     trace = float(np.trace(R))
     squares = np.array([1.0 + trace, *(1.0 - trace + 2.0 * np.diag(R))])
     k = int(squares.argmax())
@@ -30,7 +30,7 @@ def of_matrix(R: ArrayLike) -> Array:
 
 
 def product(a: Array, b: Array) -> Array:
-    """Return the rotation a b: first b, then a."""
+    """Return the rotation a b, which applies b first, then a."""
     aw, ax, ay, az = a
     bw, bx, by, bz = b
     return np.array(

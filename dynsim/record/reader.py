@@ -31,11 +31,11 @@ from dynsim.system.files import check_complete
 from dynsim.system.inputs import is_file
 
 EVENT_COLUMNS = {"time": float, "kind": str, "name": str, "value": float, "description": str}
-"""Attributes of events; each is a data set in the group ``events``."""
+"""Attributes of events; each attribute is a data set in the group ``events``."""
 _written: set[str] = set()
 """Digests of the files that this process wrote."""
 _LABELS_IN_ATTRIBUTE = 1000
-"""More labels than this are stored as a data set: an HDF5 attribute holds at most 64 kB, which is 4090 labels."""
+"""Above this number, labels are stored as a data set, because an HDF5 attribute holds at most 64 kB, or 4090 labels."""
 
 
 def encode(content: Content) -> memoryview:
@@ -54,12 +54,12 @@ def encode(content: Content) -> memoryview:
         check_time(times, f"time axis {name!r}")
     summary, provenance = json.dumps(content.summary), json.dumps(content.provenance, default=str)
     scene = "" if content.scene is None else content.scene.to_json()
-    # Written in memory: HDF5 crashes the process if the disk is full when it closes a file.
+    # The file is written in memory, because HDF5 crashes the process if the disk is full when it closes a file.
     image = io.BytesIO()
     with h5py.File(image, "w") as file:
         file.attrs["format"] = FORMAT
         file.attrs["complete"] = content.complete
-        # Long texts are data sets: an HDF5 attribute holds at most 64 kB.
+        # Long texts are stored as data sets, because an HDF5 attribute holds at most 64 kB.
         file["summary"] = summary
         file["provenance"] = provenance
         if scene:
@@ -83,7 +83,7 @@ def encode(content: Content) -> memoryview:
 
 
 def _write(file: Any, name: str, signal: Signal) -> None:
-    # gzip only for large signals: it costs time in every run, and short records are small anyway.
+    # Use gzip only for large signals, because it takes time in every run and short records are small anyway.
     options = {"compression": "gzip", "compression_opts": 1} if signal.data.nbytes > 1 << 22 else {}
     data = file.create_dataset(name, data=signal.data, **options)
     data.attrs["unit"] = signal.unit
@@ -95,7 +95,7 @@ def _write(file: Any, name: str, signal: Signal) -> None:
 
 
 def _write_events(file: Any, events: Sequence[Event]) -> None:
-    """Write one column per attribute; a file without events has no such group."""
+    """Write one column per attribute; without events, the group is not created."""
     import h5py
 
     if not events:
@@ -126,7 +126,7 @@ def read(path: Path, *, trust: bool = False) -> Content:
     ------
     RecordError
         If the file does not exist, is damaged or is not a record; if its digest is missing or wrong and ``trust`` is
-        False; or if it may belong to another run than the files next to it.
+        False; or if it may belong to a different run than the files next to it.
     """
     try:
         if not is_file(path, RecordError):
@@ -152,7 +152,7 @@ def _digest(path: Path, stream: BinaryIO) -> tuple[str, str]:
     Raises
     ------
     RecordError
-        If it is not an HDF5 file.
+        If the file is not an HDF5 file.
     """
     size = stream.seek(0, os.SEEK_END)
     stream.seek(max(size - _LAST_LINE_SIZE, 0))
@@ -183,7 +183,7 @@ def decode(path: Path) -> Content:
     Raises
     ------
     RecordError
-        If the content is invalid; with file and reason.
+        If the content is invalid; the message contains file and reason.
     """
     import h5py
 
@@ -194,13 +194,13 @@ def decode(path: Path) -> Content:
         raise RecordError(f"{path}: {error}") from error
     except MemoryError:
         raise
-    # With damaged files h5py raises exceptions of almost any type.
+    # For damaged files, h5py raises exceptions of almost any type.
     except Exception as error:
         text = str(error).strip("'\"").splitlines() or [type(error).__name__]
         raise RecordError(f"{path}: not a readable HDF5 file ({text[0]})") from error
 
 
-# Groups of data sets, and how messages name their data sets.
+# Groups of data sets, and the names of their data sets in messages.
 _GROUPS = {"signals": "signal {!r}", "axes": "time axis {!r}", "events": "{} of the events", "labels": "labels of {!r}"}
 
 
@@ -210,7 +210,7 @@ def _describe(path: str) -> str:
 
 
 class _Reader:
-    """Reader of an open file; its errors do not name the file."""
+    """Reader of an open file; its error messages do not contain the name of the file."""
 
     def __init__(self, file: Any, size: int) -> None:
         self._file = file
@@ -224,9 +224,9 @@ class _Reader:
         if version != FORMAT:
             raise RecordError(f"unsupported record format {brief(version)}; this version of dynsim reads {FORMAT}")
         if complete is None:
-            raise RecordError("incomplete dynsim record: no attribute complete")
+            raise RecordError("incomplete dynsim record: the attribute complete is missing")
         if not isinstance(complete, (bool, np.bool_)):
-            raise RecordError("attribute complete must be true or false")
+            raise RecordError("the attribute complete must be true or false")
         axes = {TIME: self._times(TIME)}
         for name in self._names("axes"):
             if name == TIME:
@@ -257,7 +257,7 @@ class _Reader:
         kept = "labels" in attributes or "labels" not in self._file
         labels = attributes.get("labels") if kept else self._column(f"labels/{name}")
         if labels is None:
-            raise RecordError(f"incomplete dynsim record: no labels of {_describe(path)}")
+            raise RecordError(f"incomplete dynsim record: {_describe(path)} has no labels")
         texts = {key: attributes.get(key) for key in ("unit", "description")} | {"axis": attributes.get("axis", TIME)}
         for key, text in texts.items():
             if not isinstance(text, str):
@@ -273,7 +273,7 @@ class _Reader:
         for name, kind in EVENT_COLUMNS.items():
             path = f"events/{name}"
             texts = kind is str
-            columns[name] = _texts(self._column(path), f"events has {name}") if texts else self._numbers(path).tolist()
+            columns[name] = _texts(self._column(path), f"has event {name}s") if texts else self._numbers(path).tolist()
             if len(columns[name]) != len(columns["time"]):
                 counts = len(columns[name]), len(columns["time"])
                 raise RecordError(f"{_describe(path)} has {counts[0]} entries, but there are {counts[1]} times")
@@ -292,7 +292,7 @@ class _Reader:
         name = f"group {path}" if group else _describe(path)
         link = self._file.get(path, getlink=True)
         if link is None:
-            raise RecordError(f"incomplete dynsim record: no {name}")
+            raise RecordError(f"incomplete dynsim record: {name} is missing")
         if not isinstance(link, h5py.HardLink):
             raise RecordError(f"{name} is a link; links are not followed")
         item = self._file[path]
@@ -315,7 +315,7 @@ class _Reader:
         """Return a long text that is stored as a data set."""
         text = self._values(self._child(name), name)
         if not isinstance(text, bytes):
-            raise RecordError(f"{name} is not a text")
+            raise RecordError(f"{name} is not text")
         return text.decode("utf-8")
 
     def _values(self, data: Any, path: str) -> Any:

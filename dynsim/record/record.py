@@ -1,6 +1,6 @@
 """Record of a run: signals over time with units, events, scene, summary and provenance; loaded from and saved as HDF5.
 
-A record does not depend on the engine that made it: simulated and measured runs have the same form.
+A record does not depend on the engine that created it: records of simulated and measured runs have the same form.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ _SHOWN = 6
 
 
 class Entries(dict[str, Any]):
-    """Mapping whose error for a missing key lists the existing keys."""
+    """Mapping that raises an error listing the existing keys if a key is missing."""
 
     def __init__(self, kind: str, entries: Mapping[str, Any]) -> None:
         super().__init__(entries)
@@ -70,8 +70,8 @@ class Entries(dict[str, Any]):
 class Record(Content):
     """Results of one run: signals with units, events, scene and provenance.
 
-    ``record["q"]`` is the array of a signal, ``record.times("q")`` its sample times; iteration yields the signal names,
-    and ``len(record)`` is the number of samples on the main time axis.
+    ``record["q"]`` is the array of a signal, and ``record.times("q")`` returns its sample times; iteration yields the
+    signal names, and ``len(record)`` is the number of samples on the main time axis.
 
     Parameters
     ----------
@@ -83,9 +83,9 @@ class Record(Content):
     Attributes
     ----------
     time : (T,) ndarray
-        Main time axis [s].
+        Times of the main time axis [s].
     axes : dict of str to (K,) ndarray
-        Further time axes [s], for signals that are sampled at other times.
+        Additional time axes [s], for signals that are sampled at other times.
     signals : dict of str to Signal
         Signals by name.
     events : list of Event
@@ -146,12 +146,12 @@ class Record(Content):
         description : str, optional
             Short description.
         axis : str, optional
-            Name of the time axis; default: the main one. :meth:`add_axis` adds others.
+            Name of the time axis; default: the main time axis. :meth:`add_axis` adds other axes.
 
         Raises
         ------
         RecordError
-            If the name is taken by a time axis, the time axis does not exist, the data are not real numbers, or the
+            If a time axis already has this name, the time axis does not exist, the data are not real numbers, or the
             number of samples or labels is wrong.
 
         Examples
@@ -163,7 +163,7 @@ class Record(Content):
         (3, 2)
         """
         if name in self.axes:
-            raise RecordError(f"signal {name!r}: a time axis has that name")
+            raise RecordError(f"signal {name!r}: a time axis already has this name")
         signal = Signal(np.asarray(data), unit, tuple(labels), description, axis)
         samples = {TIME: len(self.time), **{axis: len(times) for axis, times in self.axes.items()}}
         check_signal(name, signal, samples)
@@ -182,7 +182,7 @@ class Record(Content):
         Raises
         ------
         RecordError
-            If the name is taken, or the times are not finite or run backwards.
+            If the name is already in use, or the times are not finite or run backwards.
 
         Examples
         --------
@@ -193,7 +193,7 @@ class Record(Content):
         """
         check_name("time axis", name)
         if name == TIME or name in self.axes or name in self.signals:
-            raise RecordError(f"the name {name!r} is taken by another time axis or by a signal")
+            raise RecordError(f"the name {name!r} is already used by a time axis or a signal")
         axis = np.asarray(times, dtype=np.float64)
         check_time(axis, f"time axis {name!r}")
         self.axes[name] = axis
@@ -239,7 +239,7 @@ class Record(Content):
         kind : str
             Kind of the event, such as "contact opens".
         name : str, optional
-            Name of the contact, joint, … concerned; default: the whole run.
+            Name of the contact, joint or other part that the event concerns; default: the whole run.
         value : float, optional
             Associated number in SI units; NaN counts as None.
         description : str, optional
@@ -331,13 +331,13 @@ class Record(Content):
 
     @property
     def settle_time(self) -> float:
-        """Time before which tracking errors do not count [s]; 0 if unknown."""
+        """Time before which tracking errors are not evaluated [s]; 0 if unknown."""
         metrics = self._scenario.get("metrics")
         return float(metrics.get("settle_s", 0.0)) if isinstance(metrics, Mapping) else 0.0
 
     @property
     def _scenario(self) -> Mapping[str, Any]:
-        """Scenario in the provenance; empty if unknown."""
+        """Scenario in the provenance of the record; empty if unknown."""
         scenario = self.provenance.get("scenario")
         return scenario if isinstance(scenario, Mapping) else {}
 
@@ -353,7 +353,7 @@ class Record(Content):
 
     @property
     def summary(self) -> dict[str, Any]:
-        """Numbers of ``summary.json``."""
+        """Entries of ``summary.json``."""
         return self._summary
 
     @summary.setter
@@ -385,8 +385,8 @@ class Record(Content):
         Raises
         ------
         RecordError
-            If the file cannot be written (no space, no permission); an existing file is then unchanged. Also if a time
-            axis is not finite or runs backwards.
+            If the file cannot be written (no space, no permission); an existing file then remains unchanged. The same
+            error is raised if a time axis is not finite or runs backwards.
 
         Examples
         --------
@@ -445,8 +445,8 @@ class Record(Content):
         ------
         RecordError
             If the file does not exist, is damaged or is not a record; if its digest is missing or wrong and ``trust``
-            is False; or if the file ``INCOMPLETE`` next to it shows that a run crashed while saving. The message names
-            file and reason.
+            is False; or if the file ``INCOMPLETE`` next to it shows that a run crashed while saving. The message
+            contains file and reason.
 
         Examples
         --------
@@ -469,7 +469,7 @@ class Record(Content):
         Parameters
         ----------
         axis : str, optional
-            Name of the time axis; default: the main one.
+            Name of the time axis; default: the main time axis.
 
         Returns
         -------

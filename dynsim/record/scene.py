@@ -1,4 +1,4 @@
-"""Scene of a record: shapes and poses of robot and surfaces, as plain data for figures and viewers.
+"""Scene of a record: shapes and poses of the robot and the surfaces, as plain data for figures and viewers.
 
 A pose is a position [m] and an orientation, a unit quaternion (w, x, y, z). The frame of a body moves with its joint;
 at joint position zero it coincides with the frame of the joint, whose pose is relative to the parent.
@@ -27,8 +27,9 @@ JointKind = Literal["revolute", "prismatic", "planar", "ball", "fixed"]
 Matrix3 = tuple[Vector3, Vector3, Vector3]
 
 WORLD = -1
-"""Index of the world among the bodies."""
-# Smaller depths below a surface count as zero [m]: contact errors and single precision of poses can reach this size.
+"""Body index that stands for the world."""
+# Depths below a surface that are smaller than this count as zero [m], because contact errors and the single precision
+# of poses can cause such depths.
 NOT_BELOW = 1e-4
 HERE: Quaternion = (1.0, 0.0, 0.0, 0.0)
 """Identity orientation."""
@@ -52,11 +53,11 @@ class Shape(_Finite):
         Kind of the solid, which is centred on its frame; cylinders and capsules extend along z.
     size : tuple of float
         Cylinder and capsule: radius and length [m]; the length of a capsule is the distance between the centres of its
-        ends. Box: edge lengths along x, y and z. Sphere: radius. Mesh: scale along x, y and z.
+        end spheres. Box: edge lengths along x, y and z [m]. Sphere: radius [m]. Mesh: scale factors along x, y and z.
     position, orientation : tuple of float
         Pose in the frame of the body.
     file : str
-        Mesh file, as named in the robot file.
+        Path of the mesh file, as written in the robot file.
     colour : tuple of float or None
         Red, green, blue and opacity from 0 to 1, if specified.
     """
@@ -79,7 +80,7 @@ class Shape(_Finite):
         Parameters
         ----------
         position, orientation : array_like
-            Pose of the frame of the body in the other frame.
+            Pose of the body's frame in the other frame.
         """
         turn = np.asarray(orientation, dtype=np.float64)
         where = np.asarray(position) + rotated(turn, np.array(self.position))
@@ -102,8 +103,9 @@ class Joint(_Finite):
     position, orientation : tuple of float
         Pose of the joint in the frame of the parent.
     signal, labels : str, tuple of str
-        Signal of the record with the joint position, and its columns: one [rad or m], for a planar joint three [m, m,
-        rad], for a ball joint the four of a quaternion w, x, y, z of any length, for a fixed joint none.
+        Signal of the record with the joint position, and its columns: one column [rad or m], three columns for a planar
+        joint [m, m, rad], the four components w, x, y, z of a quaternion of any length for a ball joint, and no column
+        for a fixed joint.
     lower, upper : float or None
         Limits [rad or m].
     part_of : str
@@ -137,7 +139,7 @@ class Body(_Finite):
 
     @property
     def radius(self) -> float:
-        """Radius of its thickest cylinder or capsule [m], 0 without one.
+        """Radius of the body's thickest cylinder or capsule [m]; 0 if it has no such shape.
 
         The axis of the body may be this far below a surface.
         """
@@ -154,21 +156,22 @@ class SceneSurface(_Finite):
     name : str
         Name of the surface.
     Q, b, c : tuple of tuple of float, tuple of float, float
-        Coefficients of a quadric, C = r·Q r/2 + b·r + c; zero for a box (C is the distance) and a height field
-        (C = z − h).
+        Coefficients of a quadric, C = r·Q r/2 + b·r + c. They are zero for a box (C is the distance) and for a height
+        field (C = z − h).
     kind : "plane", "sphere", "cylinder", "quadric", "box" or "height_field"
         Kind of the surface.
     position : tuple of float or None
         Plane: point closest to the origin of the world. Sphere and box: centre. Cylinder: point on the axis. Height
-        field: first grid point, with z the zero of the heights [m].
+        field: first grid point; its z is the zero level of the heights [m].
     direction : tuple of float or None
         Normal of a plane, or axis of a cylinder.
     radius : float or None
-        Radius of a sphere or cylinder [m], negative if the free side is inside; radius of the edges of a box.
+        Radius of a sphere or cylinder [m], negative if the free side is inside; for a box, radius of its edges [m].
     orientation, edges : tuple of float or None
         Orientation and edge lengths [m] of a box.
     spacing, heights : tuple or None
-        Grid spacing of a height field along x and y, and its heights, one row per y [m], only as many as are drawn.
+        Grid spacing of a height field along x and y, and its heights, one row per y [m]; only the heights that are
+        drawn.
     """
 
     name: str
@@ -220,7 +223,7 @@ class SceneSurface(_Finite):
         return np.asarray(points @ np.array(self.Q) + np.array(self.b))
 
     def normal(self, points: Array) -> Array:
-        """Return unit normals into the free side at points, (…, 3) → (…, 3); zero if ∇C is zero."""
+        """Return the unit normals towards the free side at points, (…, 3) → (…, 3); zero if ∇C is zero."""
         slope = self.gradient(points)
         size = np.linalg.norm(slope, axis=-1, keepdims=True)
         return np.asarray(slope / np.where(size > 0.0, size, 1.0))
@@ -240,12 +243,12 @@ class SceneSurface(_Finite):
         return x, y
 
     def _height(self, x: Array, y: Array) -> Array:
-        """Return heights by bilinear interpolation; outside the grid, the height at its edge."""
+        """Return heights by bilinear interpolation; outside the grid, return the height at its edge."""
         from scipy.ndimage import map_coordinates  # imported here because height fields are rare
 
         start, spacing = np.array(self.position), np.array(self.spacing)
         cells = np.stack([(y - start[1]) / spacing[1], (x - start[0]) / spacing[0]])
-        # For a single point the arrays have no axis, which map_coordinates does not accept.
+        # For a single point, the arrays are zero-dimensional, which map_coordinates does not accept.
         heights = map_coordinates(np.array(self.heights), cells.reshape(2, -1), order=1, mode="nearest")
         return np.asarray(heights).reshape(cells.shape[1:])
 
@@ -267,7 +270,7 @@ class Point(_Finite):
     surface : str
         Name of the surface that a contact point touches.
     friction : float
-        Coefficient of the friction cone of a contact point, 0 if unknown.
+        Friction coefficient that defines the friction cone of a contact point; 0 if unknown.
     """
 
     name: str
@@ -285,9 +288,9 @@ class SoftGripper(_Finite):
     Attributes
     ----------
     capture : float
-        Largest distance to a grasp frame at which the gripper captures an object [m].
+        Maximum distance to a grasp frame at which the gripper captures an object [m].
     force, torque : float
-        Bounds on the force [N] and torque [N m] on a grasped object.
+        Maximum force [N] and torque [N m] that the gripper can exert on a grasped object.
     """
 
     capture: float
@@ -311,17 +314,17 @@ class Scene(_Finite):
         Shapes fixed in the world.
     supports : tuple of Point
         Ground contacts of a mobile base: left wheel, right wheel, caster. They are not in ``points``, so that older
-        versions, which do not know their role, skip them.
+        versions of dynsim, which do not know their role, ignore them.
     objects : tuple of str
         Names of the bodies that are objects, not parts of the robot.
     resistance, voltage_limit : float or None
-        Resistance [ohm] and voltage limit [V] of the DC motors, if all have the same.
+        Resistance [ohm] and voltage limit [V] of the DC motors, if they are the same for all motors.
     mesh_folders : tuple of str
-        Folders in which mesh files are searched for.
+        Folders that are searched for mesh files.
     grip : SoftGripper or None
         Gripper of a snake.
     tip : float
-        Distance of the tip of a snake's gripper ahead of the controlled point [m].
+        Distance by which the tip of a snake's gripper is ahead of the controlled point [m].
 
     Raises
     ------
@@ -347,7 +350,7 @@ class Scene(_Finite):
                 raise RecordError(f"body {body.name!r} ({k}) must come after its parent ({body.parent})")
         for point in (*self.points, *self.supports):
             if not WORLD <= point.body < len(self.bodies):
-                raise RecordError(f"point {point.name!r} is on body {point.body} of {len(self.bodies)} bodies")
+                raise RecordError(f"point {point.name!r} is on body {point.body}, but only {len(self.bodies)} exist")
 
     @property
     def hand(self) -> Point | None:
@@ -365,7 +368,7 @@ class Scene(_Finite):
         if not self.supports or self.supports[0].body == WORLD:
             return ()
         base = self.supports[0].body
-        # The coordinates of the joint of the base include the angles of its wheels.
+        # The coordinates of the base's joint include the angles of its wheels.
         joint = self.bodies[base].joint.part_of
         own = {body.joint.name for body in self.bodies if joint and body.joint.part_of == joint}
         wheels = [k for k, body in enumerate(self.bodies) if body.parent == base and own & set(body.joint.labels)]
@@ -382,12 +385,12 @@ class Scene(_Finite):
         return next((surface for surface in self.surfaces if surface.name == name), None)
 
     def to_json(self) -> str:
-        """Return the scene as JSON text, which :meth:`from_json` reads."""
+        """Return the scene as JSON text that :meth:`from_json` can read."""
         return json.dumps(self, default=vars)
 
     @classmethod
     def from_json(cls, text: str) -> Scene:
-        """Read the text of :meth:`to_json` and check every part; keys of later versions are ignored.
+        """Read a text written by :meth:`to_json` and check every part of it; keys of later versions are ignored.
 
         Raises
         ------

@@ -8,13 +8,13 @@ import numpy as np
 
 from dynsim.record.quaternion import Array
 
-# Confidence level of the interval of the mean, and probability of the interval of the samples.
+# Confidence level of the interval of the mean, and probability covered by the interval of the samples.
 LEVEL = 0.95
 
 
 @dataclass(frozen=True)
 class Spread:
-    """Statistics of a number over samples.
+    """Statistics of a quantity over samples.
 
     Attributes
     ----------
@@ -23,11 +23,11 @@ class Spread:
     mean : float
         Mean of the samples.
     mean_low, mean_high : float
-        Confidence interval of the mean at ``LEVEL``, by Student's t.
+        Confidence interval of the mean at level ``LEVEL``, from Student's t distribution.
     deviation : float
         Standard deviation of the samples.
     low, high : float
-        Interval of the samples at ``LEVEL``, by their quantiles.
+        Interval that contains the fraction ``LEVEL`` of the samples, from their quantiles.
     """
 
     count: int
@@ -40,14 +40,14 @@ class Spread:
 
 
 def student(freedom: int) -> float:
-    """Return the half-width of the interval at ``LEVEL`` of Student's t.
+    """Return the half-width of the interval of Student's t distribution at level ``LEVEL``.
 
     Parameters
     ----------
     freedom : int
         Degrees of freedom.
     """
-    from scipy.special import stdtrit  # imported here because it takes as long as ten runs of a sweep
+    from scipy.special import stdtrit  # imported here because the import takes as long as ten runs of a sweep
 
     return float(stdtrit(freedom, 0.5 + 0.5 * LEVEL))
 
@@ -62,16 +62,16 @@ def spread(values: Array) -> Spread:
 
 @dataclass(frozen=True)
 class Sensitivities:
-    """Linear model y = b_0 + Σ b_j (x_j − x̄_j)/s_j of a number, fitted by least squares.
+    """Linear model y = b_0 + Σ b_j (x_j − x̄_j)/s_j of a quantity, fitted by least squares.
 
     Attributes
     ----------
     effect : (k,) ndarray
-        b_j: change of the number per standard deviation s_j of each parameter.
+        Coefficients b_j: change of the quantity per standard deviation s_j of each parameter.
     half_width : (k,) ndarray
-        Half-widths of the confidence intervals of ``effect`` at ``LEVEL``, by Student's t.
+        Half-widths of the confidence intervals of ``effect`` at level ``LEVEL``, from Student's t distribution.
     explained : float
-        Fraction of the variance of the number that the model explains, R².
+        Fraction R² of the variance of the quantity that the model explains.
     """
 
     effect: Array
@@ -80,7 +80,7 @@ class Sensitivities:
 
 
 def sensitivities(parameters: Array, values: Array) -> Sensitivities | None:
-    """Fit parameters, (N, k), to values, (N,).
+    """Fit a linear model of values, (N,), as a function of parameters, (N, k).
 
     Returns None if the fit is not determined: too few samples, a parameter or value that does not vary, or linearly
     dependent parameters.

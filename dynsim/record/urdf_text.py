@@ -16,15 +16,15 @@ Element = ElementTree.Element
 WORLD_LINK = "world"
 # URDF has no ball joint; viewers position such bodies by their frames.
 _KINDS = {"ball": "floating"}
-# Written for a joint without a limit, because URDF requires numbers [rad or m, N m or N, rad/s or m/s].
+# Values written for a joint without limits, because URDF requires numbers [rad or m, N m or N, rad/s or m/s].
 _UNLIMITED = 1e9
 
 
 def scene_urdf(scene: Scene, name: str) -> str:
     """Return the URDF text of the bodies of a scene: joints, limits and shapes, without masses.
 
-    Links have the names of the bodies; the root is ``world``. ROS viewers draw this text (``robot_description``);
-    ``dynsim export SCENARIO --format urdf`` writes masses too.
+    Links are named after the bodies; the root is ``world``. ROS viewers display this text (``robot_description``). To
+    include masses, use ``dynsim export SCENARIO --format urdf``.
     """
     root = Element("robot", name=name)
     names = [body.name for body in scene.bodies]
@@ -90,7 +90,7 @@ def _simple(shapes: Sequence[Shape]) -> list[Shape]:
 
 
 def connect(joint: Element, parent: str, child: str, position: Any, rotation: Array) -> None:
-    """Add parent, child and origin to a joint."""
+    """Add the elements parent, child and origin to a joint."""
     ElementTree.SubElement(joint, "parent", link=parent)
     ElementTree.SubElement(joint, "child", link=child)
     ElementTree.SubElement(joint, "origin", xyz=numbers(position), rpy=numbers(roll_pitch_yaw(rotation)))
@@ -102,7 +102,7 @@ def rotation(orientation: Any) -> Array:
 
 
 def roll_pitch_yaw(R: Array) -> Array:
-    """Return the angles of R = Rz(yaw) Ry(pitch) Rx(roll) [rad], accurate at pitch = ±90° too.
+    """Return the angles of R = Rz(yaw) Ry(pitch) Rx(roll) [rad]; they are also accurate at pitch = ±90°.
 
     At pitch = ±90° roll and yaw are not unique: yaw is determined by rounding, and roll is computed from Rz(yaw)ᵀ R.
     """
@@ -114,7 +114,7 @@ def roll_pitch_yaw(R: Array) -> Array:
 
 
 def numbers(values: Any) -> str:
-    """Format numbers in the shortest form that reads back to the same double."""
+    """Format numbers in the shortest form that gives the same double when it is read."""
     return " ".join(repr(float(x)) for x in np.atleast_1d(values))
 
 

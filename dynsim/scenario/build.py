@@ -86,7 +86,7 @@ def _loaded(scenario: Scenario) -> Robot:
     for name, config in scenario.config.loads.items():
         if isinstance(config, Payload):
             body, point, axes = _attached(bare, name, config)
-            # A massless payload leaves its link bit-identical.
+            # A massless payload leaves the data of its link bit-identical.
             if config.mass_kg > 0.0:
                 inertias.setdefault(body, [bare.links[body].inertia]).append(_payload(name, config, point, axes))
     links = list(bare.links)
@@ -130,7 +130,7 @@ def _tied(scenario: Scenario, built: Robot) -> Robot:
     taken = {tie.name for tie in built.ties}
     for name, tie in ties.items():
         if name in taken:
-            text = f"ties.{name}: the spring or the gripper of an object uses this name; choose another"
+            text = f"ties.{name}: this name is used by the spring or gripper of an object; choose another"
             raise ModelError(text, keys=("ties", name))
         for key, body in (("body", tie.body), ("other", tie.other)):
             if key == "other" and body == WORLD:
@@ -141,7 +141,7 @@ def _tied(scenario: Scenario, built: Robot) -> Robot:
 
 
 def _nameable(scenario: Scenario, built: Robot) -> list[Contact]:
-    """Return the contacts that ``initial`` may list.
+    """Return the contacts that may be listed in ``initial``.
 
     Disabled points are included, so that variants with and without a brace can start in the same posture.
     """
@@ -154,7 +154,7 @@ def _nameable(scenario: Scenario, built: Robot) -> list[Contact]:
 def disabled_points(scenario: Scenario, described: Robot) -> list[Contact]:
     """Return the disabled contact points.
 
-    They have no contact, but a start or a path may keep them on their surfaces, so that the same motion can be
+    They make no contact, but a start posture or a path may keep them on their surfaces, so that the same motion can be
     simulated with and without a brace.
     """
     options = scenario.config.contacts
@@ -205,7 +205,7 @@ def _first_references(scenario: Scenario, built: Robot) -> Array | None:
         if name in built.joint_names:
             q[built.position_index[built.joint_names.index(name)]] = path.values[0]
     places, placed = dict(zip(built.joint_names, built.position_index, strict=True)), {*waypoints}
-    # A follower may lead another joint, and couplings are not ordered.
+    # Repeat this, because a follower may lead another joint and couplings are not ordered.
     for _ in built.couplings:
         for coupling in built.couplings:
             if coupling.leader in placed and coupling.joint not in waypoints:
@@ -231,7 +231,7 @@ def build_model(scenario: Scenario) -> Model:
     Raises
     ------
     ModelError
-        If the plant is kinematic, or its masses and joints are not physical.
+        If the plant is kinematic, or its masses or joints are not physically possible.
     ScenarioError
         If ``scenario`` is not a Scenario.
 
@@ -259,7 +259,8 @@ def _fitting_controller(scenario: Scenario) -> Any:
     config = scenario.controller
     if config is None:
         raise ModelError("the scenario has no controller; its motors are short-circuited")
-    # ENGINE of the modules, not of the scenario: a snake's controller drives a snake at both levels.
+    # Compare the ENGINE of the modules, not of the scenario, because a snake's controller drives a snake at both
+    # levels.
     if families.member("plant", scenario.plant.type).ENGINE != families.member("controller", config.type).ENGINE:
         raise ModelError(f"controller {config.type!r} cannot drive a {scenario.plant.type!r}")
     return config
@@ -282,7 +283,7 @@ def controller(
     progress : callable, optional
         Called with the time [s] up to which the references are computed.
     touching : sequence of Contact, optional
-        Contacts of the scenario, if they are built already.
+        Contacts of the scenario, if they have already been built.
 
     Raises
     ------
@@ -346,7 +347,7 @@ class _TrackedContacts(Mapping[str, Contact]):
 
 
 def surfaces(scenario: Scenario) -> dict[str, Surface]:
-    """Return the named surfaces, in use or not, at their simulated positions."""
+    """Return all named surfaces, whether used or not, at their simulated positions."""
     context, configs = BuildContext(scenario.duration_s), scenario.config.surfaces
     error = scenario.config.surface_error
 
@@ -362,14 +363,14 @@ def surfaces(scenario: Scenario) -> dict[str, Surface]:
 
 
 def contacts(scenario: Scenario, described: Robot | None = None) -> list[Contact]:
-    """Return all enabled contact points with their surfaces, then the other candidates.
+    """Return all enabled contact points with their surfaces, followed by the other contact candidates.
 
     Parameters
     ----------
     scenario : Scenario
         Validated scenario.
     described : Robot, optional
-        Robot of the scenario, if it is built already.
+        Robot of the scenario, if it has already been built.
 
     Raises
     ------
@@ -407,7 +408,7 @@ def contacts(scenario: Scenario, described: Robot | None = None) -> list[Contact
         result = [replace(contact, left_out=left_out) for contact, left_out in zip(result, still, strict=True)]
     if options.candidates != "points":
         law = _law(options, ContactPoint(body=""))
-        # Objects touch with their solids, not with their origins.
+        # Objects touch surfaces with their solids, not with their origins.
         beside = {link.name for name, body in scenario.config.objects.items() for link in body.links(name)}
         own = (entry for entry in candidates(options.candidates, described, known, result) if entry.body not in beside)
         result += [replace(contact, **law) for contact in own]
@@ -416,7 +417,7 @@ def contacts(scenario: Scenario, described: Robot | None = None) -> list[Contact
 
 
 def _foot(foot: Foot, known: Mapping[str, Surface], options: Contacts) -> Contact:
-    """Return the contact of a foot: a part that the robot is built to touch with."""
+    """Return the contact of a foot, a part of the robot that is designed to touch a surface."""
     if foot.surface not in known:
         raise ModelError(f"surfaces: surface {foot.surface!r} does not exist (used by {foot.name})")
     law = _law(options, ContactPoint(body=foot.body))
@@ -428,7 +429,7 @@ def _foot(foot: Foot, known: Mapping[str, Surface], options: Contacts) -> Contac
 
 
 def _scaled_friction(contact: Contact, factor: float) -> Contact:
-    """Return the contact with all coefficients of friction multiplied by a factor."""
+    """Return the contact with all friction coefficients multiplied by a factor."""
     static = None if contact.static_friction is None else factor * contact.static_friction
     viscous = factor * contact.viscous_friction
     return replace(contact, friction=factor * contact.friction, static_friction=static, viscous_friction=viscous)
@@ -538,7 +539,7 @@ def check_start(
     if off:
         contact, declared, keys, gap = off[0]
         position = model.point_position(contact.body, contact.point, q)
-        remedy = "start from another posture; or change the surface"
+        remedy = "start from another posture, change the surface"
         if own and scenario.plant.type == "snake":  # `initial` does not place its joints
             remedy = "move the surface or change plant.initial_joints_rad"
         elif own:
@@ -581,7 +582,7 @@ def left_out_warnings(
     contacts : sequence of Contact
         Contacts of the run.
     behind_brakes : mapping of str to float, optional
-        Contacts that only braked joints would move, with the time at which the brakes closed [s].
+        Contacts that only braked joints can move, with the time at which the brakes closed [s].
     """
     sentences = []
     for contact in contacts:
@@ -602,11 +603,11 @@ def left_out_warnings(
 
 
 def _remedy(scenario: Scenario, off: Sequence[Contact]) -> str:
-    """Return the remedy that puts declared points on their surfaces; empty if the scenario already requests it."""
+    """Return the advice for putting declared points on their surfaces; empty if the scenario already requests it."""
     initial = scenario.config.initial
     already = [] if initial is None else initial.on_surface
     names = [contact.name for contact in off if contact.name not in already]
-    return f"`{on_surface_key(scenario, names)}` puts it there; or " if names else ""
+    return f"`{on_surface_key(scenario, names)}` puts it there; otherwise " if names else ""
 
 
 def on_surface_key(scenario: Scenario, names: Sequence[str]) -> str:
@@ -641,7 +642,7 @@ def sensor_mounts(scenario: Scenario, robot: Robot) -> dict[str, dict[str, Senso
     return {
         kind: {name: _mount(robot, config, ("sensors", kind, name)) for name, config in named.items()}
         for kind, named in sensors or ()
-        if isinstance(named, dict) and named  # sections of named sensors; the other keys are no sensors on links
+        if isinstance(named, dict) and named  # only sections of named sensors contain sensors on links
     }
 
 
@@ -657,7 +658,7 @@ def _mount(robot: Robot, config: LinkSensorConfig, keys: tuple[str, ...]) -> Sen
     if config.frame is not None and frames.get(config.frame) != config.body:
         with errors_at(*keys, "frame"):
             own = [name for name, body in frames.items() if body == config.body]
-            fix = f"frames: {', '.join(own)}" if own else "remove it, this body has no frames"
+            fix = f"frames: {', '.join(own)}" if own else "remove it, because this body has no frames"
             raise ModelError(f"{config.frame!r} is not a frame fixed to {config.body}; {fix}")
     frame = config.body if config.frame is None else config.frame
     index, point = robot.attach(frame, np.array(config.point_m))

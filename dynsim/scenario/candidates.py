@@ -17,21 +17,21 @@ from dynsim.model.surfaces import Array, Surface
 
 log = logging.getLogger(__name__)
 
-# Reduction of a capsule's radius between its ends [m]. If an end is nearest, or the axis is parallel to a face, only
-# the ends touch, so the constraint rows are independent.
+# Amount by which a capsule's radius is smaller between its ends [m]. If an end is nearest, or the axis is parallel to a
+# face, only the ends touch, so that the constraint rows are independent.
 THINNER = 1e-6
 
 
 def candidates(kind: str, robot: Robot, surfaces: Mapping[str, Surface], declared: Iterable[Contact]) -> list[Contact]:
     """Return the frictionless contact candidates of a robot on all surfaces, in addition to the declared contacts.
 
-    The kind ``joints`` makes points of the origins of all joints and of the hand; ``links`` makes capsules of the axes
+    The kind ``joints`` uses the origins of all joints and the hand as points; ``links`` forms capsules from the axes
     and radii of all links. On a flat or hollow surface, or a height field, a capsule touches with one of its end
     spheres. Neighbouring links share an end sphere; it is listed once, on the link that starts at the joint, with the
     larger radius. Spheres, cylinders and boxes can also touch the capsule between its ends; this part is thinner by
     :data:`THINNER`.
 
-    Omitted are points that are declared or coincide with another candidate, spheres around declared points (with a
+    The result omits points that are declared or coincide with another candidate, spheres around declared points (with a
     warning), and candidates that no joint moves along the normal (with a log line), because their constraint row would
     be zero. A link without mass and length, such as a carriage, has no sphere.
     """
@@ -70,11 +70,11 @@ def candidates(kind: str, robot: Robot, surfaces: Mapping[str, Surface], declare
                 still.append(name)
     if replaced:
         log.warning(
-            "contacts.candidates: a declared point at a joint replaces the larger sphere of the link: %s",
+            "contacts.candidates: declared points at joints replace the larger spheres of the links: %s",
             ", ".join(dict.fromkeys(replaced)),
         )
     if still:
-        log.info("contacts.candidates: omitted, because no joint moves them along the normal: %s", ", ".join(still))
+        log.info("contacts.candidates: omitted because no joint moves them along the normal: %s", ", ".join(still))
     return contacts
 
 
@@ -118,7 +118,7 @@ def _same(a: Array, b: Array) -> bool:
 
 
 def _unused(name: str, names: set[str]) -> str:
-    """Return the name, with a number if it is in use, and add it to ``names``."""
+    """Return the name, with a number appended if it is already in use, and add it to ``names``."""
     unused, count = name, 1
     while unused in names:
         count += 1

@@ -44,19 +44,19 @@ class Restriction:
     Attributes
     ----------
     feature : str
-        Description for the table.
+        Description of the feature for the table.
     reason : str
-        Why the other laws and methods do not support it.
+        Reason why the other laws and methods do not support the feature.
     laws, methods : tuple of str
-        Contact laws and integration methods that support it.
+        Contact laws and integration methods that support the feature.
     fix : str
-        Remedy other than changing the law or the method.
+        Fix other than changing the law or the method.
     keys : callable, optional
         Yields the dotted keys of a ScenarioConfig that use the feature.
     parts : callable, optional
         Returns the names of the robot's joints, ties or bases that use the feature.
     at : tuple of str
-        Key that an error about the robot refers to.
+        Keys to which an error about the robot refers.
     """
 
     feature: str
@@ -69,7 +69,7 @@ class Restriction:
     at: tuple[str, ...] = ("plant",)
 
     def conflict(self, config: Any) -> str:
-        """Return the requirement on law or method that the scenario does not meet; "" if it meets both."""
+        """Return the requirement on law or method that the scenario does not meet, or "" if it meets both."""
         law, method = config.contacts.law, config.integrator.method
         if law not in self.laws:
             return f"requires contacts.law: {_either(self.laws)} (here: {law})"
@@ -88,7 +88,7 @@ def _either(names: tuple[str, ...]) -> str:
 
 
 def _contact_keys(*names: str) -> Callable[[Any], Iterator[str]]:
-    """Return a function that yields the keys with these names that contacts and contact points set."""
+    """Return a function that yields the keys with these names that are set in contacts or contact points."""
 
     def used(config: Any) -> Iterator[str]:
         sections = {"contacts": config.contacts}
@@ -102,7 +102,7 @@ def _contact_keys(*names: str) -> Callable[[Any], Iterator[str]]:
 
 
 def _compliance(config: Any) -> Iterator[str]:
-    # Resolved scenarios contain the default damping of 0, which is not a use of the feature.
+    # Resolved scenarios contain the default damping of 0, which does not count as use of the feature.
     yield from _contact_keys("stiffness_N_per_m")(config)
     if config.contacts.damping_N_s_per_m:
         yield "contacts.damping_N_s_per_m"

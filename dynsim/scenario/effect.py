@@ -19,7 +19,7 @@ MOVING = ("hand", "base", "joints", "torques", "brace")
 
 
 def without_effect(scenario: Any, motors: bool = True) -> list[str]:
-    """Return a warning for each key that the scenario sets without effect, with its location and the reason.
+    """Return a warning for each key that the scenario sets but that has no effect, with location and reason.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ def without_effect(scenario: Any, motors: bool = True) -> list[str]:
 
 
 def idle_keys(config: Any) -> dict[Keys, str]:
-    """Return the keys without effect, set or not, with the reason for each."""
+    """Return all keys that have no effect, whether set or not, with the reason for each."""
     kinematic = engine(config.plant) == "kinematic"
     rules = (
         [_of_kinematics(config)] if kinematic else [_of_integrator(config), _of_contacts(config), _of_sensors(config)]
@@ -65,7 +65,7 @@ def is_set(config: BaseModel, keys: Keys) -> bool:
 
 
 def _of_kinematics(config: Any) -> Iterator[tuple[Keys, str]]:
-    """A kinematic plant ignores forces and integration; only ``duration_s`` and the controller matter."""
+    """Yield the keys about forces and integration, which a kinematic plant ignores."""
     for section in OF_DYNAMICS:
         part = getattr(config, section)
         for key in () if part is None else type(part).model_fields:
@@ -91,7 +91,7 @@ def _of_contacts(config: Any) -> Iterator[tuple[Keys, str]]:
     if contacts.law == "unilateral":
         yield ("contacts", "reference_tolerance_m"), "it requires law: bilateral; unilateral braces may lift off"
     has_feet = getattr(config.plant, "level", "") == "dynamic"
-    # Free objects have contacts at their corners and wheels.
+    # Free objects always have contacts at their corners and wheels.
     touches = contacts.law == "unilateral" and any(body.joint is None for body in config.objects.values())
     if not contacts.points and contacts.candidates == "points" and not has_feet and not touches:
         for key in type(contacts).model_fields:
@@ -110,11 +110,11 @@ def _of_controller(config: Any) -> Iterator[tuple[Keys, str]]:
         return
     moves = any(getattr(controller, key) for key in MOVING) or controller.feed_forward != "none"
     if not moves:
-        yield ("controller", "knot_spacing_s"), "no reference moves"
+        yield ("controller", "knot_spacing_s"), "all references are constant"
 
 
 def _of_sensors(config: Any) -> Iterator[tuple[Keys, str]]:
-    """A snake controller uses at most one sensor."""
+    """Yield unused sensors; a snake controller uses at most one sensor."""
     state = getattr(config.controller, "state", None)
     if config.sensors is None or state is None:
         return
@@ -125,7 +125,7 @@ def _of_sensors(config: Any) -> Iterator[tuple[Keys, str]]:
 
 
 def _of_time(config: Any) -> Iterator[tuple[Keys, str]]:
-    """References, loads and commands that start after the end of the run."""
+    """Yield references, loads and commands that start after the end of the run."""
     end = config.duration_s
     ends = f"the run ends at {end:g} s"
     settle = config.metrics.settle_s

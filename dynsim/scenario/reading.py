@@ -1,7 +1,7 @@
 """Scenario files: search, merging of variants and overrides, validation, YAML output, and the JSON schema for editors.
 
-Errors contain file, line, key and fix. A scenario file is one mapping; its key ``variants`` maps the name of each
-variant to its differences (mappings merge, lists and values replace, null removes). Overrides are applied last.
+Errors contain file, line, key and fix. A scenario file is a mapping; its key ``variants`` maps the name of each variant
+to its differences (mappings merge, lists and values replace, null removes). Overrides are applied last.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from dynsim.system.files import check_complete
 from dynsim.system.inputs import DEPTH_LIMIT, YamlMapping, is_file, parse_yaml, read_text
 from dynsim.system.shipped import shipped_scenario, shipped_scenarios
 
-# Keys of a file that are not part of a single variant.
+# Keys of a file that do not belong to a single variant.
 TOP = ("variants",)
-# Smallest magnitude of a number in a scenario, and the largest by the end of its key, which is its unit; the first match
-# counts.
+# Smallest magnitude of a number in a scenario, and the largest by the end of its key, which is its unit; the first
+# match counts.
 MAGNITUDE_MIN = 1e-30
 MAGNITUDES = {
     "noise_deg": 360.0,
@@ -56,7 +56,7 @@ MAGNITUDES = {
     "_hz": 1e9,
     "": 1e15,
 }
-# Maximum number of other variants that are searched for unknown keys after an error.
+# Maximum number of other variants in which unknown keys are sought after an error.
 VARIANTS_SEARCHED = 100
 
 
@@ -103,7 +103,7 @@ def load_scenario(path: str | Path, variant: str | None = None, overrides: Mappi
     variant : str, optional
         Name of the variant; default: the first variant in the file.
     overrides : mapping, optional
-        Values by dotted key, in the units of the keys, e.g.
+        Values by dotted key, in the units stated in the keys, e.g.
         ``{"integrator.rtol": 1e-8, "plant.chain.0.mass_kg": 0.2}``. They are applied after the variant.
 
     Returns
@@ -195,7 +195,7 @@ class ScenarioFile:
             raise ScenarioError(f"{path}:{data.lines['variants']}: variants must be a mapping of names to differences")
         if variant is None and variants:
             variant = next(iter(variants))
-        # Compare with a list: an invalid name need not be hashable.
+        # Compare with a list, because an invalid name may not be hashable.
         if variant is not None and variants and variant not in list(variants):
             raise ScenarioError(
                 f"{path}: no variant {variant!r}{suggest(str(variant), variants)}; "
@@ -248,7 +248,7 @@ def scenario_from_resolved(resolved: Mapping[str, Any]) -> Scenario:
     Raises
     ------
     ScenarioError
-        If it was written by a version of dynsim with different keys.
+        If the record was written by a version of dynsim with different keys.
     """
     if not isinstance(resolved, Mapping):
         raise ScenarioError(f"the scenario in this record must be a mapping of keys to values, got {brief(resolved)}")
@@ -326,7 +326,7 @@ def _override(data: Any, key: str, value: Any, overriding: str, variant: str | N
     if "" in parts:
         raise ScenarioError(f"{location}: part of the key is empty; write it like integrator.rtol")
     if len(parts) > DEPTH_LIMIT:
-        raise ScenarioError(f"{location}: has {len(parts)} parts; keys have at most {DEPTH_LIMIT}")
+        raise ScenarioError(f"{location}: has {len(parts)} parts; keys must not have more than {DEPTH_LIMIT}")
     if parts[0] == "variants" or (parts[0] == "variant" and variant is not None):
         raise ScenarioError(f"{location}: the variant cannot be set here; use dynsim run --variant")
     for depth, part in enumerate(parts):

@@ -1,6 +1,6 @@
 """Schema of a scenario file: keys with types, units, limits and defaults as frozen pydantic models, and `Scenario`.
 
-One section of this file for each section of a scenario: sensors, ties, loads, objects, contacts, start, integrator.
+This file has one section for each section of a scenario: sensors, ties, loads, objects, contacts, start, integrator.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ from dynsim.scenario.effect import idle_keys, is_set
 
 # Section `sensors`: sampling rate, delay, resolution and noise of the controller's inputs; recorded sensors on links.
 
-# Rate of a sensor [Hz]; limited because each sample is a Python call.
+# Rate of a sensor [Hz]; it is limited because each sample requires a Python call.
 Rate = Annotated[float, Field(gt=0.0, le=1e5)]
-# Resolution of the MX series [deg]: 4096 positions in a turn (data sheet).
+# Resolution of MX-series servos [deg]: 4096 positions per turn (data sheet).
 MX_RESOLUTION = math.degrees(2.0 * math.pi / 4096)
 
 
@@ -57,7 +57,7 @@ class Sensor(StrictConfig):
 
 
 class Encoders(Sensor):
-    """Joint encoders; joint rates are differences of samples."""
+    """Joint encoders; joint rates are computed from differences of samples."""
 
     resolution_deg: NonNegative = default(
         MX_RESOLUTION, "resolution of joint angles; default: 4096 positions per turn, as in MX servos"
@@ -77,7 +77,7 @@ class MotionCapture(Sensor):
 
 
 class LinkSensorConfig(StrictConfig):
-    """Recorded sensor on a link: the body that carries it, and its point and axes there."""
+    """Recorded sensor on a link: the body that carries it, and its position and axes on this body."""
 
     body: str = Field(description="name of the body that carries the sensor")
     frame: str | None = default(
@@ -87,9 +87,9 @@ class LinkSensorConfig(StrictConfig):
 
 
 class WrenchSensor(LinkSensorConfig):
-    """Exact force and torque from the parent of `body` across its joint; the torque is about the point of the sensor.
+    """Exact force and torque that the parent of `body` exerts on it; the torque is about the point of the sensor.
 
-    The joint is the joint that carries `body`, not a fixed joint of `frame`.
+    They act across the joint that carries `body`, not across a fixed joint of `frame`.
     """
 
 
@@ -110,12 +110,12 @@ class Sensors(StrictConfig):
 
 
 class TieConfig(StrictConfig):
-    """Ends and direction of a tie; `LAW` names the keys of its stiffness, damping and bound."""
+    """Ends and direction of a tie; `LAW` contains the keys of its stiffness, damping and bound."""
 
     LAW: ClassVar[tuple[str, str, str]]
 
-    body: str = Field(description="first end: a body, or a frame fixed on a body")
-    other: str = Field(description="second end: a body, a frame fixed on a body, or `world`")
+    body: str = Field(description="first end: a body, or a frame fixed to a body")
+    other: str = Field(description="second end: a body, a frame fixed to a body, or `world`")
     axis: Direction = Field(description="direction of the tie, in the axes of `body`")
     pushes: bool = default(False, "only push `body` along the axis, away from `other`")
     holds: bool = default(True, "active at the start; `Simulation.set_tie` changes it")
@@ -161,7 +161,7 @@ class Linear(TieConfig):
 
 
 class Torsion(TieConfig):
-    """Torsional tie about the axis: the law of a linear tie for the rotation of `body` relative to `other`."""
+    """Torsional tie about the axis: the law of a linear tie applies to the rotation of `body` relative to `other`."""
 
     LAW = "stiffness_N_m_per_rad", "damping_N_m_s_per_rad", "bound_N_m"
 
@@ -183,7 +183,7 @@ TieChoice = Annotated[Linear | Torsion, Field(discriminator="type")]
 FORCE_COLUMNS = ("t_s", "fx_N", "fy_N", "fz_N")
 TORQUE_COLUMNS = ("mx_N_m", "my_N_m", "mz_N_m")
 
-# Times, shape (K + 1,) [s], and coefficients of the cubic polynomials of the six components in between, (K, 6, 4).
+# Times, shape (K + 1,) [s], and coefficients of the cubic polynomials between them for the six components, (K, 6, 4).
 Pieces = tuple[Array, Array]
 
 
@@ -219,7 +219,7 @@ class Sampled(WrenchConfig):
         "spline", "`spline`: cubic, not-a-knot (a line for two samples, a parabola for three); or `linear`"
     )
     hold: bool = default(False, "hold the first and last sample outside the sampled times; default: zero there")
-    # Computed at load time: a later edit of the file does not change a loaded scenario.
+    # The pieces are computed at load time, so that a later edit of the file does not change a loaded scenario.
     _pieces: Pieces = PrivateAttr()
 
     def pieces(self, duration: float) -> Pieces:
@@ -237,7 +237,7 @@ class Sampled(WrenchConfig):
         except ValueError:  # slopes that overflow
             met = False
         if not (met and np.isfinite(coefficients).all()):
-            raise ValueError("cannot be interpolated: numbers too large, or samples too close in time")
+            raise ValueError("cannot be interpolated: numbers are too large, or samples are too close in time")
         return knots, coefficients
 
     def _coefficients(self, knots: Array, values: Array) -> Array:
@@ -276,7 +276,7 @@ class Samples(Sampled):
 
 
 class Table(Sampled):
-    """Force and torque from a CSV file."""
+    """Force and torque read from a CSV file."""
 
     type: Literal["csv"]
     file: str = Field(
@@ -323,7 +323,7 @@ LoadConfig = Annotated[Constant | Samples | Table | Payload, Field(discriminator
 # Section `objects`: bodies in addition to the robot, each a separate tree rooted in the world.
 
 
-# The colour of wood, so that objects differ from the robot.
+# Objects have the colour of wood, so that they differ from the robot.
 COLOUR = (0.91, 0.81, 0.65, 1.0)
 
 
@@ -461,8 +461,8 @@ class Solid(Sized):
     def spheres(self) -> tuple[Array, float]:
         """Centres, shape (k, 3), and radius of the spheres that can touch surfaces [m].
 
-        A box touches with its corners, a cylinder with a sphere inside each end: contact is exact for a lying pipe;
-        an upright pipe stands on a sphere.
+        A box touches with its corners, a cylinder with a sphere inside each end. Contact is exact for a pipe that lies
+        on its side; an upright pipe stands on a sphere.
         """
         if self.shape == "box":
             signs = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
@@ -482,7 +482,7 @@ class Part(Solid):
 
 
 class Grasp(StrictConfig):
-    """Pose of a gripper that holds an object."""
+    """Pose that a gripper must have to hold an object."""
 
     position_m: Vector3 = default(
         [0.0, 0.0, 0.0], "position of the gripper's tip, in the object's axes from its centre"
@@ -527,7 +527,7 @@ class SceneObject(Sized):
         None, "named solids, fixed to each other, for `shape: parts`"
     )
     position_m: Vector3 = Field(
-        description="initial position of the centre in the world; for `shape: parts`, of the origin of the parts"
+        description="initial world position of the centre, or of the origin of the parts for `shape: parts`"
     )
     rpy_deg: Vector3 = default([0.0, 0.0, 0.0], "initial attitude, Rz(yaw) Ry(pitch) Rx(roll)")
     hinge: Hinge | None = default(None, "hinge to the world; default: the object is free")
@@ -565,17 +565,17 @@ class SceneObject(Sized):
 
     @property
     def shapes(self) -> tuple[Shape, ...]:
-        """Shapes for display, in the object's axes from its centre."""
+        """Shapes for display, relative to the object's centre, in its axes."""
         parts = self.solids.values()
         return tuple(part.solid.placed(part.position_m, quaternion(_turn(part.rpy_deg))) for part in parts)
 
     @property
     def _origin(self) -> Array:
-        """Origin of the body, in the object's axes from its centre [m]; on the hinge if there is a hinge."""
+        """Origin of the body from the object's centre, in its axes [m]; if there is a hinge, on its axis."""
         return np.zeros(3) if self.joint is None else np.array(self.joint.point_m)
 
     def links(self, name: str) -> tuple[Link, ...]:
-        """Return the tree of links; joint and body have the name of the object."""
+        """Return the tree of links; its joint and body are named after the object."""
         back = -self._origin
         shapes = tuple(shape.placed(back, HERE) for shape in self.shapes)
         inertia = self.inertia.placed(np.eye(3), back)
@@ -631,7 +631,7 @@ class SceneObject(Sized):
 
 
 def _turn(rpy_deg: list[float]) -> Array:
-    # Imported here because the URDF reader takes long to load.
+    # Imported here because the URDF reader takes a long time to load.
     if not any(rpy_deg):
         return np.eye(3)
     from dynsim.model.urdf.reader import rotation
@@ -667,15 +667,15 @@ class Grip(StrictConfig):
     """Friction that differs along and across an axis of the body, like the friction of a wheel."""
 
     axis: Direction = Field(
-        description="direction of the reduced friction in the axes of the body or frame, projected onto the surface"
+        description="direction of reduced friction, in the axes of the body or frame; it is projected onto the surface"
     )
     ratio: Share = Field(
-        description="friction along the axis as a fraction of the friction across it; 0: it rolls freely"
+        description="friction along the axis as a fraction of the friction across the axis; 0: free rolling"
     )
 
 
 class ContactPoint(BodyPoint):
-    """Contact of a point fixed on a body, or of a sphere around it, with a surface."""
+    """Contact of a surface with a point fixed to a body, or with a sphere around this point."""
 
     surface: str = default("floor", "name of a surface")
     radius_m: NonNegative = default(0.0, "radius of a sphere around the point; 0: the point touches")
@@ -742,15 +742,16 @@ class Contacts(StrictConfig):
         return getattr(self, key) if value is None else value
 
     def coefficients(self, point: ContactPoint | None = None) -> tuple[float, float]:
-        """Return the kinetic and static coefficient of a point, or of all contacts.
+        """Return the kinetic and static friction coefficients of a point, or the values for all contacts.
 
-        Keys of the point take precedence over keys of `contacts`; the static coefficient defaults to the kinetic one.
+        Keys of the point take precedence over keys of `contacts`. The static coefficient defaults to the kinetic
+        coefficient.
         """
         kinetic, static = self.of(point, "friction"), self.of(point, "static_friction")
         return kinetic, kinetic if static is None else static
 
     def compliance(self, point: ContactPoint | None = None) -> tuple[float, float]:
-        """Return stiffness [N/m] (0: rigid) and damping [N s/m] of a point, or of all contacts."""
+        """Return stiffness [N/m] (0: rigid) and damping [N s/m] of a point, or the values for all contacts."""
         return self.of(point, "stiffness_N_per_m") or 0.0, self.of(point, "damping_N_s_per_m")
 
     @model_validator(mode="after")
@@ -772,7 +773,7 @@ class Contacts(StrictConfig):
         return self
 
     def _check_compliance(self) -> None:
-        """Raise an error for damping of a rigid contact and for restitution of a compliant contact."""
+        """Raise an error if a rigid contact has damping or a compliant contact has restitution."""
         for where, point in {"": None, **{f"points.{name}.": point for name, point in self.points.items()}}.items():
             config = self if point is None else point
             soft = self.compliance(point)[0] > 0.0
@@ -784,12 +785,12 @@ class Contacts(StrictConfig):
                 key = "restitution" if config.restitution else "stiffness_N_per_m"
                 raise error_at(
                     f"{where}{key}",
-                    f"compliant contacts have no restitution (here {restitution:g}); use damping_N_s_per_m instead",
+                    f"compliant contacts cannot have restitution (here {restitution:g}); use damping_N_s_per_m instead",
                 )
 
 
 class Initial(StrictConfig):
-    """Start of a run: smallest change of the plant's initial posture, and initial motor currents."""
+    """Start of a run: a minimal change of the plant's initial posture, and the initial motor currents."""
 
     on_surface: list[str] = default([], "contact points, enabled or disabled, that start exactly on their surfaces")
     keep: list[str] = default([], "joints that `on_surface` must not move; `hand` keeps the position of the hand")
@@ -855,7 +856,7 @@ class Integrator(StrictConfig):
 
     @property
     def absolute_tolerance(self) -> float:
-        """``atol`` or its default, which follows ``rtol``: a fixed default would limit the accuracy."""
+        """``atol`` or its default, which depends on ``rtol``, because a fixed default would limit the accuracy."""
         return min(1e-8, 1e-2 * self.rtol) if self.atol is None else self.atol
 
 
@@ -924,9 +925,9 @@ class ScenarioConfig(StrictConfig):
     @field_validator("name", "variant")
     @classmethod
     def _check_folder(cls, value: str) -> str:
-        """Both become folder names: they must not lead out of the results folder."""
+        """Check that the value is a valid folder name, which cannot lead out of the results folder."""
         if value in (".", "..") or any(sign in value for sign in "/\\\0"):
-            raise ValueError("becomes a folder name, so it must not contain slashes or be dots")
+            raise ValueError("becomes a folder name, so it must not contain slashes or consist only of dots")
         if not value.isprintable():
             raise ValueError("becomes a folder name, so it must be printable and on one line")
         if len(value.encode()) > NAME_LIMIT:
@@ -1070,7 +1071,7 @@ class Scenario:
         return resolved
 
     def location(self, keys: Sequence[int | str] = (), variant: str = "") -> str:
-        """Return where a key was set, for messages.
+        """Return the location at which a key was set, for messages.
 
         Parameters
         ----------
@@ -1082,7 +1083,7 @@ class Scenario:
         Returns
         -------
         str
-            ``file:line``; without a line if the key is not in the file. For an overridden key ``file: --set`` or
+            ``file:line``, or only ``file`` if the key is not in the file; for an overridden key, ``file: --set`` or
             ``file: overrides``.
 
         Examples

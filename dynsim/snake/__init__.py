@@ -1,1 +1,1 @@
-"""Kinematic snake robot: compiled kinematics, controller, support polygon and tick loop, and data of [T]."""
+"""Kinematic snake robot: compiled kinematics, controller, support polygon and tick loop, and published data of [T]."""

@@ -27,9 +27,9 @@ from dynsim.snake.kinematics import (
 )
 from dynsim.snake.support import Cost, Support, cost_gradient, new_support
 
-# Joint limits: ignored, clamped in the tick loop, or clamped with joints at a limit excluded from the allocation.
+# Treatment of joint limits: ignored; clamped in the tick loop; clamped, and joints at a limit excluded from allocation.
 LIMITS_NONE, LIMITS_SATURATE, LIMITS_ALLOCATE = 0, 1, 2
-# Null-space term: as printed in [T] eq 14, or in a form that never increases the cost, see control_input.
+# Null-space term: as printed in [T] eq 14, or in a form that never increases the cost; see control_input.
 NULL_PAPER, NULL_SAFE = 0, 1
 
 
@@ -44,10 +44,10 @@ class ControlLaw(NamedTuple):
     shape_target: np.ndarray  # (m,) [rad]
     grounded: np.ndarray  # (modes, n_b + 1) 1 for pairs on the ground
     limit_policy: int
-    rate_limit: float  # maximum joint rate [rad/s]; a command that needs a higher rate is not executed
+    rate_limit: float  # maximum joint rate [rad/s]; a command that requires a higher rate is not executed
     limit_rate: float  # maximum rate towards a joint limit, per remaining angle [1/s]
     damping_sigma: float  # smallest singular value of M below which the solution is damped
-    damping_factor: float  # damping at sigma = 0, in the unit of sigma
+    damping_factor: float  # damping at sigma = 0, in the same unit as sigma
     cost: Cost
 
 
@@ -70,9 +70,9 @@ class ControlWork(NamedTuple):
     singular: np.ndarray  # (n_u,) left singular vector of the smallest singular value
     error: np.ndarray  # (6,)
     gradient: np.ndarray  # (n_u,) eta
-    null_part: np.ndarray  # (n_u,) Q^T of the scaled gradient
+    null_part: np.ndarray  # (n_u,) Q^T times the scaled gradient
     u: np.ndarray  # (n_u,) result: joint rates, wheel rates [rad/s]
-    withheld: np.ndarray  # (1,) part of the command removed by damping [m/s, rad/s]
+    withheld: np.ndarray  # (1,) part of the command that damping removes [m/s, rad/s]
     at_limit: np.ndarray  # (n_phi,) 1: joint excluded from the allocation, 2: joint that could not be excluded
 
 
@@ -145,12 +145,12 @@ def reflect(j, reflector, beta, vector):
 def smallest_singular_value(count, tolerance, lower, u, y):
     """Compute the smallest singular value of L (count x count, lower triangular) by inverse iteration.
 
-    ``u`` receives the left singular vector, ``y`` is workspace, and ``tolerance`` is the relative change that ends the
-    iteration. The entries of the first vector have equal magnitude; their signs are chosen one by one to make y large
-    (Cline, Moler, Stewart, Wilkinson 1979). A fixed vector is orthogonal to the singular vector in some postures, and
-    the iteration then ends at the second smallest value. The convergence factor is the square of the ratio of the two
-    smallest singular values: near a singularity, where value and vector matter, two or three steps suffice; if the two
-    values are close, any combination of their vectors is adequate.
+    The left singular vector is written to ``u``, ``y`` is workspace, and ``tolerance`` is the relative change that ends
+    the iteration. The entries of the first vector have equal magnitude; their signs are chosen one by one to make y
+    large (Cline, Moler, Stewart, Wilkinson 1979). A fixed first vector would be orthogonal to the singular vector in
+    some postures, and the iteration would then end at the second smallest value. The convergence factor is the square
+    of the ratio of the two smallest singular values: near a singularity, where the value and vector matter, two or
+    three steps are sufficient; if the two values are close, any combination of their vectors is adequate.
     """
     sigma = math.inf
     for iteration in range(60):
@@ -181,7 +181,7 @@ def smallest_singular_value(count, tolerance, lower, u, y):
 
 @internal_kernel
 def factor_rows(B, rows, count, shape_joints, scale, row, lower, reflector, beta):
-    """Factorise B~ diag(scale) = L Q^T of a mode: rows ``rows[:count]`` of B, then S; return the number of rows."""
+    """Factorise B~ diag(scale) = L Q^T for a mode; B~ is ``rows[:count]`` of B, then S. Return the number of rows."""
     total = count + shape_joints.shape[0]
     for k in range(total):
         for i in range(row.shape[0]):
@@ -230,7 +230,7 @@ def solve_input(law, work, rows, null_gain):
 
 @internal_kernel
 def worst_limit_violation(model, law, work, phi):
-    """Return the joint whose rate exceeds its bound most, and that bound; (-1, 0) if no rate exceeds its bound."""
+    """Return the joint whose rate exceeds its bound the most, and this bound; (-1, 0) if no rate exceeds its bound."""
     u, at_limit, upper, lower, rate = work.u, work.at_limit, model.upper, model.lower, law.limit_rate
     worst, joint, bound = 1e-12, -1, 0.0
     for j in range(phi.shape[0]):
@@ -244,7 +244,7 @@ def worst_limit_violation(model, law, work, phi):
 
 @kernel
 def control_input(model, law, work, w, phi, w_target, velocity, mode, null_gain):
-    """Evaluate the control law once: joint and wheel rates u of [T] eqs 12-14, written to ``work.u``.
+    """Evaluate the control law once, and write the joint and wheel rates u of [T] eqs 12-14 to ``work.u``.
 
     u = B~^(W+) A~ (w~_d' - K (w~ - w~_d)) - k_eta (I - B~^(W+) B~) n, with n = eta (the paper's eq 14) or W^-1 eta
     (safe: eta . u_ker <= 0 for every W). Near a singular B~ only the part of the command along the weakest direction is
@@ -323,7 +323,7 @@ def control_input(model, law, work, w, phi, w_target, velocity, mode, null_gain)
             for i in range(row.shape[0]):
                 row[i] = 0.0
             row[joint] = root[joint]
-            # If the task determines this joint almost alone, the other joints would need 1/tolerance times its rate.
+            # If almost only this joint can perform the task, the other joints would need 1/tolerance times its rate.
             if append_row(rows, row, 1e-3 * root[joint], lower, reflector, beta):
                 rhs[rows] = bound
                 rows += 1
@@ -336,7 +336,7 @@ def control_input(model, law, work, w, phi, w_target, velocity, mode, null_gain)
 
 @internal_kernel
 def estimate_from_joints(model, phi, frame, base, w_hat, w):
-    """Estimate z, alpha, beta from the head joints with a level base ([T] IV.C.1); x, y, gamma remain as integrated.
+    """Estimate z, alpha, beta from the head joints for a level base ([T] IV.C.1); x, y, gamma keep integrated values.
 
     ``w_hat``, shape (6,), keeps its x, y, gamma; ``base`` and ``w`` are workspace.
     """

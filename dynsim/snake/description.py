@@ -38,7 +38,7 @@ class SnakeDescription:
     point_offset : float
         Distance of the controlled point ahead of the head point [m].
     reference_joints : (n_phi,) ndarray
-        Joint angles with raised head and straight base, the reference for damping [rad].
+        Joint angles with the head raised and the base straight, the reference for damping [rad].
     joint_names : tuple of str
         theta1, psi1, ..., then theta of the base part.
     pitch : (n_phi,) ndarray of bool
@@ -130,7 +130,7 @@ class ModeTable:
         Raises
         ------
         ModelError
-            If there is no mode, a mode number is below 1, or a pair does not exist.
+            If the table has no modes, a mode number is below 1, or a pair does not exist.
         """
         if not lifted:
             raise ModelError("controller.modes must have at least one mode, e.g. {1: [3, 6]}")
@@ -145,7 +145,7 @@ class ModeTable:
         return cls(tuple(lifted), grounded)
 
     def row(self, number: int, key: str) -> int:
-        """Return the row of a mode number; ``key`` is the scenario key that an error refers to."""
+        """Return the row of a mode number; ``key`` is the scenario key for an error message."""
         if number not in self.numbers:
             raise ModelError(f"{key}: unknown mode {number} (modes: {', '.join(map(str, self.numbers))})")
         return self.numbers.index(number)
@@ -157,7 +157,7 @@ class CommandBlock(NamedTuple):
     Attributes
     ----------
     velocity : (T, 6) ndarray
-        Mean rates of the target x, y, z [m/s], alpha, beta, gamma [rad/s] in each period.
+        Mean rates of the target in each period: x, y, z [m/s] and alpha, beta, gamma [rad/s].
     request : (T,) ndarray of int
         Mode request at the beginning of each period: NO_REQUEST, SWITCHING, FIXING, or a mode number.
     gripper : (T,) ndarray of int
@@ -170,7 +170,7 @@ class CommandBlock(NamedTuple):
 
 
 class Feedback(NamedTuple):
-    """State of the robot for an operator at the beginning of a control period.
+    """State of the robot that an operator receives at the beginning of a control period.
 
     Attributes
     ----------
@@ -201,9 +201,10 @@ class CommandSource(Protocol):
     """Source of commands, such as a script or a joystick."""
 
     def read(self, first: int, count: int, period: float, feedback: Feedback) -> CommandBlock:
-        """Return the commands of 1 to ``count`` control periods from period ``first``.
+        """Return the commands of 1 to ``count`` control periods, starting at period ``first``.
 
-        The engine calls again when these commands are used up. A script returns ``count`` periods, a joystick one.
+        The engine calls again when these commands are used up. A script returns ``count`` periods, and a joystick
+        returns one period.
 
         Parameters
         ----------
@@ -220,12 +221,12 @@ class CommandSource(Protocol):
 
 
 class Conditioning(NamedTuple):
-    """Ranks of the model of one mode at one posture ([T] eqs 9-11)."""
+    """Ranks and singular values of the model for one mode in one posture ([T] eqs 9-11)."""
 
     rows: int
     rank_A: int  # rank of A~; full rank: 6 + m
     rank_B: int  # rank of B~; full rank: rows
-    redundancy: int  # number of inputs - rank of B~
+    redundancy: int  # number of inputs minus rank of B~
     sigma_min_A: float
     sigma_min_B: float
     condition_B: float
@@ -235,7 +236,7 @@ class Conditioning(NamedTuple):
 class TaskSpaceController:
     """Parameters of the tick loop and the mode switcher.
 
-    ``prediction`` is the schedule of a predicted switching period with ``prediction_ticks`` coarser steps.
+    ``prediction`` is the schedule for predicting a switching period with ``prediction_ticks`` coarser steps.
     """
 
     law: ControlLaw
@@ -256,7 +257,7 @@ class TaskSpaceController:
 def conditioning(
     model: SnakeModel, law: ControlLaw, row: int, base: NDArray[np.float64], phi: NDArray[np.float64]
 ) -> Conditioning:
-    """Compute ranks and singular values of A~ and B~ ([T] eqs 10, 11) of one mode at a posture on the ground."""
+    """Compute the ranks and singular values of A~ and B~ ([T] eqs 10, 11) for one mode in a posture on the ground."""
     chain, w, frame = new_chain(model), np.zeros(6), np.zeros((3, 3))
     pose_of_point(model, reals(base), reals(phi), frame, w)
     walk_chain(model, w, reals(phi), frame, chain)

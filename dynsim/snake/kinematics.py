@@ -23,11 +23,12 @@ from dynsim.jit.kernel import internal_kernel, kernel
 class SnakeModel(NamedTuple):
     """Parameters of a robot for the kernels: lengths [m], angles [rad], masses [kg].
 
-    n_phi = head_joints + base_joints joints, base_joints + 1 wheel pairs, head_joints + 2 base_joints links.
+    The robot has n_phi = head_joints + base_joints joints, base_joints + 1 wheel pairs and head_joints + 2 base_joints
+    links.
     """
 
-    head_joints: int  # n_h, even: yaw and pitch alternate
-    base_joints: int  # n_b, all yaw
+    head_joints: int  # n_h, even, because yaw and pitch joints alternate
+    base_joints: int  # n_b, all of them yaw joints
     wheels: int  # n_w, active wheels of the base part
     link_length: float
     wheel_radius: float
@@ -103,7 +104,7 @@ def head_frame(w, R):
 
 @kernel
 def pose_of_point(model, base, phi, R, w):
-    """Compute the pose w of the controlled point for a base part that is level on its wheels.
+    """Compute the pose w of the controlled point if the base part is level on its wheels.
 
     Parameters
     ----------
@@ -196,7 +197,7 @@ def velocity_row(model, chain, w, pair, a, A, B, row):
 
 @internal_kernel
 def add_rotation(model, chain, pair, factor, a, A, B, row):
-    """Add factor a . omega_pair = A w' - B u, the rotation of the body of a wheel pair, to a row."""
+    """Add factor times a . omega_pair = A w' - B u, with the angular velocity of a wheel pair's body, to a row."""
     ax, ay, az = factor * a[0], factor * a[1], factor * a[2]
     for k in range(3):
         e = chain.rate_axis[k]
@@ -210,8 +211,8 @@ def add_rotation(model, chain, pair, factor, a, A, B, row):
 def constraint_matrices(model, chain, w, A, B):
     """Compute A(q) and B(q) of A w' = B u with all wheels on the ground, u = (phi', rho') ([T] eqs 2-6).
 
-    Rows: n_b + 1 rows without side slip, Y_i . v_i = 0; three rows of ground contact, e_z . v_1 = 0 and
-    X_1 . omega_tail = Y_1 . omega_tail = 0; n_w rows of rolling active wheels,
+    The rows are: n_b + 1 rows for no side slip, Y_i . v_i = 0; three rows for ground contact, e_z . v_1 = 0 and
+    X_1 . omega_tail = Y_1 . omega_tail = 0; n_w rows for rolling active wheels,
     X_i . v_i - side_i b_i (Z_i . omega_i) = r rho_i'.
 
     Parameters
@@ -231,7 +232,7 @@ def constraint_matrices(model, chain, w, A, B):
     joints = model.head_joints + model.base_joints
     for i in range(pairs):
         velocity_row(model, chain, w, i, chain.pair_y[i], A, B, i)
-    first = pairs - pairs  # a variable instead of the literal 0, so that only one signature is compiled
+    first = pairs - pairs  # use a variable instead of the literal 0, so that only one signature is compiled
     velocity_row(model, chain, w, first, chain.rate_axis[2], A, B, pairs)  # rate axis of gamma: e_z
     for row in range(pairs + 1, pairs + 3):
         a = chain.pair_x[0] if row == pairs + 1 else chain.pair_y[0]

@@ -1,12 +1,13 @@
 """Lifting of wheel pairs: geometry of a snake from its record, and pitch angles that lift the pairs.
 
-A record has 1 for each pair on the ground and 0 for each lifted pair; lifting takes time. The height of a pair is
+A record contains 1 for each pair on the ground and 0 for each lifted pair, but lifting takes time. The height of a pair
+is
 
     eta(t) = clearance s((t - t_up)/blend) s((t_down - t)/blend),   s(u) = 10 u^3 - 15 u^4 + 6 u^5
 
-from the first sample t_up at which it is lifted to the first sample t_down at which it is grounded again. So a pair is
-in the air only while it is lifted in the record. The pitch angles follow from the heights and yaw angles of each sample
-and are computed before any motion starts.
+from the first sample t_up at which it is lifted to the first sample t_down at which it is grounded again. A pair is
+thus in the air only while it is lifted in the record. The pitch angles follow from the heights and yaw angles of each
+sample and are computed before any motion starts.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from dynsim.errors import CheckRefused, MissingEntry
 from dynsim.record import TIME, Record
 from dynsim.record.scene import Scene
 
-# Geometry from the scene of a record.
+# Geometry of a snake, from the scene of its record.
 
 
 @dataclass(frozen=True)
@@ -78,7 +79,7 @@ def snake_geometry(record: Record) -> SnakeGeometry:
 
 
 class WheelOfPair(NamedTuple):
-    """Position of a wheel along its body, its distance to the side of the body's middle, and its radius [m]."""
+    """Position of a wheel along its body, its lateral distance from the middle of the body, and its radius [m]."""
 
     along: float
     beside: float
@@ -86,7 +87,7 @@ class WheelOfPair(NamedTuple):
 
 
 def wheels_of(scene: Scene, pair: str) -> list[WheelOfPair]:
-    """Return the wheels of a wheel pair's body: its own shapes, and bodies that turn on it."""
+    """Return the wheels of a wheel pair's body: shapes of the body itself, and bodies that rotate on it."""
     index = {body.name: k for k, body in enumerate(scene.bodies)}[pair]
     places = [(shape.position, shape) for shape in scene.bodies[index].shapes]
     places += [(body.joint.position, body.shapes[0]) for body in scene.bodies if body.parent == index and body.shapes]
@@ -95,20 +96,20 @@ def wheels_of(scene: Scene, pair: str) -> list[WheelOfPair]:
     ]
 
 
-# Kinematics of the base part with lifted wheel pairs: pitch angles of the plates hinged at the axles.
+# Kinematics of the base part with lifted wheel pairs: pitch angles of the plates that are hinged at the axles.
 
 
 Coefficients = tuple[float, float, float]
 NEWTON_STEPS = 12
-# Minimum change of the height per pitch angle [m/rad]; with less the height is out of reach.
+# Minimum change of height per pitch angle [m/rad]; if it is less, the height is out of reach.
 FLAT = 1e-12
-# Last Newton step of a pitch angle [rad]; the height of the wheel is then accurate to 2e-10 m.
+# Size of the last Newton step of a pitch angle [rad]; the height of the wheel is then accurate to 2e-10 m.
 CONVERGED = 1e-9
 
 
 @dataclass(frozen=True)
 class Fold:
-    """Folded base part at T instants.
+    """Base part folded about its axles, at T instants.
 
     Attributes
     ----------
@@ -127,7 +128,7 @@ class Fold:
 
 @dataclass(frozen=True)
 class BasePart:
-    """Lengths of the base part and the record's columns of its yaw angles.
+    """Lengths of the base part, and the columns of a record that contain its yaw angles.
 
     Attributes
     ----------
@@ -171,7 +172,7 @@ class BasePart:
         Raises
         ------
         ArithmeticError
-            If a height is out of reach; the arguments are the indices of the instant and of the pair.
+            If a height is out of reach; the exception's arguments are the indices of the instant and of the pair.
         """
         hinge, lower, tilt = np.zeros_like(yaw), np.zeros_like(height), np.zeros_like(height)
         before, behind, half_track = self.before.tolist(), self.behind.tolist(), self.half_track.tolist()
@@ -211,7 +212,7 @@ class BasePart:
                 break
             step = (above + rise[0] + rise[1] * c + rise[2] * s + lever * incline - self.radius * disc) / change
             psi -= step
-            # Quadratic convergence: the next step would be of the order of the square.
+            # Convergence is quadratic, so the next step would be of the order of this step squared.
             if abs(step) < CONVERGED:
                 return psi
         return math.nan
@@ -264,14 +265,15 @@ def base_part(record: Record, pairs: tuple[str, ...]) -> BasePart:
 
 
 Array = NDArray[np.float64]
-# Minimum number of samples per blend; with fewer the path between two samples deviates from their heights.
+# Minimum number of samples per blend; with fewer samples, the path between two samples would deviate from their
+# heights.
 SAMPLES_PER_BLEND = 20
 # Tolerance of comparisons between times [s].
 TIME_ROUNDING = 1e-9
 
 
 class Lifts(StrictConfig):
-    """Lifting of the wheel pairs that are lifted in a record.
+    """Options for lifting the wheel pairs that are lifted in a record.
 
     All pairs except the last have a pitch joint on the axle. Lifting adds to the angles of these joints; the first
     joint, on the axle that carries the head, follows the record and keeps the head in place.
@@ -285,8 +287,8 @@ class Lifts(StrictConfig):
     blend_s: Positive = Field(0.3, description="time to lift or lower a pair, in record time")
     tilt_mm: Positive = Field(
         2.5,
-        description="maximum height difference between the wheels of a grounded pair, caused by the twist of a bent "
-        "base; an error if exceeded",
+        description="maximum height difference between the wheels of a grounded pair, due to the twist of a bent base; "
+        "a larger difference is an error",
     )
 
 
@@ -296,8 +298,8 @@ def lifted(record: Record, lifts: Lifts) -> Fold:
     Raises
     ------
     CheckRefused
-        If the signal does not exist, a pair cannot be lifted, or a lift is too short. The message contains pair and
-        time.
+        If the signal does not exist, a pair cannot be lifted, or a lift is too short. The message contains the pair and
+        the time.
     """
     grounded = grounded_pairs(record, lifts.signal)
     pairs = record.labels[lifts.signal]
@@ -326,14 +328,14 @@ def fold_to_heights(part: BasePart, yaw: Array, height: Array, lifts: Lifts, tim
     height : (T, pairs) ndarray
         Heights of the pairs [m].
     lifts : Lifts
-        Options of lifting.
+        Options for lifting.
     time : (T,) ndarray
         Times [s], for error messages.
 
     Raises
     ------
     CheckRefused
-        If a height is out of reach, or a pair would stand on one wheel. The message contains pair and time.
+        If a height is out of reach, or a pair would stand on one wheel. The message contains the pair and the time.
     """
     try:
         fold = part.fold(yaw, height)
@@ -407,8 +409,8 @@ def refuse_short_lift(lifts: Lifts, name: str, up: float, down: float, blends: i
     """Raise CheckRefused if a lift from ``up`` to ``down`` [s] is shorter than ``blends`` blends."""
     if down - up < blends * lifts.blend_s - TIME_ROUNDING:
         raise CheckRefused(
-            f"{name} is lifted for {down - up:.3f} s from t = {up:.3f} s; raising and lowering takes "
-            f"{blends * lifts.blend_s:g} s (lifts.blend_s): lift longer or lower blend_s"
+            f"{name} is lifted for {down - up:.3f} s from t = {up:.3f} s, but raising and lowering it take "
+            f"{blends * lifts.blend_s:g} s (lifts.blend_s); lift it for longer, or reduce blend_s"
         )
 
 
@@ -424,7 +426,7 @@ def _smooth(u: Array) -> Array:
 
 
 def _refuse_twist(tilt: Array, lifts: Lifts, pairs: tuple[str, ...], time: Array) -> None:
-    """Raise CheckRefused if a wheel of a grounded pair is too high to roll as in the record's kinematics."""
+    """Raise CheckRefused if a wheel of a grounded pair is too high to roll as the record's kinematics assume."""
     row, pair = np.unravel_index(int(tilt.argmax()), tilt.shape)
     if tilt[row, pair] > 1e-3 * lifts.tilt_mm:
         raise CheckRefused(

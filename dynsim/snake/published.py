@@ -19,14 +19,14 @@ Table = list[list[str]]  # the first row has the headings
 
 
 class Displacement(NamedTuple):
-    """Relative displacement of the head, x, y, z [m], alpha, beta, gamma [rad]."""
+    """Relative displacement of the head: x, y, z [m] and alpha, beta, gamma [rad]."""
 
     target: tuple[float, ...]
     mean: tuple[float, ...]
     deviation: tuple[float, ...]  # standard deviation over five runs
 
 
-# [T] Table III, by moved coordinate.
+# [T] Table III, by the coordinate that was moved.
 TABLE_III: dict[str, Displacement] = {
     "x": Displacement(
         (0.20, 0, 0, 0, 0, 0),
@@ -71,7 +71,7 @@ def displacement(record: Record) -> np.ndarray:
 
 
 def table_iii(records: Mapping[str, Record]) -> Table:
-    """Return Table III with targets, measurements of [T] and simulations, for the simulated manoeuvres."""
+    """Return Table III with targets, measurements from [T] and simulations, for the manoeuvres that were simulated."""
     rows = [["moved", "what", *COORDINATES]]
     for moved, published in TABLE_III.items():
         if moved in records:
@@ -83,14 +83,14 @@ def table_iii(records: Mapping[str, Record]) -> Table:
 
 
 UNITS = ("m", "m", "m", "rad", "rad", "rad")
-# Column of the table → ending that follows the moved coordinate in the variants of `snake_positioning_dynamic`.
+# Mapping from table columns to the suffixes of the variants of `snake_positioning_dynamic`, after the moved coordinate.
 SOURCES = {"kinematic": "_kinematic", "dynamic": "", "measured": "_measured"}
 
 
 def table_iii_dynamic(records: Mapping[str, Record]) -> Table:
     """Return Table III next to kinematic and dynamic simulations, and simulations with a measured head pose.
 
-    Each row has one number of the paper.
+    Each row contains one number from the paper.
     """
     rows = [["variant", "quantity", "paper_mean", "paper_sd", *SOURCES]]
     for moved, published in TABLE_III.items():
@@ -108,7 +108,7 @@ def table_iii_dynamic(records: Mapping[str, Record]) -> Table:
 
 
 class Push(NamedTuple):
-    """Posture of a push test, and the measured contact forces f_x, f_y, f_z of the head on a plate.
+    """Posture in a push test, and the measured contact forces f_x, f_y, f_z of the head on a plate.
 
     Attributes
     ----------
@@ -127,7 +127,7 @@ class Push(NamedTuple):
     deviation: tuple[float, float, float]
 
 
-# [T] Table IV, with different heights z_h.
+# [T] Table IV: postures with different heights z_h.
 TABLE_IV: dict[str, Push] = {
     "i": Push(0.40, 0.0, False, (16.9, 5.71, 15.7), (0.3, 0.22, 0.3)),
     "ii": Push(0.35, 0.0, False, (24.0, 8.60, 12.1), (1.1, 0.20, 0.1)),
@@ -136,7 +136,7 @@ TABLE_IV: dict[str, Push] = {
     "v": Push(0.35, 0.0, True, (21.4, 7.1, 11.3), (0.5, 0.5, 0.2)),
     "vi": Push(0.30, 0.0, True, (26.3, 9.94, 10.3), (1.1, 0.35, 0.2)),
 }
-# [T] Table V, with different y_h; f_y of posture (v) has one more digit.
+# [T] Table V: postures with different lateral positions y_h; f_y of posture (v) has one more digit.
 TABLE_V: dict[str, Push] = {
     "ii": TABLE_IV["ii"],
     "vii": Push(0.35, 0.1, False, (20.4, 11.1, 13.2), (0.4, 0.5, 0.2)),
@@ -145,11 +145,11 @@ TABLE_V: dict[str, Push] = {
     "ix": Push(0.35, 0.1, True, (19.2, 12.7, 13.5), (1.1, 0.6, 0.4)),
     "x": Push(0.35, 0.2, True, (13.5, 14.9, 16.1), (0.5, 1.1, 0.2)),
 }
-# Coordinate in the name of a variant → pushing direction of the head.
+# Mapping from the coordinate in the name of a variant to the direction in which the head pushes.
 PUSHES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, -1.0)}
 # Name of the contact point that touches the plate.
 PLATE = "plate"
-# Depth of the target in the plate at which f_z is evaluated [m]; the paper does not specify it.
+# Depth of the target inside the plate at which f_z is evaluated [m]; the paper does not specify it.
 DEPTH_Z = 0.07
 
 
@@ -161,7 +161,7 @@ class Pushed(NamedTuple):
     force : float
         Force of the plate against the push [N].
     depth : float
-        Depth of the target in the plate at this force [m].
+        Depth of the target inside the plate at this force [m].
     stop_acted : bool
         Whether a mechanical stop carried force while the head pushed.
     """
@@ -172,7 +172,7 @@ class Pushed(NamedTuple):
 
 
 def pushed(record: Record, coordinate: str) -> Pushed:
-    """Evaluate f_x and f_y at their maximum, and f_z at the depth :data:`DEPTH_Z` or else at the maximum depth."""
+    """Evaluate f_x and f_y at their maximum, and f_z at the depth DEPTH_Z or, if not reached, at the maximum depth."""
     plate = record.labels["contact_normal_force"].index(PLATE)
     force, gap = record["contact_normal_force"][:, plate], record["contact_gap"][0, plate]
     target = record["w_target"][:, :3]
@@ -199,7 +199,7 @@ def push_table(published: Mapping[str, Push], records: Mapping[str, Record]) -> 
 
 
 def wheel_table(records: Mapping[str, Record]) -> Table:
-    """Return load, slip distance and friction energy of each wheel and variant."""
+    """Return the load, slip distance and friction energy of each wheel in each variant."""
     rows = [["variant", "wheel", "mean_load_N", "largest_load_N", "slip_m", "friction_J"]]
     for variant, record in records.items():
         if "contact_slip_velocity" not in record:
@@ -216,15 +216,15 @@ def wheel_table(records: Mapping[str, Record]) -> Table:
 
 # [T] Table I: battery life [min].
 BATTERY_LIFE = 80.0
-# Stall current of the MX-106 at 12 V: from the data sheet, and of the model, U / R [A].
+# Stall current of the MX-106 at 12 V [A]: the value in the data sheet, and the value of the model, U / R.
 STALL_CURRENT = (5.2, 3.3)
 
 
 def energy_table(records: Mapping[str, Record]) -> Table:
-    """Return the energy of a run by destination, and the battery capacity for the 80 min of [T] Table I.
+    """Return how the energy of a run is used, and the battery capacity needed for the 80 min of [T] Table I.
 
-    The motor of the model has a lower stall current than the data sheet; with the current of the data sheet all
-    electrical energies are larger by this ratio.
+    The motor of the model has a lower stall current than the data sheet; with the current of the data sheet, all
+    electrical energies would be larger by this ratio.
     """
     more = STALL_CURRENT[0] / STALL_CURRENT[1]
     names = ("supply_J", "joule_J", "gear_J", "wheel_friction_J", "tyre_J", "mean_power_W")
@@ -242,7 +242,7 @@ def energy_table(records: Mapping[str, Record]) -> Table:
 
 
 class Statement(NamedTuple):
-    """Statement of [T], and the function that evaluates the same quantity from a record."""
+    """Statement in [T], and the function that evaluates the same quantity from a record."""
 
     section: str
     quantity: str
@@ -278,7 +278,7 @@ def used_limit(record: Record) -> np.ndarray:
 
 
 def opening(record: Record) -> np.ndarray:
-    """Return the opening angle of the door, or the turn of the head in a record without door, shape (T,) [°]."""
+    """Return the opening angle of the door, or the turn of the head in a record without a door, shape (T,) [°]."""
     has_door = "door" in record.labels.get("q", ())
     angle = record["q"][:, record.labels["q"].index("door")] if has_door else record["w"][:, 5]
     return np.asarray(np.abs(np.rad2deg(angle - angle[0])))
@@ -290,10 +290,10 @@ def _largest_base_angle(record: Record) -> str:
 
 
 def _straightening(record: Record) -> str:
-    """Return the base joints in the order in which they stay below half of their first angle, with the time [s]."""
+    """Return the base joints, in the order of the time [s] from which they stay below half of their first angle."""
     angle, names = np.abs(base_joints(record)), record.labels["phi"][-base_joints(record).shape[1] :]
     rows, texts = len(angle), []
-    # first row from which the joint stays below; the number of rows if it never does
+    # First row from which the joint stays below half of its first angle; the number of rows if it never does.
     below = [int(np.append(-1, np.flatnonzero(column > 0.5 * column[0]))[-1]) + 1 for column in angle.T]
     for j in np.argsort(below, kind="stable"):
         texts.append(f"{names[j]} " + (f"{record.time[below[j]]:.1f}" if below[j] < rows else "never"))
@@ -325,7 +325,7 @@ def _rms_base_angle(record: Record) -> str:
     return f"{np.sqrt((base_joints(record)[-1] ** 2).mean()):.3f}"
 
 
-# [T] V.B (Figs 8 to 10), IV.C.5 (Table II) and V.E (Fig 16), sentence by sentence.
+# Statements in [T] V.B (Figs 8 to 10), IV.C.5 (Table II) and V.E (Fig 16), in the order of the text.
 JOINT_LIMITS: tuple[Statement, ...] = (
     Statement("V.B", "maximum base joint angle, start -> end [rad]",
               "near the limit (1.1), decreased with time", "cyclic", _largest_base_angle),
@@ -363,7 +363,7 @@ JOINT_LIMITS: tuple[Statement, ...] = (
     ),
 )  # fmt: skip
 
-# Scenarios of [T] V.D.3, Fig 14: the arc without and with a door.
+# Scenarios for [T] V.D.3, Fig 14: the arc without and with a door.
 DOORS = ("snake_door_arc", "snake_door")
 DOOR: tuple[Statement, ...] = tuple(
     Statement("V.D.3, Fig 14", quantity, published, variant, take)
@@ -385,7 +385,7 @@ DOOR: tuple[Statement, ...] = tuple(
 
 
 def statements(listed: tuple[Statement, ...], records: Mapping[str, Record]) -> Table:
-    """Return a table of statements next to the simulated values, for the simulated variants."""
+    """Return a table that compares statements with simulated values, for the variants that were simulated."""
     rows = [["[T]", "what", "published", "variant", "simulated"]]
     rows += [[*s[:4], s.simulated(records[s.variant])] for s in listed if s.variant in records]
     return rows
@@ -433,5 +433,5 @@ def tables(scenario: str, records: Mapping[str, Record]) -> dict[str, Table]:
         results = {"door": statements(DOOR, records)}
     else:
         results = {}
-    # a table with only a heading has no simulated variant
+    # A table that has only a heading row or column has no simulated variant.
     return {name: rows for name, rows in results.items() if len(rows) > 1 and len(rows[0]) > 1}

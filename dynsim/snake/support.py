@@ -26,7 +26,7 @@ class Cost(NamedTuple):
     angle_weight: float  # a_1
     support_weight: float  # a_2 [m]
     distance_floor: float  # [m] lower bound of the distances in V, so that V stays finite if the robot tips
-    smoothing: float  # [m] sides whose distances differ by less than about this are averaged as the nearest side
+    smoothing: float  # [m] sides whose distances differ by less than about this value are averaged as the nearest side
 
 
 class Support(NamedTuple):
@@ -39,7 +39,7 @@ class Support(NamedTuple):
     distance: np.ndarray  # (2 (n_b + 1),) signed distance of the centre of mass from each side, inside > 0 [m]
     length: np.ndarray  # (2 (n_b + 1),) length of each side [m]
     centre: np.ndarray  # (3,) centre of mass [m]
-    centre_slope: np.ndarray  # (n_phi, 2) derivative of its projection with the body of wheel pair 1 fixed [m/rad]
+    centre_slope: np.ndarray  # (n_phi, 2) derivative of the projected centre with wheel pair 1's body fixed [m/rad]
     slope: np.ndarray  # (n_phi,) derivative of one distance [m/rad]
     length_slope: np.ndarray  # (n_phi,) derivative of the length of that side [m/rad]
 
@@ -83,7 +83,7 @@ def convex_hull(points, count, order, hull):
                 size -= 1
             hull[size] = p
             size += 1
-        size -= 1  # the last point of a sweep is the first point of the next
+        size -= 1  # the last point of a sweep is the first point of the next sweep
     return size
 
 
@@ -96,7 +96,7 @@ def support_polygon(model, chain, grounded, support):
     Returns
     -------
     sides : int
-        Number of sides; 0 without a polygon.
+        Number of sides; 0 if no polygon exists.
     margin : float
         Smallest d_i [m]; -inf for fewer than three corners.
     """
@@ -146,7 +146,7 @@ def polygon_area(support, sides):
 
 @internal_kernel
 def centre_slopes(model, chain, support):
-    """Compute the derivatives of the projected centre of mass by the joint angles; wheel pair 1 is fixed."""
+    """Compute the derivatives of the projected centre of mass with respect to the joint angles, wheel pair 1 fixed."""
     total = 0.0
     for k in range(model.link_mass.shape[0]):
         total += model.link_mass[k]
@@ -175,7 +175,7 @@ def centre_slopes(model, chain, support):
 
 @internal_kernel
 def distance_slope(model, chain, support, side, sides):
-    """Compute the derivatives of a distance d_side and of the side's length by the joint angles [m/rad].
+    """Compute the derivatives of a distance d_side and of the side's length with respect to joint angles [m/rad].
 
     The results are in ``support.slope`` and ``support.length_slope``.
     """
@@ -202,7 +202,7 @@ def distance_slope(model, chain, support, side, sides):
 
 @internal_kernel
 def nearness(support, side, smoothing, margin):
-    """Return exp(-(d_side - margin) / s): 1 for the nearest side, near 0 for sides that are several s farther."""
+    """Return exp(-(d_side - margin) / s): 1 for the nearest side, near 0 for sides that are several s farther away."""
     return math.exp(-(support.distance[side] - margin) / smoothing)
 
 
@@ -210,8 +210,9 @@ def nearness(support, side, smoothing, margin):
 def smooth_margin(support, sides, smoothing, margin):
     """Smooth the smallest distance: margin - s ln sum_i (L_i / L) exp(-(d_i - margin) / s), L = sum of the lengths L_i.
 
-    The gradient of the exact minimum jumps if two sides are equally near, and a robot that follows it oscillates
-    between them. With weights by length, a side that a new corner of the hull splits has the same effect as before.
+    The gradient of the exact minimum jumps if two sides are equally near, and a robot that follows it would oscillate
+    between them. As sides are weighted by their lengths, a side that a new corner of the hull splits has the same
+    effect as before.
 
     Returns
     -------
@@ -250,7 +251,7 @@ def cost_value(cost, phi, sides, support, margin):
 
 @kernel
 def cost_gradient(model, cost, chain, phi, grounded, support, gradient):
-    """Write eta = dV/d(phi, rho) ([T] eq 17), shape (n_phi + n_w,), to ``gradient``; its wheel part is zero."""
+    """Write eta = dV/d(phi, rho) ([T] eq 17), shape (n_phi + n_w,), to ``gradient``; the part for wheels is zero."""
     angle_weight = 1.0 if cost.kind == COST_ANGLES else cost.angle_weight
     for j in range(gradient.shape[0]):
         gradient[j] = 2.0 * angle_weight * cost.diagonal[j] * phi[j] if j < phi.shape[0] else 0.0

@@ -22,22 +22,22 @@ from dynsim.snake.support import cost_value, polygon_area, support_polygon
 
 # Data of the tick loop: schedule, state of plant and controller, workspace, recorded rows.
 
-# Source of the controller's state estimate; GIVEN: written by the caller that moves the robot.
+# Source of the controller's state estimate; GIVEN: the caller, which moves the robot, writes the estimate.
 MEASURED, ESTIMATED, FEEDFORWARD, GIVEN = 0, 1, 2, 3
 # Reasons why a command cannot be executed.
 NO_OBSTACLE, JOINT_LIMIT, RATE_LIMIT, SINGULAR, ATTITUDE = 0, 1, 2, 3, 4
 # Indices of SnakeState.counts
 MODE = 0  # row of the mode in ControlLaw.grounded
-TICKS = 1  # ticks simulated
-CLAMPED = 2  # joint-ticks clamped at a limit
-CARRIED_OUT = 3  # executed commands of the current block
+TICKS = 1  # number of simulated ticks
+CLAMPED = 2  # number of clamped joint rates, counted for each joint and tick
+CARRIED_OUT = 3  # number of executed commands of the current block
 WAITED = 4  # ticks in which the command could not be executed and the target waited
-SLOWED = 5  # ticks with rates scaled down
-NULL_REDUCED = 6  # ticks with reduced null-space motion
+SLOWED = 5  # ticks in which the rates were scaled down
+NULL_REDUCED = 6  # ticks in which the null-space motion was reduced
 WAITED_FOR = 6  # + JOINT_LIMIT … ATTITUDE: ticks in which the target waited for this reason
 PATH_SLOWED = WAITED_FOR + ATTITUDE + 1  # ticks in which the target moved slower than commanded
 STILL = PATH_SLOWED + 1  # ticks since the target started to wait
-STILL_FOR = STILL + 1  # reason of the last wait
+STILL_FOR = STILL + 1  # reason for the last wait
 COUNTS_SIZE = STILL_FOR + 1
 # Indices of SnakeState.progress
 DONE = 0  # executed part of the current row of commands, 0 to 1
@@ -48,7 +48,7 @@ class Schedule(NamedTuple):
     """Sampling of the controller."""
 
     period: float  # control period [s]
-    midpoint: int  # 1: rates are computed for the predicted middle of the period; 0: for its beginning
+    midpoint: int  # 1: rates are computed for the predicted middle of the period; 0: for the beginning
     substeps: int  # integration steps of the plant per control period
     state_source: int  # MEASURED, ESTIMATED, FEEDFORWARD or GIVEN
     null_start_tick: int
@@ -136,11 +136,11 @@ def new_trace(model: SnakeModel, rows: int) -> SnakeTrace:
 
 @internal_kernel
 def base_velocity(model, grounded, yaw, phi, u, ws):
-    """Compute the velocity of the base part from the grounded wheels, written to ``ws.base_rate``.
+    """Compute the velocity of the base part from the grounded wheels, and write it to ``ws.base_rate``.
 
     Joint and wheel rates are known, so the rows (no side slip of grounded pairs, rolling of grounded active wheels)
-    overdetermine the three unknowns. The least-squares solution is the motion of least dissipation if all wheels slip
-    with equal viscous friction. Between control ticks the held rates satisfy the rows only to first order, and the
+    overdetermine the three unknowns. The least-squares solution is the motion with the least dissipation if all wheels
+    slip with equal viscous friction. Between control ticks the held rates satisfy the rows only to first order, and the
     solution distributes the residual evenly. A consistent u gives the exact motion.
 
     Returns
@@ -167,7 +167,7 @@ def base_velocity(model, grounded, yaw, phi, u, ws):
                 y -= model.link_length * math.sin(heading)
             if not grounded[pair]:
                 continue
-            vx, vy = 0.0, 0.0  # from the joint rates, pair 1 held
+            vx, vy = 0.0, 0.0  # due to the joint rates, with pair 1 held
             for j in range(pair):
                 rate = u[model.head_joints + j]
                 vx -= rate * (y - ws.py[j])
@@ -206,7 +206,7 @@ def base_velocity(model, grounded, yaw, phi, u, ws):
 
 @internal_kernel
 def advance_plant(model, grounded, period, substeps, state, u, ws):
-    """Hold u for one control period: exact joints and wheels, base pose by the classical Runge-Kutta method.
+    """Hold u for one control period; joints and wheels move exactly, the base by the classical Runge-Kutta method.
 
     Returns the largest slip [m/s].
     """
@@ -236,25 +236,26 @@ def advance_plant(model, grounded, period, substeps, state, u, ws):
 
 # Maximum part of a command that damping may remove [m/s, rad/s]; with gain K the head error is WITHHELD / K.
 WITHHELD = 1e-5
-# Limit of |beta|: a target is not rotated closer to +-90 deg [rad].
+# Limit of |beta| [rad]; a target is not rotated closer to +-90 deg than this.
 BETA_LIMIT = 0.5 * math.pi - 0.02
-# Steps in which a null-space motion that is too fast is reduced; the last step removes it.
+# Number of steps in which a null-space motion that is too fast is reduced; the last step removes it completely.
 NULL_REDUCTIONS = 4
 # Maximum number of trials for a target speed within the limits. Each trial uses the fraction ROOM of the speed that the
-# last trial allows, but at least LEAST_PART of the last speed: far above the limits the prediction is inaccurate.
+# last trial allows, but at least LEAST_PART of the last speed, because the prediction is inaccurate far above the
+# limits.
 SLOW_DOWNS = 8
 ROOM = 0.98
 LEAST_PART = 0.25
-# Minimum target speed as a fraction of the commanded speed; below it the target waits.
+# Minimum target speed as a fraction of the commanded speed; if the target would be slower, it waits.
 LEAST_SPEED = 0.01
-# Distance to a joint limit below which the joint is at the limit [rad]; a joint farther away that blocks a command was
-# too fast.
+# Distance to a joint limit below which the joint counts as at the limit [rad]; a joint that is farther away but blocks
+# a command was too fast.
 AT_LIMIT = 0.05
 
 
 @internal_kernel
 def copy(source, target):
-    """Copy source to target; numba's slice assignment would also compile its error formatting."""
+    """Copy source to target, because numba's slice assignment would also compile the formatting of errors."""
     for i in range(source.shape[0]):
         target[i] = source[i]
 
@@ -275,7 +276,7 @@ def update_estimate(model, schedule, state, ws):
 
 @internal_kernel
 def obstacle(law, work, joints):
-    """Return why ``work.u`` cannot be executed: SINGULAR, JOINT_LIMIT, RATE_LIMIT or NO_OBSTACLE."""
+    """Return the reason why ``work.u`` cannot be executed: SINGULAR, JOINT_LIMIT, RATE_LIMIT, or NO_OBSTACLE."""
     if work.withheld[0] > WITHHELD:
         return SINGULAR
     reason = NO_OBSTACLE
@@ -297,7 +298,7 @@ def slow_down(model, law, u, phi):
     factor = 1.0
     for j in range(phi.shape[0]):
         room = law.limit_rate * max(model.upper[j] - phi[j] if u[j] > 0.0 else phi[j] - model.lower[j], 0.0)
-        # allocation puts rates on their bounds only to rounding
+        # Allocation puts rates on their bounds only up to rounding.
         allowed = min(law.rate_limit, room + 1e-9)
         if abs(u[j]) > allowed:
             factor = min(factor, allowed / abs(u[j]))
@@ -308,7 +309,7 @@ def slow_down(model, law, u, phi):
 
 @internal_kernel
 def is_too_fast(model, law, work, reason, phi):
-    """Return whether a slower target would help: joints are too fast, and none that blocks is already at its limit."""
+    """Return whether a slower target would help: joints are too fast, and no blocking joint is already at its limit."""
     for j in range(phi.shape[0]):
         if work.at_limit[j] == 2:
             left = model.upper[j] - phi[j] if work.u[j] > 0.0 else phi[j] - model.lower[j]
@@ -319,7 +320,7 @@ def is_too_fast(model, law, work, reason, phi):
 
 @internal_kernel
 def fitting_part(model, law, work, phi):
-    """Return the factor on the target speed for the next trial, from the rate limits and the joint limits."""
+    """Return the factor for the target speed in the next trial, computed from the rate limits and the joint limits."""
     part = 1.0
     for j in range(phi.shape[0]):
         allowed, rate = law.rate_limit, abs(work.u[j])
@@ -335,7 +336,7 @@ def fitting_part(model, law, work, phi):
 def commanded_rate(velocity, row, done, speed, rate):
     """Compute the mean rate of the target in a period that executes ``speed`` rows of the commands, 0 to 1.
 
-    The fraction ``done`` of row ``row`` is executed already; after the last row the rate is zero. The path does not
+    The fraction ``done`` of row ``row`` is already executed; after the last row, the rate is zero. The path does not
     depend on the speed: every row is executed completely, in one period or several.
     """
     rows = velocity.shape[0]
@@ -349,14 +350,15 @@ def commanded_rate(velocity, row, done, speed, rate):
 
 @internal_kernel
 def command(model, law, schedule, state, velocity, moving, slows, ws):
-    """Compute the joint and wheel rates of one control period, written to ``ws.work.u``.
+    """Compute the joint and wheel rates of one control period, and write them to ``ws.work.u``.
 
-    Rates computed for the beginning of the period and held miss the constraints by O(period) at its end, with a head
-    error of the same order. Rates for the predicted middle (``schedule.midpoint``) reduce it to O(period^2). The
+    If rates are computed for the beginning of the period and held, they violate the constraints by O(period) at the
+    end, and the head error is of the same order. Rates for the predicted middle (``schedule.midpoint``) reduce it to
+    O(period^2). The
     prediction uses the closed loop, w~' = w~_d' - K (w~ - w~_d) ([T] eq 15).
 
-    With the limit policy "allocate" all six coordinates of a command are executed together, with every joint within
-    its limits and rate. If a joint would be too fast, the null-space motion is reduced first; then, if ``slows``, the
+    With the limit policy "allocate", all six coordinates of a command are executed together, with every joint within
+    its limits. If a joint would be too fast, the null-space motion is reduced first; then, if ``slows``, the
     target moves along its path at a lower speed. Otherwise the target waits, and the remaining motion (errors, shape
     points) is slowed down until it is within the limits. A target that would pass beta = +-90 deg, where the rates of
     alpha and gamma are unbounded, also waits.
@@ -383,11 +385,11 @@ def command(model, law, schedule, state, velocity, moving, slows, ws):
     Returns
     -------
     reason : int
-        Why the target waits, see :mod:`dynsim.snake.ticks`; NO_OBSTACLE if it does not wait.
+        Reason why the target waits, see :mod:`dynsim.snake.ticks`; NO_OBSTACLE if it does not wait.
     commanded : bool
         Whether the command was not zero.
     speed : float
-        Executed rows of the commands, 0 to 1.
+        Number of executed command rows, 0 to 1.
     """
     work, period, mode = ws.work, schedule.period, state.counts[MODE]
     phi, phi_hat, w_hat, w_target = state.phi, state.phi_hat, state.w_hat, state.w_target
@@ -452,12 +454,12 @@ def command(model, law, schedule, state, velocity, moving, slows, ws):
             break
     state.counts[SLOWED] += int(slowed)
     state.counts[NULL_REDUCED] += int(reductions > 0)
-    if law.limit_policy != controller.LIMITS_NONE:  # mechanical stops, and rates that allocation could not reduce
+    if law.limit_policy != controller.LIMITS_NONE:  # clamp at mechanical stops, and rates that allocation left too high
         for j in range(joints):
             up = max(model.upper[j] - phi[j], 0.0) / period
             down = min(model.lower[j] - phi[j], 0.0) / period
             if u[j] > up or u[j] < down:
-                # do not count rounding of an allocated bound
+                # Do not count rates that exceed an allocated bound only by rounding.
                 if u[j] > up + 1e-9 or u[j] < down - 1e-9:
                     state.counts[CLAMPED] += 1
                 u[j] = up if u[j] > up else down
@@ -500,7 +502,7 @@ def settle(schedule, state, moving, reason, commanded, speed, ws):
 def tick(model, law, schedule, state, velocity, moving, slows, ws):
     """Run one control period of the kinematic robot: evaluate the controller, hold its rates, move the plant.
 
-    For the parameters see :func:`command`. Returns the slip of the plant [m/s], and whether the command was not
+    For the parameters, see :func:`command`. Returns the slip of the plant [m/s], and whether the command was not
     executed.
     """
     mode = state.counts[MODE]
@@ -516,7 +518,7 @@ def record_command(schedule, state, ws, r, trace):
     copy(state.w_hat, trace.w_hat[r])
     for j in range(state.phi.shape[0]):
         trace.at_limit[r, j] = ws.work.at_limit[j]
-    # estimate at the beginning of the period: subtract the step added by settle
+    # For the estimate at the beginning of the period, subtract the step added by settle.
     for i in range(6):
         trace.w_hat[r, i] -= schedule.period * ws.rate[i]
 
@@ -582,8 +584,8 @@ def run_ticks(model, law, schedule, state, velocity, count, moving, stop, stride
         State of plant and controller.
     velocity : (T, 6) ndarray
         Commanded rates of the target [m/s, rad/s], one row per period; zero after the end. A row is executed completely
-        before the next row starts: ``state.counts[CARRIED_OUT]`` is the current row, ``state.progress[DONE]`` its
-        executed fraction.
+        before the next row starts: ``state.counts[CARRIED_OUT]`` is the current row, and ``state.progress[DONE]`` is
+        its executed fraction.
     count : int
         Number of control periods.
     moving : int

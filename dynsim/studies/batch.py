@@ -19,7 +19,8 @@ from dynsim.system.memo import Memo, remembering
 Keep = Literal["none", "failed", "all"]
 Task = TypeVar("Task")
 
-# Attempts at a run whose process is lost: the process may have been killed because another run used up the memory.
+# Number of attempts at a run whose process is lost. The process may have been killed because another run used up the
+# memory.
 ATTEMPTS = 2
 
 
@@ -32,22 +33,23 @@ def simulate_batch(
     scheduler: str | None = None,
     finished: Callable[[int, RunResult], None] | None = None,
 ) -> list[RunResult]:
-    """Simulate many scenarios in parallel and return one result each; a failed run does not stop the others.
+    """Simulate many scenarios in parallel and return a result for each; a failed run does not stop the other runs.
 
-    Each run is bit-identical to :func:`dynsim.simulate`, for any ``jobs`` and any other runs in the batch.
+    Each run is bit-identical to :func:`dynsim.simulate`, whatever ``jobs`` is and whichever other runs are in the
+    batch.
 
     Parameters
     ----------
     scenarios : iterable of Scenario
-        Scenarios with any plants.
+        Scenarios to simulate; their plants may differ.
     jobs : int, optional
         Number of worker processes; 1 (default) simulates in this process.
     keep_records : {"none", "failed", "all"}, optional
-        Results that keep their record: none (default), those of runs that stopped early, or all.
+        Results that keep their record: none (default), only the results of runs that stopped early, or all.
     scheduler : str, optional
-        Address of a Dask scheduler, such as ``tcp://host:8786``, whose workers simulate instead.
+        Address of a Dask scheduler, such as ``tcp://host:8786``, whose workers then run the simulations.
     finished : callable, optional
-        Called with the index of a run and its result, as soon as it is available.
+        Called with the index of a run and its result as soon as the result is available.
 
     Returns
     -------
@@ -94,12 +96,13 @@ def simulate_batch(
 
 
 class BatchWork(Generic[Task]):
-    """Work for the tasks of a batch; each process has one memo for the results that its runs share.
+    """Function object that processes the tasks of a batch; each process has one memo for results that its runs share.
 
     Parameters
     ----------
     load : callable
-        Returns the scenario of a task. It must be picklable: a function of a module, or a method of a picklable object.
+        Function that returns the scenario of a task. It must be picklable: a module-level function, or a method of a
+        picklable object.
     keep : {"none", "failed", "all"}
         Runs whose records are kept, see :func:`simulate_batch`.
     """
@@ -122,7 +125,8 @@ class BatchWork(Generic[Task]):
         except SimulationInterrupted:
             raise
         except Exception as error:
-            # A bug of dynsim in one run must not cost hours of other runs; its reason starts with the error type.
+            # A bug in dynsim that affects one run must not destroy hours of other runs. The reason of such a failure
+            # starts with the error type.
             kind = "" if isinstance(error, DynsimError) else f"{type(error).__name__}: "
             reason = " ".join(f"{kind}{error}".split())
             record = error.record if isinstance(error, SimulationStopped) else None
@@ -146,14 +150,14 @@ def run_all(
     jobs: int = 1,
     scheduler: str | None = None,
 ) -> bool:
-    """Do ``work`` for all tasks here, in processes or on a cluster, and pass each result to ``take`` when it arrives.
+    """Call ``work`` for all tasks here, in processes or on a cluster; pass each result to ``take`` when it arrives.
 
     Parameters
     ----------
     work : callable
         Called with a task and its progress function; returns its result.
     tasks : sequence
-        Tasks, picklable for ``jobs`` > 1 or a scheduler.
+        Tasks; they must be picklable if ``jobs`` > 1 or if there is a scheduler.
     take : callable
         Called in this process with a task and its result.
     jobs, scheduler
@@ -162,7 +166,7 @@ def run_all(
     Returns
     -------
     bool
-        True if Ctrl-C came before all tasks were done.
+        True if Ctrl-C was pressed before all tasks were done.
 
     Raises
     ------

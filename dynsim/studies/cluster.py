@@ -1,6 +1,6 @@
 """Batch of runs on a Dask cluster: tasks are sent to its workers, and results are received in the order of completion.
 
-Start of the cluster, retries after the loss of a worker, and adaptive scaling are left to Dask.
+Dask starts the cluster, retries tasks after the loss of a worker, and scales the cluster adaptively.
 """
 
 from __future__ import annotations
@@ -20,21 +20,22 @@ from dynsim.system import interruption
 
 Task = TypeVar("Task")
 
-# Longest wait for an answer of the scheduler [s].
+# Maximum waiting time for an answer from the scheduler [s].
 _CONNECT_S = 10.0
-# Duration of one piece of work [s]: short, to balance the load of the cluster, but long enough for scheduler and
-# client to handle one piece for each thread in that time; they need some milliseconds per piece (docs/sweeps.md).
+# Duration of one piece of work [s]. It is short, to balance the load of the cluster, but long enough for scheduler and
+# client to handle one piece for each thread in that time; they need a few milliseconds per piece (docs/sweeps.md).
 _PIECE_S, _PIECE_S_PER_THREAD = 1.0, 0.015
 _PIECE_MAX_TASKS = 2048
 # Number of pending pieces: several per thread, and enough for adaptive scaling to add workers.
 _PENDING_PER_THREAD, _PENDING_MIN = 3, 64
 
-# One run at a time in a process: other threads of a worker would only wait for the global interpreter lock.
+# Only one run at a time is simulated in a process, because other threads of a worker would only wait for the global
+# interpreter lock.
 _one_at_a_time = threading.Lock()
 
 
 class ClusterError(DynsimError):
-    """Dask is missing, no scheduler answers, or a worker cannot do the work."""
+    """Raised if Dask is missing, no scheduler answers, or a worker cannot do the work."""
 
 
 def run_on_cluster(
@@ -43,16 +44,16 @@ def run_on_cluster(
     take: Callable[[Task, RunResult], None],
     address: str,
 ) -> bool:
-    """Do ``work`` for all tasks on the workers of a scheduler, see :func:`dynsim.studies.batch.run_all`.
+    """Call ``work`` for all tasks on the workers of a scheduler, see :func:`dynsim.studies.batch.run_all`.
 
-    Tasks are sent in pieces of about a second, according to the measured durations. A piece whose workers die
+    Tasks are sent in pieces that take about a second, according to measured durations. A piece whose workers die
     repeatedly is split into its tasks; a task whose workers die again is lost.
 
     Raises
     ------
     ClusterError
-        If Dask is not installed, no scheduler answers at the address (any more), or a worker has no dynsim or another
-        version of it.
+        If Dask is not installed, no scheduler answers at the address (any more), or a worker has no dynsim or a
+        different version of it.
     """
     try:
         from distributed import CancelledError, Client, KilledWorker, as_completed
@@ -122,8 +123,8 @@ def run_on_cluster(
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Suppress the log of Dask in the block; its problems are reported once, as errors."""
-    # Loggers whose level Dask sets separately.
+    """Suppress Dask's log messages in the block; its problems are reported once, as errors."""
+    # These are the loggers whose level Dask sets separately.
     before = {logger: logger.level for logger in map(logging.getLogger, ("distributed", "distributed.client"))}
     for logger in before:
         logger.setLevel(logging.CRITICAL + 1)
@@ -137,7 +138,7 @@ def _quiet() -> Iterator[None]:
 def _run_piece(
     work: Callable[[Task, Progress | None], RunResult], tasks: Sequence[Task], version: str
 ) -> list[RunResult]:
-    """Do the work for each task, on a worker."""
+    """Call the work function for each task, on a worker."""
     if version != __version__:
         raise ClusterError(f"a worker has dynsim {__version__}, but this is {version}; install the same version")
     with _one_at_a_time:

@@ -34,7 +34,7 @@ def compare(
     finished: Callable[[str, Record], None] | None = None,
     stopped: Callable[[str, SimulationStopped], None] | None = None,
 ) -> dict[str, Record]:
-    """Simulate every variant of a scenario. A failed variant does not stop the others.
+    """Simulate every variant of a scenario; a failed variant does not stop the other variants.
 
     Parameters
     ----------
@@ -45,9 +45,9 @@ def compare(
     jobs : int, optional
         Number of worker processes; 1 (default) simulates in this process.
     progress : callable, optional
-        See :class:`VariantProgress`. With several processes it is called only at the end of a variant.
+        See :class:`VariantProgress`. With several processes, it is called only when a variant ends.
     finished : callable, optional
-        Called with variant and record as soon as a variant is done, for example to save it.
+        Called with variant and record as soon as a variant is done, for example to save the record.
     stopped : callable, optional
         Called with variant and exception as soon as a variant stops or is interrupted.
 
@@ -62,8 +62,8 @@ def compare(
         If the file has no variants, a variant is invalid (all are checked before the first runs), or ``jobs`` is
         invalid.
     SimulationStopped
-        If a variant stopped, after all others have run. The message lists all stopped variants; ``record`` is the
-        record of the first.
+        If a variant stopped; raised after all other variants have run. The message lists all stopped variants;
+        ``record`` is the record of the first of them.
     SimulationInterrupted
         On Ctrl-C. The message also lists the variants that were not started.
 
@@ -124,8 +124,8 @@ def compare(
 
 
 def _combined_stop(stops: Mapping[str, SimulationStopped], left: list[str], interrupted: bool) -> SimulationStopped:
-    """Combine the exceptions of all stopped variants, and list those that Ctrl-C prevented from starting."""
-    # If there is no record, the message already names the variant.
+    """Combine the exceptions of all stopped variants, and list the variants that Ctrl-C prevented from starting."""
+    # If there is no record, the message already contains the variant.
     texts = [str(stop) if stop.record is None else f"{name}: {stop}" for name, stop in stops.items()]
     if left:
         texts.append(f"interrupted before {', '.join(left)} {'was' if len(left) == 1 else 'were'} started")
@@ -140,7 +140,7 @@ def save_comparison(records: Mapping[str, Record], folder: Path) -> None:
     """Write ``comparison.json`` and ``comparison.csv``."""
     summaries = {name: record.summary for name, record in records.items()}
     runs = [flat(summary) for summary in summaries.values()]
-    # Variants may differ in their numbers; numbers of contacts depend on the contact law.
+    # Variants may have different entries, because the entries of contacts depend on the contact law.
     scalars = (
         key for run in runs for key, value in run.items() if value is None or isinstance(value, (int, float, str))
     )

@@ -23,7 +23,7 @@ class RunResult:
     record : Record or None
         Record of the run, if requested.
     wall_s : float
-        Total computing time [s].
+        Total computing time of the run [s].
     """
 
     summary: dict[str, Any] = field(default_factory=dict)

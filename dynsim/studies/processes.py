@@ -1,12 +1,12 @@
-"""Pool of worker processes: results in the order of completion, Ctrl-C, and loss of workers.
+"""Pool of worker processes that returns results in the order of completion and handles Ctrl-C and lost workers.
 
 A worker is a new Python process. The parent sends it pickled tasks on its standard input, one at a time, and reads
-pickled messages from its standard output. A worker ends when its standard input ends, and so never outlives the parent.
+pickled messages from its standard output. A worker ends when its standard input ends, so it never outlives the parent.
 
-The pools of Python and loky do not suffice. ``multiprocessing`` runs the script of the caller again in every worker,
-and imports a ``signal.py`` of the working directory before that. In ``concurrent.futures`` and loky, the death of one
-worker fails all pending tasks. ``multiprocessing.Pool`` never returns the task of a worker that died. None of them lets
-runs return their partial results on Ctrl-C.
+The pools of Python and loky are not sufficient. ``multiprocessing`` runs the script of the caller again in every
+worker, and imports a ``signal.py`` of the working directory before that. In ``concurrent.futures`` and loky, the death
+of one worker fails all pending tasks. ``multiprocessing.Pool`` never returns the task of a worker that died. None of
+them lets runs return their partial results on Ctrl-C.
 """
 
 from __future__ import annotations
@@ -33,27 +33,29 @@ from dynsim.system import interruption
 from dynsim.system.interruption import STOP_SIGNALS
 
 if TYPE_CHECKING:
-    from dynsim.engine import Progress  # imports numba, which not all work needs
+    from dynsim.engine import Progress  # imports numba, which some work does not need
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
-# Number of workers that may die in a row while they start, before the pool gives up: the first and three more.
+# Number of workers in a row that may die during their start before the pool gives up: the first and three more.
 STARTS = 4
-# After Ctrl-C a worker checks this many times, at this interval [s], whether its work reacts; otherwise it ends. It
-# counts the checks itself, so that no result is lost if the machine is busy.
+# After Ctrl-C, a worker checks this many times, at this interval [s], whether its work reacts. If it does not, the
+# worker ends. The worker counts the checks itself, so that no result is lost if the machine is busy.
 _CHECKS, _CHECK_S = 14, 0.05
-# Longest time until a worker reports that its work reacts to Ctrl-C [s], in case the process is suspended.
+# Maximum time until a worker must report that its work reacts to Ctrl-C [s]; needed if the process is suspended.
 _STALLED_S = 10.0
-# Interval of the checks for signals in the parent, and longest wait for the end of a process and of its threads [s].
+# Interval at which the parent checks for signals, and maximum waiting time for the end of a process and of its threads
+# [s].
 _SIGNAL_S, _JOIN_S = 0.1, 0.7
-# Lines of a worker's stderr that are reported when it cannot start.
+# Number of lines of a worker's stderr that are reported if it cannot start.
 _LAST_LINES = 12
-# Let glibc reuse the memory of one run for the next: new pages would cost up to a tenth of each run.
+# Let glibc reuse the memory of one run for the next, because new pages would cost up to a tenth of the time of each
+# run.
 _MEMORY = {"MALLOC_MMAP_THRESHOLD_": str(32 << 20), "MALLOC_TRIM_THRESHOLD_": str(512 << 20)}
 
 # Program of a worker. Only the worker itself uses the pipes; output of its tasks goes to stderr. The first message
-# lists the folders in which Python searches for dynsim.
+# contains the folders in which Python searches for dynsim.
 START = """
 import os, pickle, sys
 tasks, answers = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
@@ -66,18 +68,18 @@ serve(tasks, answers)
 
 
 class WorkerError(DynsimError):
-    """A process cannot be started, or a task or its result cannot be sent between processes."""
+    """Raised if a process cannot be started, or if a task or its result cannot be sent between processes."""
 
 
 class WorkerLost(Exception):
-    """The worker process of a task ended; the message is a clause that begins with ``its process``."""
+    """Raised if the worker process of a task ended; the message is a clause that begins with ``its process``."""
 
     def __init__(self, how: str = "its process was killed from outside; if memory is short, use fewer jobs") -> None:
         super().__init__(how)
 
 
 class WorkerInterrupted(WorkerLost):
-    """The worker process ended after Ctrl-C without a result, because its work did not react."""
+    """Raised if the worker process ended after Ctrl-C without a result, because its work did not react."""
 
 
 def cores() -> int:
@@ -87,7 +89,7 @@ def cores() -> int:
 
 @contextmanager
 def signals_held() -> Iterator[None]:
-    """Shield processes that start in the block from Ctrl-C in the terminal; this process receives it after the block.
+    """Shield processes started in the block from Ctrl-C in the terminal; this process receives it after the block.
 
     Only the parent reacts to Ctrl-C and informs the workers; the same applies to the other ``STOP_SIGNALS``.
     """
@@ -109,22 +111,22 @@ def run_in_processes(
     *,
     attempts: int = 1,
 ) -> bool:
-    """Do ``work(task, look)`` for every task, in several processes.
+    """Call ``work(task, look)`` for every task, in several processes.
 
     Parameters
     ----------
     work : callable
-        Function of an importable module. It must call ``look`` often, which raises KeyboardInterrupt to stop it.
+        Function of an importable module. It must often call ``look``, which raises KeyboardInterrupt to stop the work.
     tasks : iterable
-        Tasks; they are sent to the processes one at a time as these become free.
+        Tasks, which are sent to the processes one at a time as processes become free.
     jobs : int
         Number of processes.
     take : callable
         Called in this process with each task and a function that returns its result, or raises the exception of the
-        work or :class:`WorkerLost`. The result is None if Ctrl-C came before the task began. ``take`` is not called for
-        tasks that had not been sent to a process at Ctrl-C.
+        work or :class:`WorkerLost`. The result is None if Ctrl-C was pressed before the task began. ``take`` is not
+        called for tasks that had not been sent to a process when Ctrl-C was pressed.
     attempts : int, optional
-        Number of processes that a task may lose before it is given up.
+        Number of processes that may die during a task before it is given up.
 
     Returns
     -------
@@ -134,7 +136,8 @@ def run_in_processes(
     Raises
     ------
     WorkerError
-        If a task cannot be sent to a process, or no process can start: ``STARTS`` die in a row while they start.
+        If a task cannot be sent to a process, or if no process can start, because ``STARTS`` processes in a row die
+        while they start.
     KeyboardInterrupt
         On a second Ctrl-C; the processes are killed.
     """
@@ -159,9 +162,9 @@ def run_in_processes(
 class _Worker:
     """Worker process, and the threads that use its pipes, so that the main thread never waits for a pipe.
 
-    The threads take messages from ``outbox``, up to an empty one, and put those of the worker, and None at their end,
-    into the inbox of the pool. ``task`` is the task in progress, with the number of processes that it has lost before;
-    ``confirmed`` is whether the work reacted to Ctrl-C.
+    One thread sends messages from ``outbox`` until it finds an empty one. Another thread puts the messages of the
+    worker into the inbox of the pool, followed by None. ``task`` is the task in progress, with the number of processes
+    that have died during it; ``confirmed`` is True if the work has reacted to Ctrl-C.
     """
 
     def __init__(self, beginning: bytes, inbox: SimpleQueue[tuple[_Worker, tuple[Any, ...] | None]]) -> None:
@@ -187,21 +190,21 @@ class _Worker:
             thread.start()
 
     def _write(self, stream: BinaryIO) -> None:
-        # The thread that reads the answers notices if the process has ended.
+        # If the process has ended, the thread that reads the answers notices it.
         with suppress(OSError), stream:
             while content := self.outbox.get():
                 stream.write(content)
                 stream.flush()
 
     def _read(self, stream: BinaryIO) -> None:
-        # The end of the process may cut off a message.
+        # The last message may be incomplete if the process ends.
         with suppress(EOFError, OSError, pickle.UnpicklingError), stream:
             while True:
                 self._inbox.put((self, pickle.load(stream)))
         self._inbox.put((self, None))
 
     def _forward(self, stream: BinaryIO) -> None:
-        """Forward the stderr of the worker; before it is ready, only keep the lines for the error of a failed start."""
+        """Forward the worker's stderr; until the worker is ready, only keep its lines to report a failed start."""
         with suppress(OSError, ValueError), stream:
             for line in stream:
                 self._lines.append(line.decode("utf-8", "replace").rstrip())
@@ -209,7 +212,7 @@ class _Worker:
                     self.show()
 
     def show(self) -> None:
-        """Print the stderr lines that have not been printed."""
+        """Print the lines of stderr that have not been printed yet."""
         with suppress(IndexError):
             while sys.stderr is not None:
                 print(self._lines.popleft(), file=sys.stderr, flush=True)
@@ -219,12 +222,12 @@ class _Worker:
         self.process.kill()
         self.process.wait()
         self.outbox.put(b"")
-        # A child process of the worker may still hold its streams open.
+        # A child process of the worker may keep the worker's streams open.
         for thread in self._threads:
             thread.join(_JOIN_S)
 
     def failed_start(self) -> str:
-        """Return how the process ended before it was ready, with its last lines."""
+        """Describe how the process ended before it was ready, with the last lines of its output."""
         code = self.process.returncode
         how = f"was ended by signal {-code}" if code < 0 else f"ended with exit code {code}"
         output = "".join(f"\n  {line}" for line in self._lines) or " nothing"
@@ -238,7 +241,7 @@ class _Pool:
         self.workers: list[_Worker] = []
         self._jobs, self._take, self._attempts = jobs, take, attempts
         self._beginning = _beginning(work)
-        # Tasks that no worker has, with the number of workers that they have lost.
+        # Tasks that no worker has yet, each with the number of workers that have died during it.
         self._waiting = deque((task, 0) for task in tasks)
         self._inbox = SimpleQueue[tuple[_Worker, tuple[Any, ...] | None]]()
         self._failed_starts = 0
@@ -252,9 +255,9 @@ class _Pool:
             worker.outbox.put(pickle.dumps(None))
 
     def collect(self) -> None:
-        """Send tasks and take results until no more are expected; signals are deferred while this process works.
+        """Send tasks and receive results until no more are expected.
 
-        They still are at the end.
+        Signals are deferred while this process works, and are still deferred on return.
         """
         while True:
             interruption.keep()
@@ -263,7 +266,7 @@ class _Pool:
                 return
             with suppress(Empty):
                 worker, message = self._inbox.get(timeout=_SIGNAL_S)
-                # A worker that this process has ended may have left messages.
+                # A worker that was ended by this process may have left messages.
                 if worker in self.workers:
                     self._handle(worker, message)
             if self._stopped is not None and clock.monotonic() > self._stopped + _STALLED_S:
@@ -274,7 +277,7 @@ class _Pool:
             interruption.check()
 
     def _hand_out(self) -> None:
-        """Send tasks to the workers that are ready, and start workers for tasks that wait."""
+        """Send tasks to the workers that are ready, and start workers for the waiting tasks."""
         for worker in self.workers:
             if self._waiting and worker.ready and worker.task is None:
                 content = packed(self._waiting[0][0])
@@ -285,7 +288,7 @@ class _Pool:
             self.workers.append(_Worker(self._beginning, self._inbox))
 
     def _handle(self, worker: _Worker, message: tuple[Any, ...] | None) -> None:
-        """Handle a message of a worker; None at the end of its output."""
+        """Handle a message from a worker; the message is None at the end of its output."""
         match message:
             case ("ready",):
                 worker.ready, self._failed_starts = True, 0
@@ -306,7 +309,7 @@ class _Pool:
 
     def _lose(self, worker: _Worker) -> None:
         with suppress(subprocess.TimeoutExpired):
-            worker.process.wait(_JOIN_S)  # for its exit code: its output ends a little earlier
+            worker.process.wait(_JOIN_S)  # needed for the exit code, because the output ends slightly earlier
         self.workers.remove(worker)
         worker.end()
         if worker.task is not None:
@@ -365,12 +368,12 @@ class _Pickler(pickle.Pickler):
 
 
 def packed(value: Any) -> bytes:
-    """Return a pickle of a value for another process.
+    """Return a value as a pickle for another process.
 
     Raises
     ------
     WorkerError
-        If a part of it cannot be sent, or is defined in the module that this process runs as its script.
+        If a part of the value cannot be sent, or is defined in the module that this process runs as its script.
     """
     stream = io.BytesIO()
     try:
@@ -395,21 +398,22 @@ class _LogToParent(logging.Handler):
 
 
 def serve(source: BinaryIO, sink: BinaryIO) -> None:
-    """Do tasks until the parent ends this process or itself."""
+    """Process tasks until the parent ends this process or ends itself."""
     # A terminal or a service manager sends these signals to every process of a group; only the parent handles them.
     for number in STOP_SIGNALS:
         signal.signal(number, signal.SIG_IGN)
     path, level, content = pickle.load(source)
     work: Callable[[Any, Any], Any] = pickle.loads(content)
-    # Tasks may need modules from the folder of the script. Imports of dynsim and of the work do not use it.
+    # Tasks may need modules from the folder of the script. The imports of dynsim and of the work itself do not use that
+    # folder.
     sys.path[:] = path
     tasks, writing = SimpleQueue[bytes](), threading.Lock()
-    # ``reacted`` is set unless a task is in progress that would not notice a stop.
+    # ``reacted`` is cleared while a task is in progress that has not yet noticed a stop.
     stop, reacted = threading.Event(), threading.Event()
     reacted.set()
 
     def send(*message: Any) -> None:
-        # If the parent has ended, the other thread ends this process.
+        # If the parent has ended, the other thread will end this process.
         with suppress(OSError), writing:
             sink.write(pickle.dumps(message))
             sink.flush()
@@ -448,7 +452,8 @@ def serve(source: BinaryIO, sink: BinaryIO) -> None:
         except Exception as error:
             reacted.set()
             good, content = False, _packed_error(error)
-        # If a thread of the work remains, the parent ends this process: the thread would slow down other tasks.
+        # If a thread of the work is still running, the parent ends this process, because the thread would slow down
+        # other tasks.
         send("answer", good, content, interruption.is_left())
 
 

@@ -1,4 +1,4 @@
-"""Sweeps: run the runs of a plan, resume from the journal, and write the table of results and its statistics."""
+"""Sweeps: simulate the runs of a plan, resume from the journal, and write the table of results and its statistics."""
 
 from __future__ import annotations
 
@@ -24,12 +24,13 @@ from dynsim.studies.processes import WorkerError
 from dynsim.studies.sweep_plan import Plan, SweepPoint
 from dynsim.system.files import check_writable, held_folder, json_text, replacing, write_text
 
-# Not among the numbers of a run: names, which have separate columns, and computing times, which are not reproducible.
+# Entries that do not count as numbers of a run: names, which have separate columns, and computing times, which are not
+# reproducible.
 _EXCLUDED = ("scenario", "variant", "dynsim_version", "integration_wall_s", "real_time_factor")
 
 
 def flat(summary: dict[str, Any]) -> dict[str, Any]:
-    """Return a summary with the numbers of mobile base and motors at the top level, as ``base.…`` and ``JOINT.…``."""
+    """Return a summary in which the numbers of base and motors are at the top level, as ``base.…`` and ``JOINT.…``."""
     base = dict(summary.get("base", {}))
     for key in [key for key, value in base.items() if isinstance(value, dict)]:
         base.update({f"{key}.{name}": value for name, value in base.pop(key).items()})
@@ -48,7 +49,7 @@ def is_finite(value: Any) -> bool:
 
 
 def numbers(summary: dict[str, Any]) -> dict[str, Any]:
-    """Return all finite numbers of a summary that do not depend on the machine; contacts under ``CONTACT.…``."""
+    """Return all finite numbers of a summary that do not depend on the machine; contact numbers are ``CONTACT.…``."""
     values = flat(summary)
     for key, value in summary.items():
         if isinstance(value, dict) and key != "base":
@@ -70,13 +71,13 @@ class SweepRow(SweepPoint):
     Attributes
     ----------
     status : str
-        ``ok``, ``failed`` (reproducibly) or ``lost`` (with its process).
+        ``ok``, ``failed`` (the failure is reproducible) or ``lost`` (its process died).
     reason : str
         Reason for the failure.
     numbers : mapping of str to float
-        Numbers of its summary, see :func:`dynsim.studies.sweep.numbers`.
+        Numbers in the summary of the run, see :func:`dynsim.studies.sweep.numbers`.
     warnings : str
-        Warnings of its summary, in one line.
+        Warnings in the summary of the run, in one line.
     """
 
     status: str
@@ -122,7 +123,7 @@ class SweepRow(SweepPoint):
         return row
 
     def placed(self, point: SweepPoint) -> SweepRow:
-        """Return this row with number, variant and values of a point of another plan."""
+        """Return this row with the run number, variant and values of a point of another plan."""
         return replace(self, **vars(point))
 
     def cells(self) -> dict[str, Any]:
@@ -133,18 +134,18 @@ class SweepRow(SweepPoint):
 
 
 class SweepJournal:
-    """Journal file of a sweep: written again with the known rows, then open for further rows.
+    """Journal file of a sweep; it is rewritten with the known rows and then stays open for further rows.
 
     Raises
     ------
     RecordError
-        If it cannot be written.
+        If the file cannot be written.
     """
 
     def __init__(self, folder: Path, rows: Iterable[SweepRow]) -> None:
         self._path = folder / JOURNAL
         write_text(self._path, "".join(map(_line, rows)))
-        # Unbuffered: closing the file on a full disk would try to write a buffer again.
+        # Use no buffer, because closing the file on a full disk would try to write the buffer again.
         self._stream = self._path.open("ab", buffering=0)
 
     def close(self) -> None:
@@ -157,7 +158,7 @@ class SweepJournal:
         Raises
         ------
         RecordError
-            If it cannot be written; a part of its line may remain, which is ignored when the journal is read.
+            If the row cannot be written; a part of its line may remain, which is ignored when the journal is read.
         """
         content = _line(row).encode("utf-8")
         try:
@@ -172,22 +173,22 @@ def _line(row: SweepRow) -> str:
 
 
 def earlier_rows(folder: Path, header: Mapping[str, Any], resume: bool) -> dict[str, SweepRow]:
-    """Return the rows of the journal in a folder by identity, except lost ones.
+    """Return the rows of the journal in a folder by identity, except rows of lost runs.
 
     Parameters
     ----------
     folder : Path
         Folder of the sweep.
     header : mapping
-        Header of the new sweep, which the existing one must match.
+        Header of the new sweep, which the header of an existing sweep must match.
     resume : bool
         Whether an existing sweep may be resumed.
 
     Raises
     ------
     ScenarioError
-        If the folder contains a sweep and ``resume`` is False, or a sweep with another scenario, other overrides or
-        another version of dynsim.
+        If the folder contains a sweep and ``resume`` is False, or if it contains a sweep with another scenario, other
+        overrides or another version of dynsim.
     RecordError
         If a file is damaged or missing.
     """
@@ -203,7 +204,8 @@ def earlier_rows(folder: Path, header: Mapping[str, Any], resume: bool) -> dict[
     if not resume:
         raise ScenarioError(f"{folder} already contains a sweep; add --resume, choose another --out, or delete it")
     _check_header(folder / PLAN, header)
-    # Decoded line by line so that an error names its line; a line without an end was not written completely.
+    # Decode the file line by line, so that an error contains the line number. A last line without a line end was not
+    # written completely.
     *lines, _ = _content(journal).split(b"\n")
     rows = {}
     for number, line in enumerate(lines, start=1):
@@ -211,7 +213,7 @@ def earlier_rows(folder: Path, header: Mapping[str, Any], resume: bool) -> dict[
             row = SweepRow.read(line.decode("utf-8"))
         except (ValueError, RecursionError) as error:
             raise RecordError(
-                f"{journal}, line {number}: damaged ({error}); delete this line, and --resume repeats its run"
+                f"{journal}, line {number}: damaged ({error}); delete this line, and --resume will repeat its run"
             ) from error
         if row.status != LOST:
             rows[row.identity] = row
@@ -222,7 +224,7 @@ def _check_header(path: Path, header: Mapping[str, Any]) -> None:
     """Raise if the folder contains a different sweep."""
     fix = f"restore it, delete {path.parent}, or choose another --out"
     if not path.exists():
-        raise RecordError(f"{path} is missing, so the runs next to it cannot be identified; {fix}")
+        raise RecordError(f"{path} is missing, so the runs in its folder cannot be identified; {fix}")
     try:
         before = json.loads(_content(path))
     except (ValueError, RecursionError) as error:
@@ -245,7 +247,7 @@ def _content(path: Path) -> bytes:
         return path.read_bytes()
     except OSError as error:
         raise RecordError(
-            f"{path}: cannot be read ({error.strerror}); fix permissions or choose another --out"
+            f"{path}: cannot be read ({error.strerror}); fix its permissions or choose another --out"
         ) from error
 
 
@@ -264,7 +266,7 @@ def run_sweep(
     progress: Callable[[int, int], None] = lambda completed, failed: None,
     ended: Callable[[SweepRow], None] = lambda row: None,
 ) -> list[SweepRow]:
-    """Run a plan; write plan, journal, records, tables and statistics of the samples to a folder.
+    """Simulate the runs of a plan, and write plan, journal, records, tables and sample statistics to a folder.
 
     Parameters
     ----------
@@ -275,10 +277,10 @@ def run_sweep(
     jobs, keep_records, scheduler
         See :func:`dynsim.studies.batch.simulate_batch`.
     resume : bool, optional
-        Take completed runs of the same scenario from the journal in the folder; only missing and lost runs are
-        simulated.
+        If True, take completed runs of the same scenario from the journal in the folder, and simulate only missing and
+        lost runs.
     progress : callable, optional
-        Called with the numbers of completed and of failed runs.
+        Called with the number of completed runs and the number of failed runs.
     ended : callable, optional
         Called with the row of every completed run, including those taken from the journal.
 
@@ -290,14 +292,15 @@ def run_sweep(
     Raises
     ------
     ScenarioError
-        If the folder contains a sweep and ``resume`` is False, or a sweep of another scenario; or if the first run of a
-        variant is invalid (for example a misspelt key), before anything is simulated.
+        If the folder contains a sweep and ``resume`` is False, or if it contains a sweep of another scenario. Also if
+        the first run of a variant is invalid (for example because of a misspelt key); this is checked before anything
+        is simulated.
     SimulationInterrupted
         On Ctrl-C.
     RecordError
         If a file cannot be written, a file of the resumed sweep is damaged, or another process is using the folder.
     WorkerError, ClusterError
-        If no process can be started; see :func:`dynsim.studies.cluster.run_on_cluster`.
+        If no worker process can be started, or on the errors of :func:`dynsim.studies.cluster.run_on_cluster`.
 
     Notes
     -----
@@ -322,7 +325,7 @@ def run_sweep(
 
                 def take(point: SweepPoint, result: RunResult) -> None:
                     nonlocal failed
-                    # The record is saved before the row, because a run with a row is not repeated.
+                    # The record is saved before the row is written, because a run that has a row is not repeated.
                     if result.record is not None:
                         save_run(result.record, folder / RECORDS / f"{point.run:06d}")
                     row = rows[point.run] = SweepRow.of(point, result)
@@ -349,7 +352,10 @@ def run_sweep(
 
 @contextmanager
 def _resumable(folder: Path) -> Iterator[None]:
-    """Add to errors that completed runs are kept: a full disk, no process or no cluster only stops the sweep."""
+    """Add to errors that completed runs are kept.
+
+    A full disk, or a process or cluster that cannot be started, only stops the sweep.
+    """
     try:
         yield
     except (RecordError, WorkerError, ClusterError) as error:
@@ -366,7 +372,7 @@ def _write_results(rows: Mapping[int, SweepRow], plan: Plan, folder: Path) -> li
 
 
 def _header(plan: Plan) -> dict[str, Any]:
-    """Return the data that rows of one table must share, and the plan of the sweep."""
+    """Return the data that all rows of a table must share, together with the plan of the sweep."""
     return {
         "dynsim_version": __version__,
         "commit": commit(),
@@ -384,14 +390,14 @@ def _header(plan: Plan) -> dict[str, Any]:
 
 
 def columns(rows: Sequence[SweepRow]) -> list[str]:
-    """Return the columns of the table: those of all rows, in order of first occurrence."""
+    """Return the columns of the table, which are the columns of all rows in order of first occurrence."""
     names = dict.fromkeys(name for row in rows for name in row.cells())
     # Failed runs have no numbers.
     return [*(name for name in names if name != "warnings"), "warnings"]
 
 
 def write_tables(rows: Sequence[SweepRow], plan: Plan, folder: Path) -> None:
-    """Write ``sweep.csv`` and, with pyarrow, ``sweep.parquet``, with all digits; missing numbers are empty or null.
+    """Write ``sweep.csv`` and, with pyarrow, ``sweep.parquet``, in full precision; missing numbers are empty or null.
 
     Raises
     ------
@@ -426,7 +432,7 @@ def _write_parquet(rows: Sequence[SweepRow], names: Sequence[str], path: Path, p
         try:
             arrays.append(pyarrow.array(column))
         except (pyarrow.ArrowInvalid, pyarrow.ArrowTypeError, OverflowError):
-            # A grid with numbers and texts.
+            # This column has both numbers and texts, from a grid.
             arrays.append(pyarrow.array([None if value is None else json.dumps(value) for value in column]))
     table = pyarrow.table(arrays, names=list(names))
     described = {"dynsim": json.dumps(json.loads(json_text(_header(plan))))}
@@ -439,10 +445,10 @@ def _write_parquet(rows: Sequence[SweepRow], names: Sequence[str], path: Path, p
 def statistics(rows: Sequence[SweepRow], plan: Plan) -> list[dict[str, Any]]:
     """Return statistics for each variant and grid point.
 
-    Each entry has the number of runs, the number of failed runs, and for every number that all successful runs have its
-    :class:`dynsim.record.sensitivity.Spread`. If a linear model can be fitted, it also has the change of the number per
-    standard deviation of each sampled key (``effect``, with the half-width of its confidence interval) and the fraction
-    of the variance that the model explains.
+    Each entry contains the number of runs, the number of failed runs, and a :class:`dynsim.record.sensitivity.Spread`
+    for every number that all successful runs have. If a linear model can be fitted, it also has the change of the
+    number per standard deviation of each sampled key (``effect``, with the half-width of its confidence interval) and
+    the fraction of the variance that the model explains.
     """
     groups: dict[str, list[SweepRow]] = {}
     for row in rows:

@@ -17,22 +17,22 @@ from dynsim.errors import ScenarioError
 from dynsim.scenario import Scenario, ScenarioFile, SetOptions
 from dynsim.system.inputs import parse_yaml
 
-# More runs than this are rejected as a mistake.
+# Maximum number of runs; a larger number is rejected as a mistake.
 MAX_RUNS = 10_000_000
 ANY = "*"
 
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _RANGE = re.compile(rf"({_NUMBER}):({_NUMBER}):(\d+)")
-# A range whose count is missing or not an integer.
+# Pattern of a range whose count is missing or not an integer.
 _HALF_RANGE = re.compile(rf"({_NUMBER}):({_NUMBER})(:.*)?")
 _LAW = re.compile(rf"(\w+)\(\s*({_NUMBER})\s*,\s*({_NUMBER})\s*\)")
-# Distributions of samples, and their two parameters.
+# Distributions of samples, each with its two parameters.
 LAWS = {"normal": "mean, standard deviation", "uniform": "minimum, maximum"}
 
 
 @dataclass(frozen=True)
 class Axis:
-    """Scenario key and its values, one after the other."""
+    """Scenario key and the values that it takes one after the other."""
 
     key: str
     values: tuple[Any, ...]
@@ -51,7 +51,7 @@ class Axis:
             start, stop, count = float(match[1]), float(match[2]), int(match[3])
             if not 2 <= count <= MAX_RUNS:
                 raise ScenarioError(f"--grid {text}: count must be between 2 (both ends are included) and {MAX_RUNS}")
-            # Twelve digits: 0.3 instead of 0.30000000000000004.
+            # Round to twelve digits, to get 0.3 instead of 0.30000000000000004.
             return cls(key, tuple(float(f"{x:.12g}") for x in np.linspace(start, stop, count)))
         if match := _HALF_RANGE.fullmatch(value):
             example = f"{key}={match[1]}:{match[2]}:5"
@@ -60,7 +60,7 @@ class Axis:
         if not values:
             raise ScenarioError(f"--grid {text}: has no values")
         if len(set(map(json.dumps, values))) < len(values):
-            raise ScenarioError(f"--grid {text}: repeats a value")
+            raise ScenarioError(f"--grid {text}: contains a value twice; remove one of them")
         return cls(key, tuple(values))
 
 
@@ -90,11 +90,14 @@ class Law:
         if not (b > 0.0 if match[1] == "normal" else b > a):
             raise ScenarioError(f"--sample {text}: {match[1]}({LAWS[match[1]]}) requires a positive spread")
         if not (math.isfinite(a) and math.isfinite(b) and math.isfinite(b - a)):
-            raise ScenarioError(f"--sample {text}: parameters must be finite, and so must their difference")
+            raise ScenarioError(f"--sample {text}: parameters and their difference must be finite")
         return cls(key, match[1], (a, b))
 
     def draw(self, key: str, seed: int, count: int) -> list[float]:
-        """Draw values for one key, independently of other keys; a longer draw begins with those of a shorter one."""
+        """Draw values for one key, independently of other keys.
+
+        A longer draw begins with the values of a shorter draw.
+        """
         generator = np.random.default_rng([seed, zlib.crc32(key.encode())])
         a, b = self.numbers
         values = generator.normal(a, b, count) if self.name == "normal" else generator.uniform(a, b, count)
@@ -111,7 +114,7 @@ class SweepPoint:
 
     @property
     def identity(self) -> str:
-        """Text that is equal for equal runs of two sweeps of the same scenario."""
+        """Text that is the same for equal runs in two sweeps of the same scenario."""
         return json.dumps([self.variant, self.values], sort_keys=True)
 
 
@@ -126,9 +129,10 @@ class Plan:
     variants : tuple of str or None
         Variants to run; (None,) for a file without variants.
     overrides : mapping
-        Overrides of all runs.
+        Overrides that apply to all runs.
     grid : tuple of Axis
-        Keys whose values are combined with each other; ``*`` in a key matches all entries, which get the same value.
+        Keys whose values are combined with each other; ``*`` in a key matches all entries, which then have the same
+        value.
     laws : tuple of Law
         Sampled keys, with the same samples at each grid point; ``*`` in a key matches all entries, which are sampled
         independently.
@@ -158,16 +162,18 @@ class Plan:
             raise ScenarioError(f"too many runs ({self.runs}, limit {MAX_RUNS}); use fewer values")
 
     def _check_overlap(self) -> None:
-        """Reject a key that in every run replaces the value of an earlier key: the same key, or one that contains it.
+        """Reject a key that replaces the value of an earlier key in every run: the same key, or a key that contains it.
 
-        A key may vary a part of an earlier one: ``plant.link`` in a grid, one of its numbers as a sample.
+        A key may vary a part of an earlier key: for example, ``plant.link`` is in a grid, and one of its numbers is
+        sampled.
         """
-        # Overrides from Python are a base whose values may be varied; a value of --set is meant to stay.
+        # Overrides from Python may be varied, because they only define the base of the sweep; a value from --set must
+        # not change.
         overrides = self.overrides if isinstance(self.overrides, SetOptions) else {}
         options = [("--set", key, [key]) for key in overrides]
         options += [("--grid", axis.key, self._entries(axis.key)) for axis in self.grid]
         options += [("--sample", law.key, self._entries(law.key)) for law in self.laws]
-        # The option that set each key, also for all keys that contain it.
+        # Option that set each key; there is also an entry for every key that contains it.
         inside: dict[str, str] = {}
         for option, key, entries in options:
             # Later overrides replace earlier ones, as in every command.
@@ -212,13 +218,13 @@ class Plan:
         Raises
         ------
         ScenarioError
-            If its values do not make a valid scenario.
+            If the values of the run do not result in a valid scenario.
         """
         values = {entry: value for key, value in point.values.items() for entry in self._entries(key)}
         return self.file.load(point.variant, {**self.overrides, **values})
 
     def _entries(self, key: str) -> list[str]:
-        """Return the keys that match a key with ``*`` in the part of the file before its variants, or the key itself.
+        """Return the keys in the file, before variants are applied, that match a key with ``*``, or the key itself.
 
         Raises
         ------
@@ -242,7 +248,7 @@ class Plan:
 
 
 def _plain(key: str) -> str:
-    """Return a key with entry numbers in plain form: 5 for 05."""
+    """Return a key with its list indices in plain form: 5 instead of 05."""
     return ".".join(part.lstrip("0") or "0" if part.isdecimal() else part for part in key.split("."))
 
 

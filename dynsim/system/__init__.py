@@ -1,1 +1,1 @@
-"""Files, YAML input, signals, standard streams, terminal, shipped scenarios, and memoisation."""
+"""Handling of files, YAML input, signals, standard streams, the terminal and shipped scenarios, and memoisation."""

@@ -1,8 +1,8 @@
-"""Atomic writing of files, marking of incomplete sets of files, and locks of folders.
+"""Functions that write files atomically, mark incomplete sets of files, and lock folders.
 
 A file is written next to its target under a name that no other process uses, and renamed when it is complete. Devices,
-pipes and sockets are therefore refused. While files that belong together are exchanged, a file ``INCOMPLETE`` marks
-their folder.
+pipes and sockets are therefore rejected as targets. While a set of files that belong together is being replaced, a file
+``INCOMPLETE`` marks their folder.
 """
 
 from __future__ import annotations
@@ -22,29 +22,29 @@ from dynsim.errors import RecordError
 
 try:
     import fcntl
-except ImportError:  # not on Windows: then no two processes should write to one folder at the same time
+except ImportError:  # Windows has no fcntl; there, two processes should not write to the same folder at the same time
     fcntl = None  # type: ignore[assignment]
 
 INCOMPLETE = "INCOMPLETE"
-"""Name of the file that marks a folder while files that belong together are being exchanged in it."""
+"""Name of the file that marks a folder while files that belong together are being replaced in it."""
 _MARK = (
     "Files of this folder are being exchanged, or a run died while it exchanged them: they may be of different runs."
 )
 _LEFT_BEHIND = 86_400.0
 """Age [s] from which a temporary file was left by a dead process: a living one writes to its file more often."""
 _STREAM = re.compile(r"/dev/(stdin|stdout|stderr|fd/.*)|/proc/.*")
-"""Names of open descriptors of a process: they may be files, but cannot be replaced."""
+"""Paths that stand for open descriptors of a process: they may refer to a file, but cannot be replaced."""
 _NAME_LENGTH = 120
-"""Longest file name made from a text [characters]; file systems allow 255 bytes."""
+"""Maximum length of a file name that is made from a text [characters]; file systems allow 255 bytes."""
 
 
 def check_writable(folder: Path, names: Iterable[str] = ()) -> None:
-    """Check before a long simulation whether the files ``names`` can be written to a folder; creates nothing.
+    """Check, before a long simulation, that the files ``names`` can be written to a folder; do not create anything.
 
     Raises
     ------
     RecordError
-        If a file is in the way or a permission is missing.
+        If something else exists at a path that is needed, or a permission is missing.
     """
     try:
         existing = folder.absolute()
@@ -55,9 +55,9 @@ def check_writable(folder: Path, names: Iterable[str] = ()) -> None:
         mark = folder / INCOMPLETE
         blocked = [name for name in names if (folder / name).exists() and not (folder / name).is_file()]
         if blocked or (mark.exists() and not mark.is_file()):
-            raise RecordError(f"cannot write to {folder}: {(*blocked, INCOMPLETE)[0]} there is in the way; remove it")
+            raise RecordError(f"cannot write to {folder}: {(*blocked, INCOMPLETE)[0]} in it is not a file; remove it")
     except FileNotFoundError as error:  # only absolute() raises that
-        raise RecordError("the working directory is no longer there; change to another folder") from error
+        raise RecordError("the working directory no longer exists; change to another folder") from error
     except (OSError, ValueError) as error:
         raise RecordError(f"cannot write to {folder}: {_reason(error)}") from error
     if not existing.is_dir():
@@ -68,12 +68,12 @@ def check_writable(folder: Path, names: Iterable[str] = ()) -> None:
 
 @contextmanager
 def held_folder(folder: Path) -> Iterator[None]:
-    """Create a folder if needed, and lock it within the block, if file system and operating system support locks.
+    """Create a folder if needed, and lock it during the block if the file system and operating system support locks.
 
     Raises
     ------
     RecordError
-        If another process has locked it or it cannot be created.
+        If another process has locked the folder, or the folder cannot be created.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -98,7 +98,7 @@ def held_folder(folder: Path) -> Iterator[None]:
 
 
 def discard(folder: Path, patterns: Iterable[str]) -> None:
-    """Delete all files of a folder that match; files that cannot be deleted stay."""
+    """Delete all files in a folder that match one of the patterns; skip files that cannot be deleted."""
     for pattern in patterns:
         for path in folder.glob(pattern):
             with suppress(OSError):
@@ -106,7 +106,7 @@ def discard(folder: Path, patterns: Iterable[str]) -> None:
 
 
 def file_name(text: object) -> str:
-    """Make a safe name for a file or folder from any text: it cannot lead to another folder."""
+    """Return a safe name for a file or folder, made from any text; the name cannot point to another folder."""
     name = "".join(c if c.isprintable() and c not in '/\\:*?"<>|' else "_" for c in str(text))
     return name.strip(". ")[:_NAME_LENGTH] or "unnamed"
 
@@ -115,20 +115,21 @@ def file_name(text: object) -> str:
 def replacing(path: Path, *, durable: bool = False) -> Iterator[BinaryIO]:
     """Provide a stream whose content replaces the file ``path`` if the block ends without an exception.
 
-    If ``path`` is a link, the link is kept and its target is replaced. A new file gets the mode set by the umask, a
-    replaced file keeps its mode.
+    If ``path`` is a link, the link is kept and its target is replaced. A new file gets the permissions set by the
+    umask; a replaced file keeps its permissions.
 
     Parameters
     ----------
     path : Path
         File to write.
     durable : bool, optional
-        Wait until the content is on the disk, so that even after a power cut the old or the new file is there.
+        Wait until the content is on the disk, so that either the old or the new file exists even after a power failure.
 
     Raises
     ------
     RecordError
-        If ``path`` is not a regular file or cannot be written (no space, no permission); an older file is unchanged.
+        If ``path`` is not a regular file or cannot be written (no space, no permission). An existing file is not
+        changed then.
     """
     with _draft(path) as draft:
         yield draft.stream
@@ -137,15 +138,15 @@ def replacing(path: Path, *, durable: bool = False) -> Iterator[BinaryIO]:
 
 
 def replace_together(folder: Path, contents: Mapping[str, bytes | memoryview]) -> None:
-    """Write files that belong together, given as name: content; all of them or none.
+    """Write a set of files that belong together, either all of them or none; ``contents`` maps names to contents.
 
-    All are complete on disk before the first is renamed. While they are renamed, a file ``INCOMPLETE`` in the folder
-    lists them: :func:`check_complete` refuses them if the process dies meanwhile.
+    All files are complete on disk before the first one is renamed. While they are being renamed, a file ``INCOMPLETE``
+    in the folder lists them, so that :func:`check_complete` rejects them if the process dies in the meantime.
 
     Raises
     ------
     RecordError
-        If a file cannot be written; older files are unchanged, unless the message says that they are marked.
+        If a file cannot be written. Existing files are not changed, unless the message says that the folder is marked.
     """
     places = {os.path.realpath(folder / name) for name in contents}
     if len(places) < len(contents):
@@ -164,12 +165,12 @@ def replace_together(folder: Path, contents: Mapping[str, bytes | memoryview]) -
 
 
 def check_complete(path: Path) -> None:
-    """Refuse a file that may belong to a different run than the others of its folder, see :func:`replace_together`.
+    """Reject a file that may not belong to the same run as other files in its folder, see :func:`replace_together`.
 
     Raises
     ------
     RecordError
-        If the folder is marked and the mark names the file.
+        If the folder is marked as incomplete and the mark lists the file.
     """
     mark = path.parent / INCOMPLETE
     try:
@@ -180,18 +181,18 @@ def check_complete(path: Path) -> None:
         names = None
     if names is None or path.name in names:
         raise RecordError(
-            f"{path}: may belong to a different run than the other files there: {mark} shows that a run died, or is "
-            "busy, while exchanging them; run it again, or delete that mark to use the files as they are"
+            f"{path}: may belong to a different run than the other files in its folder: {mark} shows that a run is "
+            "replacing them or died while doing so; run it again, or delete this mark to use the files as they are"
         )
 
 
 def write_text(path: Path, text: str) -> Path:
-    """Write a text file, see :func:`replacing`.
+    """Write a text file atomically, see :func:`replacing`.
 
     Raises
     ------
     RecordError
-        If the file cannot be written; an older file is unchanged.
+        If the file cannot be written. An existing file is not changed then.
     """
     with replacing(path) as stream:
         stream.write(text.encode("utf-8"))
@@ -199,12 +200,12 @@ def write_text(path: Path, text: str) -> Path:
 
 
 def write_json(path: Path, data: Any) -> Path:
-    """Write JSON, see :func:`write_text`."""
+    """Write data to a JSON file, see :func:`write_text`."""
     return write_text(path, json_text(data))
 
 
 def json_text(data: Any) -> str:
-    """Return JSON in the format of dynsim's files."""
+    """Return data as JSON text, in the layout of all JSON files that dynsim writes."""
     return json.dumps(data, indent=2, ensure_ascii=False) + "\n"
 
 
@@ -227,13 +228,13 @@ class _Draft:
     stream: BinaryIO
 
     def complete(self, durable: bool) -> None:
-        """Flush the complete content to the system, and to the disk if ``durable``."""
+        """Flush the complete content to the operating system and, if ``durable``, to the disk."""
         self.stream.flush()
         if durable:
             os.fsync(self.stream.fileno())
 
     def publish(self) -> None:
-        """Replace the file at the path by the content."""
+        """Replace the file at the path with the new content."""
         if not hasattr(os, "fchmod"):
             self.stream.close()  # Windows cannot rename an open file
         os.replace(self.temporary, self.target)
@@ -292,7 +293,7 @@ def _reason(error: Exception) -> str:
 
 
 def lock(descriptor: int, *, wait: bool) -> bool:
-    """Lock a file until it is closed; False if another process has locked it."""
+    """Lock a file until it is closed; return False if another process has locked it."""
     if fcntl is None:
         return True
     try:
@@ -305,7 +306,7 @@ def lock(descriptor: int, *, wait: bool) -> bool:
 
 
 def _remove_left_behind(folder: Path) -> None:
-    """Remove temporary files of processes that died."""
+    """Remove temporary files that were left behind by processes that died."""
     for path in folder.glob(".dynsim-*.tmp"):
         with suppress(OSError):
             if time.time() - path.lstat().st_mtime > _LEFT_BEHIND:
@@ -314,10 +315,11 @@ def _remove_left_behind(folder: Path) -> None:
 
 @contextmanager
 def _marked(folder: Path, names: Mapping[str, object]) -> Iterator[list[Path]]:
-    """Mark the folder as incomplete with respect to the files ``names``; yield a list for files that are exchanged.
+    """Mark a folder as incomplete because of the files ``names``; yield a list to which replaced files are added.
 
-    The mark is removed if the block succeeds, or fails before it has exchanged a file. One process at a time; others
-    wait. Mark and renames are not synced: journaling file systems keep their order, and an empty mark covers all files.
+    The mark is removed if the block succeeds, or if it fails before it has replaced a file. Only one process at a time
+    can hold the mark; other processes wait. The mark and the renamed files are not synced to the disk, because
+    journaling file systems preserve their order. An empty mark covers all files.
     """
     mark = folder / INCOMPLETE
     published: list[Path] = []
@@ -334,7 +336,7 @@ def _marked(folder: Path, names: Mapping[str, object]) -> Iterator[list[Path]]:
                     _remove_mark(mark, stream, before)
             elif isinstance(error, RecordError):
                 done = ", ".join(path.name for path in published)
-                raise RecordError(f"{error}; {done} came before, so {folder} is marked {INCOMPLETE}") from error
+                raise RecordError(f"{error}; {done} already replaced, so {folder} is marked {INCOMPLETE}") from error
             raise
         try:
             _remove_mark(mark, stream, before - set(names))
@@ -343,7 +345,7 @@ def _marked(folder: Path, names: Mapping[str, object]) -> Iterator[list[Path]]:
 
 
 def _remove_mark(mark: Path, stream: BinaryIO, left: set[str]) -> None:
-    """Remove the mark, unless it still lists files of other processes that died."""
+    """Remove the mark, unless it still lists files that other processes were replacing when they died."""
     if left:
         _rewrite_mark(stream, left)
         return
@@ -353,7 +355,7 @@ def _remove_mark(mark: Path, stream: BinaryIO, left: set[str]) -> None:
 
 
 def _open_mark(mark: Path) -> tuple[BinaryIO, set[str]]:
-    """Open the mark, locked by this process; return it and the names in it."""
+    """Open the mark and lock it for this process; return its stream and the names that it lists."""
     flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
     while True:
         stream = os.fdopen(os.open(mark, flags | getattr(os, "O_NONBLOCK", 0), 0o666), "r+b", buffering=0)
@@ -361,14 +363,14 @@ def _open_mark(mark: Path) -> tuple[BinaryIO, set[str]]:
             lock(stream.fileno(), wait=True)
             status = os.fstat(stream.fileno())
             if not stat.S_ISREG(status.st_mode):
-                raise OSError(0, "is in the way: not a regular file; remove it")
+                raise OSError(0, "this path is not a regular file; remove it")
             with suppress(FileNotFoundError):
                 if os.path.samestat(status, os.lstat(mark)):
                     text = stream.read().decode("utf-8", errors="replace")
                     if text and not text.startswith(_MARK):
-                        raise OSError(0, "is in the way: not a mark of dynsim; move it")
+                        raise OSError(0, "the existing file was not written by dynsim; move it")
                     return stream, _marked_names(text) or set()
-            # Another process has removed it meanwhile, because it was done.
+            # Another process has finished and removed the mark in the meantime; try again.
             stream.close()
         except BaseException:
             stream.close()
@@ -382,5 +384,5 @@ def _rewrite_mark(stream: BinaryIO, names: set[str]) -> None:
 
 
 def _marked_names(text: str) -> set[str] | None:
-    """Return the files that a mark names; None if it names none, which means all files."""
+    """Return the files that a mark lists; None if it lists no files, in which case it covers all files."""
     return set(text.splitlines()[1:]) or None

@@ -1,9 +1,9 @@
-"""Reading of files that users name: regular files of bounded size, as text or YAML, without blocking.
+"""Functions that read files chosen by the user, as text or YAML, without blocking; only regular files of limited size.
 
-YAML is built from the parser's events, so that every error is a dynsim error with its line, the expansion of aliases is
-bounded, and a file of some 100 000 numbers loads in a second (ruamel's compiled parser; its Python parser takes ten
-times as long). Plain values follow the core schema of YAML 1.2: null, booleans, integers, floats and text; a date is
-text.
+YAML values are built from the events of the parser. Therefore every error is a dynsim error with a line number, the
+expansion of aliases is limited, and a file of some 100 000 numbers loads in a second (with the compiled parser of
+ruamel; its Python parser takes ten times as long). Plain values follow the core schema of YAML 1.2: null, booleans,
+integers, floats and text; dates are read as text.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from typing import Any, NoReturn
 
 from dynsim.errors import DynsimError
 
-# Limits of a YAML file: bytes, values after expansion of aliases, nested mappings and lists.
+# Limits for a YAML file: size [bytes], number of values with aliases expanded, depth of nested mappings and lists.
 SIZE_LIMIT = 16_000_000
 NODE_LIMIT = 1_000_000
 DEPTH_LIMIT = 50
-# Limit of the digits of an integer: about as many as a float can represent.
+# Maximum number of digits of an integer; the largest float is about 1.8e308.
 DIGITS_LIMIT = 308
 
-# Makes an error from its message: a class of errors, or a partial of one.
+# Callable that creates an error from its message: an exception class, or a functools.partial of one.
 ErrorClass = Callable[[str], DynsimError]
 
 _NULLS = frozenset(("", "~", "null", "Null", "NULL"))
@@ -33,25 +33,26 @@ _INTEGER = re.compile(r"[-+]?(?:0b[01]+|0o[0-7]+|0x[0-9a-fA-F]+|[0-9]+)")
 _FLOAT = re.compile(
     r"[-+]?(?:(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?|\.inf|\.Inf|\.INF)|\.nan|\.NaN|\.NAN"
 )
-# Not allowed in YAML text, escaped or not: control characters except tab and line ends, and lone surrogates.
+# Characters that are not allowed in YAML, escaped or not: lone surrogates, and control characters except tab and line
+# ends.
 _FORBIDDEN = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\x7f\x80-\x84\x86-\x9f\ud800-\udfff\ufffe\uffff]")
 _CORE = "tag:yaml.org,2002:"
 _TEXT_TAGS = (None, "!", _CORE + "str")
-# Events that begin a value, with the method that reads it; names of events that cannot begin a key.
+# Parser events that begin a value, and the method that reads it; events that cannot begin a key, with their names.
 _VALUES = {"ScalarEvent": "_scalar", "MappingStartEvent": "_mapping", "SequenceStartEvent": "_list", "AliasEvent": ""}
 _NO_KEYS = {"MappingStartEvent": "a mapping", "SequenceStartEvent": "a list", "AliasEvent": "an alias"}
-# Value of an anchor whose end has not been reached.
+# Placeholder for the value of an anchor while this value is still being read.
 _INCOMPLETE = object()
 
 
 def is_file(path: str | os.PathLike[str], error: ErrorClass) -> bool:
-    """True for a regular file, False if nothing exists there.
+    """Return True if the path is a regular file, and False if nothing exists at the path.
 
     Raises
     ------
     DynsimError
-        Of the class ``error``, for a folder, pipe, socket or device (they may block or never end), or a name that
-        cannot be looked up.
+        If the path is a folder, pipe, socket or device (reading one may block or never end) or cannot be looked up; the
+        class of the error is ``error``.
     """
     try:
         mode = os.stat(path).st_mode
@@ -68,7 +69,7 @@ def is_file(path: str | os.PathLike[str], error: ErrorClass) -> bool:
 
 
 def check_file(path: str | os.PathLike[str], error: ErrorClass) -> None:
-    """Raise ``error`` if there is no such file; otherwise as :func:`is_file`."""
+    """Raise ``error`` if the file does not exist or is not a regular file, see :func:`is_file`."""
     if not is_file(path, error):
         raise error(f"{path}: no such file")
 
@@ -79,7 +80,8 @@ def read_bytes(path: Path, error: ErrorClass, limit: int = SIZE_LIMIT) -> bytes:
     Raises
     ------
     DynsimError
-        Of the class ``error``, if it is not a regular file, too large or not readable.
+        If the path is not a regular file, or the file is too large or cannot be read; the class of the error is
+        ``error``.
     """
     check_file(path, error)
     try:
@@ -98,7 +100,8 @@ def read_text(path: Path, error: ErrorClass, limit: int = SIZE_LIMIT) -> str:
     Raises
     ------
     DynsimError
-        Of the class ``error``, if it is not a regular file, too large, not readable or not UTF-8.
+        If the path is not a regular file, or the file is too large, cannot be read or is not UTF-8; the class of the
+        error is ``error``.
     """
     content = read_bytes(path, error, limit)
     try:
@@ -126,31 +129,32 @@ class YamlList(_Located, list[Any]):
 
 
 def parse_yaml(text: str, error: ErrorClass, source: str, *, line_numbers: bool = True) -> Any:
-    """Return the only document of a YAML text as plain values in YamlMapping and YamlList; None if it is empty.
+    """Parse a YAML text that contains one document; return a YamlMapping, a YamlList, a plain value, or None if empty.
 
-    Keys are text as written: ``1`` and ``"1"`` are the same key. Aliases are copies, ``<<`` merges.
+    Keys are kept as they are written: ``1`` and ``"1"`` are the same key. An alias is replaced by a copy of its anchor,
+    and ``<<`` merges mappings.
 
     Parameters
     ----------
     text : str
         Text to parse.
     error : ErrorClass
-        Class of errors to raise.
+        Class of the errors to raise.
     source : str
-        Origin of the text, for messages.
+        Origin of the text, to be shown in messages.
     line_numbers : bool, optional
-        Whether messages include lines (not useful for a text of one line).
+        Whether messages include line numbers (not useful for a text of one line).
 
     Raises
     ------
     DynsimError
-        Of the class ``error``, with source and line, for any error in the text.
+        If there is any error in the text; the class of the error is ``error``, and its message states source and line.
     """
     return _Reader(text, error, source, line_numbers).document()
 
 
 class _Reader:
-    """Builder of the values of a document from its events."""
+    """Reader that builds the values of a YAML document from the events of the parser."""
 
     def __init__(self, text: str, error: ErrorClass, source: str, line_numbers: bool) -> None:
         self._error, self._source, self._line_numbers = error, source, line_numbers
@@ -178,13 +182,13 @@ class _Reader:
         try:
             yield from YAML(typ="safe").parse(text)
         except Exception as reason:
-            # The parser may fail in any way on arbitrary text: it is always an error of the text.
+            # The parser may raise any exception on arbitrary text; the cause is always an error in the text.
             mark = getattr(reason, "problem_mark", None) or getattr(reason, "context_mark", None)
             problem = getattr(reason, "problem", None) or getattr(reason, "context", None) or str(reason)
             hint = " ".join(problem.split())
             lines = text.split("\n")
             if mark is not None and mark.line < len(lines) and lines[mark.line][mark.column :].startswith("\t"):
-                hint = "a tab; indent with spaces"
+                hint = "tab character; indent with spaces"
             self._fail(mark.line + 1 if mark else None, f"not YAML: {hint}")
 
     def _fail(self, line: int | None, problem: str) -> NoReturn:
@@ -192,7 +196,7 @@ class _Reader:
         raise self._error(f"{location}: {problem}")
 
     def _value(self, event: Any, depth: int) -> Any:
-        """Return the value that begins with an event, nested in ``depth`` mappings and lists."""
+        """Return the value that begins with an event, inside ``depth`` nested mappings and lists."""
         kind, line, anchor = type(event).__name__, _line(event), event.anchor
         if kind == "AliasEvent":
             if anchor not in self._anchors:
@@ -236,7 +240,7 @@ class _Reader:
         return text
 
     def _tagged(self, text: str, tag: str, line: int) -> Any:
-        """Return a scalar whose type is set in the file (``!!float 1``)."""
+        """Return a scalar whose type is set by a tag in the file, such as ``!!float 1``."""
         kinds: dict[str, Any] = {"null": type(None), "bool": bool, "int": int, "float": float}
         kind = kinds.get(tag.removeprefix(_CORE)) if tag.startswith(_CORE) else None
         if kind is None:
@@ -250,7 +254,7 @@ class _Reader:
 
     def _fail_tag(self, tag: str, line: int) -> NoReturn:
         shown = tag.replace(_CORE, "!!")[:60]
-        self._fail(line, f"unknown tag {shown!r}; use plain mappings, lists, numbers and texts")
+        self._fail(line, f"unknown tag {shown!r}; use plain mappings, lists, numbers and text")
 
     def _list(self, event: Any, line: int, depth: int) -> YamlList:
         self._check_tag(event, "seq")
@@ -273,7 +277,7 @@ class _Reader:
                 merged.extend(mappings)
             else:
                 own[name], own.lines[name] = value, _line(key)
-        # The mapping's own keys win, then the keys merged first.
+        # The mapping's own keys take precedence, then the keys that were merged first.
         whole = YamlMapping()
         for mapping in (*reversed(merged), own):
             whole.update(mapping)
@@ -282,7 +286,7 @@ class _Reader:
 
     def _key(self, event: Any, mapping: YamlMapping) -> str:
         if kind := _NO_KEYS.get(type(event).__name__):
-            self._fail(_line(event), f"{kind} cannot be a key; keys are texts")
+            self._fail(_line(event), f"{kind} cannot be a key; a key must be text")
         if (tag := _tag(event)) not in _TEXT_TAGS:
             self._fail_tag(str(tag), _line(event))
         name = self._allowed(event)
@@ -293,7 +297,7 @@ class _Reader:
         return name
 
     def _copy(self, value: Any, line: int, depth: int) -> Any:
-        """Return a copy of a value, at an alias, that shares no mapping or list with it."""
+        """Return a copy of an anchor's value for an alias; the copy shares no mapping or list with the original."""
         self._count(line)
         if isinstance(value, YamlMapping | YamlList):
             self._check_depth(line, depth)
@@ -313,7 +317,7 @@ class _Reader:
 
     def _check_depth(self, line: int, depth: int) -> None:
         if depth >= DEPTH_LIMIT:
-            self._fail(line, f"more than {DEPTH_LIMIT} nested mappings and lists")
+            self._fail(line, f"more than {DEPTH_LIMIT} levels of nested mappings and lists")
 
     def _count(self, line: int) -> None:
         self._nodes += 1

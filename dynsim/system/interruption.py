@@ -1,9 +1,9 @@
-"""Interrupt signals: handled at once, or postponed while a result is computed or saved.
+"""Handling of interrupt signals: immediately, or later if a result is being computed or saved.
 
-Python raises KeyboardInterrupt at any point of a program. Within a callback of the garbage collector it is lost, within
-a callback of the compiler it crashes the process, and between the last step and the saved record the record would be
-lost. A signal is therefore also stored, long work checks for it (:func:`check`), and within a callback of the compiler,
-and between :func:`keep` and :func:`heed`, it is postponed.
+Python may raise KeyboardInterrupt at any point of a program. In a callback from the garbage collector the exception is
+lost, in a callback from the compiler it crashes the process, and between the last step and the saving of a record it
+would lose the record. Therefore each signal is also stored, and long computations check for it (:func:`check`). In a
+callback from the compiler, and between :func:`keep` and :func:`heed`, a signal is postponed.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from types import FrameType
 
 STOP_SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 
-# Callbacks of llvmlite by which LLVM reads and writes its cache of compiled code; exceptions in them are not handled.
+# Callbacks in llvmlite through which LLVM reads and writes its cache of compiled code; they must not raise exceptions.
 _OF_THE_COMPILER = ("_raw_object_cache_notify", "_raw_object_cache_getbuffer")
 
 _pending = False
@@ -24,7 +24,7 @@ _left = False
 
 
 def _compiler_waits(frame: FrameType | None) -> bool:
-    """True within a callback of the compiler."""
+    """Return True if the frame is within a callback from the compiler."""
     while frame is not None:
         if frame.f_code.co_name in _OF_THE_COMPILER:
             return True
@@ -34,9 +34,10 @@ def _compiler_waits(frame: FrameType | None) -> bool:
 
 @contextmanager
 def handled() -> Iterator[list[int]]:
-    """Let the ``STOP_SIGNALS`` raise KeyboardInterrupt within the block, see above; yield the list of received signals.
+    """Raise KeyboardInterrupt for the ``STOP_SIGNALS`` within the block; yield the list of received signals.
 
-    A signal that is ignored (``nohup``) or has another handler is left alone.
+    A signal may be postponed, as described at the top of this module. A signal that is ignored (``nohup``) or has
+    another handler is left alone.
     """
     global _pending, _kept
     received: list[int] = []
@@ -61,7 +62,7 @@ def handled() -> Iterator[list[int]]:
 
 
 def exit_code(received: Sequence[int]) -> int:
-    """Return the exit code of a process ended by signals: 128 plus the first signal; by default SIGINT (Ctrl-C)."""
+    """Return the exit code after signals: 128 plus the number of the first; SIGINT (Ctrl-C) if the list is empty."""
     return 128 + (received[0] if received else signal.SIGINT)
 
 
@@ -72,7 +73,7 @@ def keep() -> None:
 
 
 def heed() -> None:
-    """Handle signals again; the next :func:`check` raises for a signal received in between."""
+    """Handle signals again; the next :func:`check` raises KeyboardInterrupt for a signal that was postponed."""
     global _kept
     _kept = False
 
@@ -95,11 +96,11 @@ def is_kept() -> bool:
 
 
 def leave() -> None:
-    """Record that a thread of this process cannot be ended and is not waited for: it ends with the process."""
+    """Record that a thread of this process cannot be stopped; the process must exit without waiting for it."""
     global _left
     _left = True
 
 
 def is_left() -> bool:
-    """Return whether there is such a thread."""
+    """Return whether a thread of this process cannot be stopped, see :func:`leave`."""
     return _left

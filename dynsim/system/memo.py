@@ -1,4 +1,4 @@
-"""Memoisation of results that runs of a sweep share, keyed by the bits of their inputs."""
+"""Memoisation of results that are shared by the runs of a sweep; inputs are compared bit by bit."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from pydantic import BaseModel
 
 T = TypeVar("T")
 
-# Number of results kept for each kind: few, because successive runs of a sweep share most inputs.
+# Number of results kept for each kind; a few suffice, because successive runs of a sweep share most inputs.
 KEPT = 4
 
 
 class Memo:
-    """Results of pure functions, indexed by the inputs from which they were computed.
+    """Cache for results of pure functions, indexed by the inputs from which they were computed.
 
-    Numbers, texts and arrays are equal if their bits are equal (−0.0 is not 0.0, 1 is not 1.0), and so are tuples,
-    lists, dicts and configurations of them; any other object equals only itself and must not be changed. Callers must
-    not change a result either. A function that raises is called again next time.
+    Numbers, strings and arrays are equal if their bits are equal (−0.0 is not 0.0, 1 is not 1.0), and so are tuples,
+    lists, dicts and configurations that contain them; any other object equals only itself and must not be changed.
+    Callers must not change a result either. If a function raises an exception, it is called again the next time.
     """
 
     def __init__(self) -> None:
         self._kept: dict[str, OrderedDict[Hashable, tuple[Any, Any]]] = {}
 
     def recall(self, kind: str, make: Callable[[], T], *inputs: Any) -> T:
-        """Return the result for these inputs, see the function :func:`recall`."""
+        """Return the result for the given inputs, as described for the function :func:`recall`."""
         kept, key = self._kept.setdefault(kind, OrderedDict()), _bits(inputs)
         if key in kept:
             kept.move_to_end(key)
@@ -48,7 +48,7 @@ _current: ContextVar[Memo | None] = ContextVar("memo", default=None)
 
 @contextmanager
 def remembering(memo: Memo | None = None) -> Iterator[None]:
-    """Use a memo for :func:`recall` within the block; default: the enclosing block's memo, or a new one."""
+    """Use a memo for calls of :func:`recall` within the block; default: the memo of the outer block, or a new one."""
     token = _current.set(memo or _current.get() or Memo())
     try:
         yield
@@ -57,14 +57,16 @@ def remembering(memo: Memo | None = None) -> Iterator[None]:
 
 
 def recall(kind: str, make: Callable[[], T], *inputs: Any) -> T:
-    """Return the result of ``make``, or of an earlier call within the same :func:`remembering` for equal inputs.
+    """Return the result of ``make``, or the stored result if it was called before with equal inputs.
+
+    Results are stored only within a :func:`remembering` block.
 
     Parameters
     ----------
     kind : str
         Kind of result; the last :data:`KEPT` results of each kind are kept.
     make : callable
-        Computes the result.
+        Function that computes the result.
     inputs : Any
         Everything that the result depends on.
     """
@@ -87,6 +89,6 @@ def _bits(value: Any) -> Hashable:
     if value is None or kind in (int, bool, str, bytes):
         return kind, value
     if isinstance(value, BaseModel):
-        # Some configurations refuse a key that is set to its default but accept it if omitted.
+        # Some configurations reject a key that is set to its default value but accept it if it is omitted.
         return kind, frozenset(value.model_fields_set), _bits(value.__dict__), _bits(value.__pydantic_private__)
     return kind, id(value)

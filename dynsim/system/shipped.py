@@ -1,4 +1,4 @@
-"""Folder and names of the scenario files that come with dynsim; imports nothing else of dynsim."""
+"""Folder and names of the scenario files shipped with dynsim; this module imports no other module of dynsim."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ SHIPPED = _CHECKOUT if _CHECKOUT.is_dir() else Path(__file__).resolve().parents[
 
 
 def shipped_scenarios() -> list[Path]:
-    """Return the scenario files that come with dynsim."""
+    """Return the paths of the scenario files shipped with dynsim."""
     return sorted(SHIPPED.glob("*.yaml"))
 
 
 def shipped_scenario(path: Path) -> Path | None:
-    """Return the shipped file for a name without a folder (or in ``scenarios``), or None."""
+    """Return the shipped scenario file for a name or for ``scenarios/NAME``; None if no such file is shipped."""
     if path.parent not in (Path(), Path("scenarios")):
         return None
     files = {file.name: file for file in shipped_scenarios()}

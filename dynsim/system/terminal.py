@@ -1,7 +1,7 @@
-"""A terminal of rich, and texts from files made safe to print on it.
+"""A rich console that prints text from files safely, and standard streams that tolerate failed writes.
 
-A name in a scenario, a record or a servo map may contain escape sequences, which move the cursor, change colours or
-rename the window, and the markup of rich. Both are printed literally and have no effect.
+A name in a scenario, a record or a servo map may contain rich markup, or escape sequences, which move the cursor,
+change colours or rename the window. Both are printed literally and have no effect.
 """
 
 from __future__ import annotations
@@ -20,12 +20,13 @@ from rich.text import Text
 
 # Width of output to a file or pipe, in columns: tables are as wide as they need to be.
 UNBOUNDED = 10_000
-# Control characters, invisible and direction-changing ones, halves of surrogate pairs, line and paragraph separators.
+# Unicode categories of characters that are escaped: control characters, invisible and direction-changing characters,
+# halves of surrogate pairs, line separators and paragraph separators.
 _UNFIT = {"Cc", "Cf", "Cs", "Zl", "Zp"}
 
 
 def plain(text: object) -> str:
-    r"""Return a text in which control characters are written out (ESC as ``\x1b``); line breaks are kept."""
+    r"""Return the text with control characters escaped (ESC is written as ``\x1b``); line breaks are kept."""
     written = str(text)
     if written.isprintable():
         return written
@@ -36,19 +37,19 @@ def plain(text: object) -> str:
 
 
 def escaped(text: object) -> str:
-    """Return a text for use where rich reads markup: as :func:`plain`, and ``[red]`` is printed literally."""
+    """Return text that can be inserted into rich markup: as :func:`plain`, with ``[red]`` printed literally."""
     return escape(plain(text))
 
 
 def escaped_line(text: object) -> str:
-    r"""Return :func:`escaped` of a name or a sentence, with line breaks written as ``\n``."""
+    r"""Return a name or a sentence escaped as by :func:`escaped`, with line breaks written as ``\n``."""
     return escape(plain(text).replace("\n", "\\n"))
 
 
 class Terminal(Console):
-    """Console that prints control characters in escaped form, also in texts of other libraries.
+    """Console that prints control characters in escaped form, even in text from other libraries.
 
-    Markup is interpreted if the console is set up to: texts inserted into markup need :func:`escaped`.
+    If the console interprets markup, text that is inserted into markup must be passed through :func:`escaped` first.
     """
 
     @property
@@ -58,7 +59,7 @@ class Terminal(Console):
 
     @property
     def size(self) -> ConsoleDimensions:
-        """Size of the terminal, or from COLUMNS; without either, lines are not wrapped."""
+        """Size of the terminal, or the size set by COLUMNS; without either, lines are not wrapped."""
         return ConsoleDimensions(UNBOUNDED, super().size.height) if self.unbounded else super().size
 
     @size.setter
@@ -66,14 +67,14 @@ class Terminal(Console):
         self._width, self._height = new_size
 
     def render_str(self, text: str, **options: Any) -> Text:
-        """Render text without control characters; cells, titles and prints all pass through here."""
+        """Render text without control characters; all table cells, titles and printed texts pass through here."""
         return super().render_str(plain(text), **options)
 
 
-# Standard output and error whose failures (closed pipes, full disks, ASCII terminals) do not end a run.
+# Standard streams for which a failed write (closed pipe, full disk, ASCII terminal) does not end a run.
 
 
-# Characters that dynsim prints → their replacements in encodings that lack them; others become "?".
+# Replacements of characters that dynsim prints, for encodings that lack them; all other characters become "?".
 _PLAIN = {
     "−": "-", "–": "-", "—": "-", "…": "...", "→": "->", "·": " ", "×": "x", "°": " deg", "µ": "u", "μ": "mu",
     "Ω": "ohm", "²": "^2", "³": "^3", "⁻": "^-", "√": "sqrt", "∫": "int ", "Σ": "sum ", "τ": "tau", "≤": "<=",
@@ -114,7 +115,7 @@ class LenientStream:
 
     def _give_up(self, error: OSError) -> None:
         self.failure = error
-        # The content of its buffer would fail again when Python ends.
+        # Redirect the stream to the null device: writing the rest of its buffer would fail again when Python exits.
         with suppress(OSError, ValueError):
             nowhere = os.open(os.devnull, os.O_WRONLY)
             os.dup2(nowhere, self._stream.fileno())
@@ -127,13 +128,14 @@ class LenientStream:
 def reserve_descriptors() -> None:
     """Redirect the descriptors of closed standard streams to the null device.
 
-    Otherwise the next files opened would get them, and the output of a library would go to a record, or to the servos.
+    Otherwise the next files to be opened would receive these descriptors, and output printed by a library would be
+    written to a record or sent to the servos.
     """
     for descriptor in (0, 1, 2):
         try:
             os.fstat(descriptor)
         except OSError:
-            # The system assigns the lowest free descriptor.
+            # The system assigns the lowest free descriptor, which is the closed one.
             os.open(os.devnull, os.O_RDWR)
 
 
@@ -157,7 +159,7 @@ def lenient_streams() -> Iterator[LenientStream | None]:
 
 @contextmanager
 def _encodable(stream: Any) -> Iterator[None]:
-    """Write characters that the stream's encoding lacks as plain letters."""
+    """Within the block, replace characters that the stream's encoding lacks by ASCII characters."""
     if not hasattr(stream, "reconfigure"):
         yield
         return
@@ -166,6 +168,6 @@ def _encodable(stream: Any) -> Iterator[None]:
     try:
         yield
     finally:
-        # Fails only if a stream cannot be flushed.
+        # This fails only if the stream cannot be flushed.
         with suppress(OSError, ValueError):
             stream.reconfigure(errors=before)

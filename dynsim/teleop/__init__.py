@@ -1,1 +1,1 @@
-"""Teleoperation: sessions of arms and snake robots, and the web server for a pilot."""
+"""Teleoperation: sessions in which a pilot drives an arm or a snake robot, and the web server for the pilot."""

@@ -1,6 +1,6 @@
 """Teleoperation sessions: a pilot commands a simulated arm or snake robot tick by tick ([T] IV.C for the snake).
 
-A session executes the commands of the pilot and writes a script that reproduces the run.
+A session executes the pilot's commands and records them in a script that reproduces the run.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from dynsim.scenario import Scenario, build, require_scenario, scenario_from_res
 from dynsim.snake import ticks as ss
 from dynsim.snake.description import COORDINATES, FIXING, NO_REQUEST, SWITCHING, CommandBlock, Feedback
 
-# Interface and data types of a teleoperated simulation.
+# Interface and data types for a teleoperated simulation.
 
 
 Array = NDArray[np.float64]
@@ -49,7 +49,7 @@ class PilotAxis:
     name : str
         Name of the component, such as ``x`` or ``yaw``.
     group : str
-        Moving part: ``hand``, ``head``, ``gripper`` or ``base``.
+        Part of the robot that moves: ``hand``, ``head``, ``gripper`` or ``base``.
     unit : str
         Unit of the velocity.
     limit : float
@@ -64,14 +64,14 @@ class PilotAxis:
 
 @dataclass(frozen=True)
 class Command:
-    """Command of a pilot for one tick of the simulation.
+    """Command from the pilot for one tick of the simulation.
 
     Attributes
     ----------
     velocity : tuple of float
         Velocity of each axis [m/s, rad/s].
     request : int
-        Requested mode: its number, or a constant of :mod:`dynsim.snake.description`; ``NO_REQUEST`` for none.
+        Requested mode: its number, or a constant from :mod:`dynsim.snake.description`, such as ``NO_REQUEST``.
     closed : bool
         True to close the gripper.
     """
@@ -83,7 +83,7 @@ class Command:
 
 @dataclass(frozen=True)
 class LiveFrame:
-    """State of the robot after a tick, for the display of the pilot.
+    """State of the robot after a tick, to be shown to the pilot.
 
     Attributes
     ----------
@@ -94,11 +94,11 @@ class LiveFrame:
     hand : array, shape (3,)
         Target position of the hand [m].
     hindrance : str
-        Reason why the command is not fully executed; empty if it is.
+        Reason why the command is not fully executed; empty if it is fully executed.
     extra : dict
-        Further entries of a page frame: wheels and gripper; ``mode`` of a snake robot.
+        Further entries for the page: wheels, gripper and ``mode`` of a snake robot.
     touching : mapping of str to Touch
-        Contact states; the keys are names of contact points.
+        Contact states, by the name of the contact point.
     """
 
     time: float
@@ -116,11 +116,11 @@ class SpeedLimits:
     Attributes
     ----------
     hand : float
-        Speed of a hand or head [m/s].
+        Maximum speed of a hand or head [m/s].
     turn : float
-        Turning rate of a head or base [rad/s].
+        Maximum turning rate of a head or base [rad/s].
     base : float
-        Speed of a mobile base [m/s].
+        Maximum speed of a mobile base [m/s].
     """
 
     hand: float = 0.1
@@ -129,12 +129,12 @@ class SpeedLimits:
 
 
 def with_controller(scenario: Scenario, duration: float, controller: dict[str, Any]) -> Scenario:
-    """Return the scenario with another duration [s] and controller."""
+    """Return a copy of the scenario with a different duration [s] and controller."""
     return scenario_from_resolved({**scenario.resolved, "duration_s": duration, "controller": controller})
 
 
 def _record_until(simulation: Simulation, end: float, script: Scenario) -> Record:
-    """Return the record of a run that ends at a tick [s], whose command is not known yet; the simulation goes on."""
+    """Return the record of a run that ends at a tick [s], whose command is not known yet; the simulation continues."""
     before = simulation.snapshot()
     if not simulation.finished:
         simulation.end_samples(end)
@@ -153,7 +153,7 @@ REQUESTS = {SWITCHING: "switching", FIXING: "fixing"}
 class SnakeSession:
     """Session of a kinematic snake robot; see :data:`dynsim.teleop.snake.Session`.
 
-    The session is the :class:`~dynsim.snake.description.CommandSource` of its run. ``longest`` is the maximum
+    The session is the :class:`~dynsim.snake.description.CommandSource` for its own run. ``longest`` is the maximum
     duration [s].
     """
 
@@ -186,7 +186,7 @@ class SnakeSession:
 
     @property
     def ticks(self) -> int:
-        """Number of control periods so far."""
+        """Number of control periods that have been executed."""
         return self._run.tick
 
     @property
@@ -202,7 +202,7 @@ class SnakeSession:
     def read(self, first: int, count: int, period: float, feedback: Feedback) -> CommandBlock:
         """Return the present command for one period."""
         command = self._command
-        # Avoid negative zeros, as in a script.
+        # Add zero to avoid negative zeros, which a script does not contain either.
         velocity = np.zeros((1, 6)) + np.array(command.velocity)
         return CommandBlock(velocity, np.array([command.request]), np.array([int(command.closed)]))
 
@@ -219,7 +219,7 @@ class SnakeSession:
         if entry:
             self._commands.append({"at_s": self.ticks * self.period, **entry})
         if self.ticks == 0:
-            # Replace the commands that were read when the run was prepared.
+            # Replace the commands that had been read when the run was prepared.
             self._run.read_commands(waiting=False)
         self._advance()
 
@@ -227,7 +227,7 @@ class SnakeSession:
         self._kinematic.advance()
 
     def frame(self) -> LiveFrame:
-        """Return the present state for the display."""
+        """Return the present state, to be shown to the pilot."""
         run, state = self._run, self._run.state
         row = int(state.counts[ss.MODE])
         return LiveFrame(
@@ -259,7 +259,7 @@ class SnakeSession:
         }
 
     def _grip(self) -> dict[str, str]:
-        """Return a description of the gripper state if there are objects to grip."""
+        """Return a description of the gripper state; it is empty if there are no objects to grip."""
         objects = self._kinematic.objects
         return {} if objects is None else {"grip": objects.state_in_words(self.ticks)}
 
@@ -267,11 +267,14 @@ class SnakeSession:
         return {}
 
     def _hindrance(self) -> str:
-        """Return the reason why the target waits."""
+        """Return the reason why the target pose does not advance; empty if it advances."""
         return self._run.hindrance
 
     def joints(self) -> Mapping[str, Array]:
-        """Return joints and wheels; rates are omitted because they are constant in a period (differences of angles)."""
+        """Return joint and wheel angles, and grounded wheel pairs.
+
+        Rates are omitted, because they are constant in each period: they are differences of angles.
+        """
         run, state = self._run, self._run.state
         grounded = run.controller.law.grounded[int(state.counts[ss.MODE])]
         return {"phi": state.phi.copy(), "rho": state.rho.copy(), "grounded": grounded}
@@ -306,7 +309,7 @@ class DynamicSnakeSession(SnakeSession):
 
     @property
     def time(self) -> float:
-        """Simulation time, half a tick before the time of the last tick [s]."""
+        """Simulation time [s], which is half a tick before the time of the last tick."""
         return self._simulation.time
 
     def _advance(self) -> None:
@@ -330,19 +333,19 @@ class DynamicSnakeSession(SnakeSession):
         return record
 
 
-# Teleoperation of an arm: the commanded velocities of hand and mobile base become references at each tick.
+# Teleoperation of an arm: at each tick, the commanded velocities of the hand and the mobile base become references.
 
 
 _NAMES = ("x", "y", "z", "ahead", "turn")
-# Velocity in the trial ticks that load the kernels [m/s].
+# Velocity used in the trial ticks that load the kernels [m/s].
 _SMALL = 1e-6
 
 
 class ArmSession:
     """Session of an arm; see :data:`dynsim.teleop.snake.Session`.
 
-    The session is the :class:`~dynsim.compile.references.teleop.VelocitySource` of its simulation. ``longest`` is the
-    maximum duration [s].
+    The session is the :class:`~dynsim.compile.references.teleop.VelocitySource` for its own simulation. ``longest`` is
+    the maximum duration [s].
     """
 
     modes: tuple[int, ...] = ()
@@ -359,7 +362,7 @@ class ArmSession:
         self._velocity, self._last = np.zeros(VELOCITIES), np.zeros(VELOCITIES)
         self._velocity[HAND] = _SMALL
         begun = with_controller(scenario, longest, {**self._controller, "operator": self._operator})
-        # Two ticks of another simulation load or compile the kernels.
+        # Run two ticks of another simulation, to load or compile the kernels.
         with kernels_logged(log):
             trial = Simulation(begun, duration=math.inf, operator=self)
             trial.advance(2.0 / trial.operator.rate if trial.operator is not None else 0.0)
@@ -388,7 +391,7 @@ class ArmSession:
 
     @property
     def time(self) -> float:
-        """Simulation time, half a tick before the time of the next command [s]."""
+        """Simulation time [s], which is half a tick before the time of the next command."""
         return self.simulation.time
 
     @property
@@ -416,7 +419,7 @@ class ArmSession:
         self.simulation.advance((self.ticks - 0.5) / self._rate)
 
     def frame(self) -> LiveFrame:
-        """Return the present state for the display."""
+        """Return the present state, to be shown to the pilot."""
         simulation, scene = self.simulation, self.still.scene
         robot, operator = simulation.robot, simulation.operator
         assert isinstance(operator, Operator)
@@ -442,7 +445,8 @@ class ArmSession:
 
     def record(self) -> Record:
         """Return the record of all ticks so far; its scenario contains the script of commands."""
-        # Compute the end from the number of ticks: a rounding error would change the last step of the repeated run.
+        # Compute the end from the number of ticks, because a rounding error would change the last step when the run is
+        # repeated.
         duration = max(self.ticks, 1) * self.period
         operator = {**self._operator, "commands": self._commands}
         script = with_controller(self._scenario, duration, {**self._controller, "operator": operator})
@@ -450,9 +454,10 @@ class ArmSession:
 
 
 def _default_operator(scenario: Scenario, controller: dict[str, Any]) -> dict[str, Any]:
-    """Return an operator with the joints of the hand path, otherwise with all position-controlled joints.
+    """Return the default operator entry: it moves the joints of the hand path or, without one, all suitable joints.
 
-    The result is empty if the arm has bilateral contacts.
+    Suitable joints are those with position control that are not wheels. If there is no hand path and the arm has
+    bilateral contacts, the result is empty.
     """
     if (hand := controller.get("hand")) is not None:
         return {key: hand[key] for key in ("joints", "braces", "tolerance_m") if key in hand}
@@ -463,7 +468,7 @@ def _default_operator(scenario: Scenario, controller: dict[str, Any]) -> dict[st
     return {"joints": [m.joint for m in robot.motors if not isinstance(m, TorqueSource) and m.joint not in wheels]}
 
 
-# Choice of the session for a scenario.
+# Function that starts the session for a scenario.
 
 
 Session = SnakeSession | ArmSession
@@ -509,7 +514,7 @@ def begin(scenario: Scenario, *, limits: SpeedLimits | None = None, longest: flo
     require_scenario(scenario)
     with named(scenario):
         if scenario.controller is None:
-            raise ScenarioError("a pilot requires a controller; add one, such as joint_pd")
+            raise ScenarioError("a live drive requires a controller; add one, such as joint_pd")
         session: type[SnakeSession] | type[ArmSession] = ArmSession
         if scenario.controller.type == "task_space":
             session = SnakeSession if scenario.engine == "kinematic" else DynamicSnakeSession

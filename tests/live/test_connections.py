@@ -72,7 +72,7 @@ def test_idle_connections_delay_the_page_and_are_one_line_of_log(descriptors: in
     assert re.fullmatch(r"\d+ connections to the drive's port failed, or came too fast", line)
 
 
-def test_only_so_many_connections_are_accepted_per_second(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_rate_of_accepted_connections_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
     now = 10.0
     monkeypatch.setattr(time, "monotonic", lambda: now)
     with _ListeningSocket(0) as listening:

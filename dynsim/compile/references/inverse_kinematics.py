@@ -1,4 +1,4 @@
-"""Joint references by inverse kinematics of a hand path, and planned voltages along joint references."""
+"""Joint references from the inverse kinematics of a hand path, and planned voltages along joint references."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from dynsim.system.memo import recall
 
 Array = NDArray[np.float64]
 
-# Limits in files are rounded: 1.5707963 = 90° does not exceed 90° [rad or m].
+# Excess over a limit that is tolerated, because limits in files are rounded: 90° does not exceed 1.5707963 [rad or m].
 LIMIT_SLACK = 1e-6
-# Targets between two checks of the clock and for Ctrl-C: some milliseconds.
+# Number of targets between two checks of the clock and for Ctrl-C; these targets take a few milliseconds.
 PIECE = 256
-# Wall-clock time before the first progress report, and between reports [s]; most paths take less than the first.
+# Wall-clock time before the first progress report, and between reports [s]; most paths take less than the former.
 QUIET_S, REPORT_S = 1.0, 0.1
 
 
@@ -48,12 +48,12 @@ def follow(
 ) -> Array:
     """Compute positions of ``joints`` that put the hand on ``targets`` at ``times``; other joints stay as in ``q``.
 
-    The joint limits are enforced. The targets are in the world frame: the joints compensate the motion of a mobile
-    base.
+    The joint limits are enforced. The targets are in the world frame, so the joints compensate for the motion of a
+    mobile base.
 
-    Damped Gauss–Newton from the previous solution: dq = Jᵀ (J Jᵀ + λ 1)⁻¹ e, with λ decreasing with the error, so that
-    it is Newton's method near a solution and does not jump far from one. More than three joints move as little as
-    possible.
+    The method takes damped Gauss–Newton steps from the previous solution: dq = Jᵀ (J Jᵀ + λ 1)⁻¹ e. λ decreases with
+    the error, so that the method becomes Newton's method near a solution and does not jump far away from it. If there
+    are more than three joints, they move as little as possible.
 
     Parameters
     ----------
@@ -68,13 +68,13 @@ def follow(
     q : (nq,) ndarray
         Configuration to start from, which selects the solution branch.
     tolerance : float
-        Distance that counts as reached [m].
+        Distance from a target at which it counts as reached [m].
     progress : callable, optional
         Called regularly with the time on the path [s] if the computation takes longer than a second.
     base : (T, 4) ndarray, optional
         Coordinates of the mobile base at ``times``: wheels [rad], x and y [m]; default: it does not move.
     braces : sequence of Contact, optional
-        Points that stay on their surfaces, as accurately as the hand on its path.
+        Points that stay on their surfaces, with the same tolerance as the hand on its path.
     orientation : (3, 3) ndarray, optional
         Constant rotation of the hand in the world; default: any.
 
@@ -130,7 +130,7 @@ def follow(
         return result
 
     inputs = geometry, path, wanted, carried, first, tolerance, np.asarray(q)
-    # The memo does not depend on masses. The path contains a workspace for one step with arbitrary contents.
+    # The cached result does not depend on masses. The path contains a workspace for one step with arbitrary contents.
     return recall("inverse kinematics", solved, *inputs)
 
 
@@ -144,7 +144,7 @@ def _turned(
     orientation: Array,
     braces: Sequence[Contact],
 ) -> Array:
-    """Compute the positions like :func:`follow`, for a hand with constant orientation."""
+    """Compute the same positions as :func:`follow`, for a hand with constant orientation."""
     columns = [model.robot.position_index[model.joint_names.index(name)] for name in joints]
     postures = np.zeros((len(times), len(joints)))
     for k, target in enumerate(targets):
@@ -161,7 +161,7 @@ def _turned(
 
 
 def _check_start(model: Model, joints: Sequence[str], q: Array) -> None:
-    """Raise UnreachableReference for joints that start beyond their limits: the path would start with a jump."""
+    """Raise UnreachableReference for joints that start beyond their limits, since the path would start with a jump."""
     for name in joints:
         i = model.joint_names.index(name)
         link, at = model.robot.links[i], float(q[model.robot.position_index[i]])
@@ -176,7 +176,7 @@ def _check_start(model: Model, joints: Sequence[str], q: Array) -> None:
 
 
 def _passed_limits(model: Model, joints: Sequence[str], times: Array, positions: Array) -> str:
-    """Describe how joints without limits would exceed them: joint, limit, time and amount, the largest first."""
+    """Describe how joints would exceed their limits without enforcement: joint, limit, time, excess; largest first."""
     passed: list[tuple[float, str]] = []
     for name, column in zip(joints, positions.T, strict=True):
         link = model.robot.links[model.joint_names.index(name)]
@@ -194,11 +194,11 @@ def _passed_limits(model: Model, joints: Sequence[str], times: Array, positions:
 # Feed-forward voltages along joint references, from the full dynamics with brace forces or from gravity alone.
 
 
-# Smoothing speed v_s of planned friction [m/s], μ s/√(s² + v_s²): a jump would make the voltages oscillate.
+# Smoothing speed v_s of planned friction [m/s], μ s/√(s² + v_s²); a jump in friction would make the voltages oscillate.
 SLIP_SCALE = 5e-3
 # Slip speed s below which the plan contains no friction [m/s].
 SLIP_MIN = 1e-9
-# Maximum distance of a brace from its surface, above or below, along the references [m]; more is a ModelError.
+# Maximum distance of a brace from its surface, above or below, along the references [m]; a larger distance is an error.
 GAP_MAX = 2e-3
 
 
@@ -221,7 +221,8 @@ def planned_voltages(
     positions : mapping of str to (T,) ndarray
         Positions of the moving joints [rad or m]; the other joints keep their initial positions.
     braces : mapping of str to (Contact, float or None)
-        Contact and commanded normal force [N] for each brace; None for the force of least heat, at least ``min_N``.
+        Contact and commanded normal force [N] for each brace; None for the force of at least ``min_N`` with the least
+        motor heat.
     min_N : float, optional
         Minimum normal force [N].
     whole : bool, optional
@@ -269,9 +270,9 @@ def pressing(
     min_N: float = MIN_N,
     slip_scale: float = SLIP_SCALE,
 ) -> tuple[BracePlanner, Array]:
-    """Return the planner of braces that press along references, and their kernel tables, (T, c, BRACE_SIZE).
+    """Return the planner for braces that press along references, and their kernel tables, (T, c, BRACE_SIZE).
 
-    Friction opposes the slip of the references: μ f_n v/√(v² + v_s²), with v_s = ``slip_scale`` [m/s].
+    Friction opposes the slip that the references prescribe: μ f_n v/√(v² + v_s²), with v_s = ``slip_scale`` [m/s].
     """
     attached = []
     for name, (contact, _) in braces.items():
@@ -294,7 +295,7 @@ def pressing(
         slip = velocity - np.sum(velocity * normals, axis=1, keepdims=True) * normals
         speed = np.linalg.norm(slip, axis=1)
         slip[speed <= SLIP_MIN] = 0.0
-        # No planned friction for a point at rest along the surface: its friction depends on its history.
+        # Plan no friction for a point that does not slide, because its friction depends on its history.
         friction = np.where(speed > SLIP_MIN, contact.friction * speed / np.hypot(speed, slip_scale), 0.0)
         tables[:, k] = brace_rows(touching, normals, friction, min_N, np.nan if force is None else force, slip)
     return planner, tables
@@ -324,7 +325,7 @@ def _pressing_torques(
 def _lowest_points(
     model: Model, attached: tuple[int, Array], offsets: Array, q: Array, v: Array
 ) -> tuple[Array, Array]:
-    """Return a body's points at given offsets from one of its points: in its frame [m], and their velocities [m/s].
+    """Return points of a body at given offsets from one of its points, in its frame [m], with their velocities [m/s].
 
     Parameters
     ----------

@@ -1,6 +1,6 @@
 """Smooth plane curves through points, as paths of a base with two driven wheels.
 
-scipy is imported with this module, so only base paths that need it import it.
+This module imports scipy, so only the base paths that need scipy import this module.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from dynsim.model.description import Robot
 
 Array = NDArray[np.float64]
 
-# Rotation of the tangent between two samples that counts as a corner, which a base cannot follow [rad].
+# Rotation of the tangent between two samples [rad] above which a curve has a corner, which a base cannot follow.
 JUMP = 0.2
 # Maximum distance of the first point from the start of the base [m].
 START_TOLERANCE = 1e-6
@@ -43,7 +43,7 @@ class PlaneCurve:
     Parameters
     ----------
     points : (N, 2) ndarray
-        Points [m], the first at the origin; neighbours must differ.
+        Points [m]. The first must be at the origin, and consecutive points must differ.
     names : list of str
         Point names with position and time, for messages.
     start_limit : float
@@ -83,7 +83,7 @@ class PlaneCurve:
             raise ModelError(f"{short} is too close to the previous point for a path of this length; remove it")
         spline = CubicSpline(self.nodes, points, bc_type=((1, np.array([1.0, 0.0])), (2, np.zeros(2))))
         self._tangent = spline.derivative()
-        # Tangent angle and arc length at samples, from which both are continued.
+        # Tangent angle and arc length at samples, from which `motion` continues both.
         parts = np.arange(samples) / samples
         self._u = np.append((self.nodes[:-1, None] + lengths[:, None] * parts).ravel(), self.nodes[-1])
         steps = np.diff(self._angle(self._u))
@@ -114,7 +114,7 @@ class PlaneCurve:
 
 @dataclass(frozen=True)
 class AlongCurve:
-    """A base path along a curve r(u), with u as piecewise polynomials of time."""
+    """A base path along a curve r(u), where u is a piecewise polynomial of time."""
 
     curve: PlaneCurve
     way: BPoly | PchipInterpolator

@@ -1,4 +1,4 @@
-"""Splines through samples (quintic, cubic), the minimum-jerk motion, and the path that turning wheels roll.
+"""Splines through samples (quintic, cubic), the minimum-jerk motion, and the path of a base on rolling wheels.
 
 These splines are used instead of scipy's, because importing scipy takes longer than a short run.
 """
@@ -14,18 +14,18 @@ from dynsim.model.mobile_base import MobileBase
 
 Array = NDArray[np.float64]
 
-# Quintic B-splines at their knots, and their sixth difference.
+# Values of a quintic B-spline at its knots, and coefficients of the sixth difference.
 _VALUE = np.array([1.0, 26.0, 66.0, 26.0, 1.0]) / 120.0
 _DIFFERENCE = np.array([1.0, -6.0, 15.0, -20.0, 15.0, -6.0, 1.0])
 # Half bandwidth of the equations: a row of sixth differences has up to six unknowns on one side of the diagonal.
 _HALF_BAND = 6
-# First and second derivatives at a knot, up to a scale, from the five B-splines there.
+# Weights of the five B-splines at a knot for the first and second derivatives there, up to a scale factor.
 _SLOPE, _CURVATURE = np.array([-1.0, -10.0, 0.0, 10.0, 1.0]), np.array([1.0, 2.0, -6.0, 2.0, 1.0])
 # Constant samples at an end are kept exactly constant if the spline through them would move there by more than this
-# fraction of its span per knot. The ringing of a kink decays by 0.43 per knot, and falls below this within about ten
-# knots.
+# fraction of its span per knot. The ringing of a kink decays by a factor of 0.43 per knot and falls below this within
+# about ten knots.
 _CREEP = 4e-6
-# Minimum number of segments of the motion in between.
+# Minimum number of segments of the motion between such constant ends.
 _FEWEST = 6
 
 
@@ -56,20 +56,20 @@ def quintic_rates(spacing: float, values: Array) -> tuple[Array, Array]:
         slope[:, column], curvature[:, column] = 0.0, 0.0
         rates = _rates(spacing, values[part, column : column + 1], (bool(creeps[0, column]), bool(creeps[1, column])))
         slope[part, column], curvature[part, column] = rates[0][:, 0], rates[1][:, 0]
-        # Exactly zero.
+        # Rounding must not leave small rates at the knots at rest.
         resting = [knot for knot, still in ((first, creeps[0, column]), (last, creeps[1, column])) if still]
         slope[resting, column], curvature[resting, column] = 0.0, 0.0
     return slope, curvature
 
 
 def _rates(spacing: float, values: Array, at_rest: tuple[bool, bool] = (False, False)) -> tuple[Array, Array]:
-    """Return the derivatives of a spline with zero rates at the ends selected by ``at_rest``, otherwise not-a-knot."""
+    """Return the derivatives of a spline with zero rates at the ends in ``at_rest``, and not-a-knot at the others."""
     count = len(values)
     band, right = np.zeros((count + 4, 3 * _HALF_BAND + 1)), np.zeros((count + 4, values.shape[1]))
-    for offset in range(5):  # sample k is row k + 2, its B-splines are k to k + 4
+    for offset in range(5):  # sample k is in row k + 2, and B-splines k to k + 4 overlap it
         band[2 : count + 2, _HALF_BAND - 2 + offset] = _VALUE[offset]
     right[2:-2] = values
-    # Row, first of the B-splines that overlap at the sample there, sample, whether it is at rest, and derivative.
+    # Each entry: row, first B-spline that overlaps the sample, sample, whether it is at rest, and derivative.
     for row, first, sample, still, rate in (
         (0, 0, 0, at_rest[0], _SLOPE),
         (1, 1, 0, at_rest[0], _CURVATURE),
@@ -87,7 +87,7 @@ def _rates(spacing: float, values: Array, at_rest: tuple[bool, bool] = (False, F
 
 
 def quintic_coefficients(spacing: float, values: Array) -> Array:
-    """Return this spline as ascending powers of the time since the start of a segment, (T − 1, m, 6).
+    """Return the quintic spline through samples as ascending powers of the time in each segment, (T − 1, m, 6).
 
     Value, slope and curvature at both ends determine the polynomial of a segment.
     """
@@ -105,7 +105,7 @@ def quintic_coefficients(spacing: float, values: Array) -> Array:
 
 
 def clamped_cubic(knots: ArrayLike, values: Array, times: Array, level: bool = True) -> Array:
-    """Return the C² cubic spline through samples at some times, with zero slope at both ends and constant beyond.
+    """Return values of the C² cubic spline through samples, with zero slope at both ends and constant beyond them.
 
     Parameters
     ----------
@@ -145,8 +145,9 @@ def clamped_cubic(knots: ArrayLike, values: Array, times: Array, level: bool = T
 
 
 def minimum_jerk(t: Array, start: float, duration: float) -> Array:
-    """Return s(x) = 10x³ − 15x⁴ + 6x⁵ with x = (t − start)/duration, 0 before and 1 after: minimum integral of squared
-    jerk.
+    """Return s(x) = 10x³ − 15x⁴ + 6x⁵ with x = (t − start)/duration, 0 before and 1 after the motion.
+
+    Of all motions from rest to rest, this one minimizes the integral of the squared jerk.
     """
     x = np.clip((np.asarray(t) - start) / duration, 0.0, 1.0)
     return x**3 * (10.0 - 15.0 * x + 6.0 * x**2)
@@ -155,7 +156,8 @@ def minimum_jerk(t: Array, start: float, duration: float) -> Array:
 # Kinematics of a base on two driven wheels: wheel angles from its path, and its pose from wheel angles.
 
 
-# Number of nodes of the Gauss–Legendre rule in one piece of a spline: exact to rounding unless it turns by radians.
+# Number of nodes of the Gauss–Legendre rule in one piece of a spline; the result is exact up to rounding unless the
+# base turns by radians within a piece.
 NODES = 8
 
 
@@ -203,7 +205,7 @@ def coordinates(base: MobileBase, start: Array, coefficients: Array, spacing: fl
     knots = rolled(base, start, coefficients, spacing)[:, 0]
     times = np.clip(times, 0.0, count * spacing)
     segment = np.minimum((times / spacing).astype(int), count - 1)
-    # Rounding may put a time into the segment before its own.
+    # Rounding may place a time slightly before the start of its segment.
     within = np.maximum(times - segment * spacing, 0.0)
     angles = np.einsum("swc,sc->sw", coefficients[segment], within[:, None] ** np.arange(6))
     steps = _steps(base, coefficients[segment], np.zeros((len(times), 1)), within)
@@ -211,8 +213,9 @@ def coordinates(base: MobileBase, start: Array, coefficients: Array, spacing: fl
 
 
 def _steps(base: MobileBase, coefficients: Array, begins: Array, lengths: Array) -> Array:
-    """Return displacements from ``begins``, (s, p) [s] within each segment, over ``lengths``, (s,) [s], as (s, p, 2)
-    [m].
+    """Return the displacements, (s, p, 2) [m], over times ``lengths``, (s,) [s], from ``begins``, (s, p) [s].
+
+    ``begins`` are times since the start of each segment.
     """
     nodes, weights = np.polynomial.legendre.leggauss(NODES)
     t = begins[..., None] + 0.5 * lengths[:, None, None] * (1.0 + nodes)

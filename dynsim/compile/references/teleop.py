@@ -1,4 +1,4 @@
-"""Velocity commands for hand and mobile base from an operator: source, script, and options of the references."""
+"""Velocity commands from an operator for the hand and the mobile base: sources, scripts, and reference options."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from dynsim.model.description import Contact
 
 Array = NDArray[np.float64]
 
-# Parts of a velocity: hand along x, y, z [m/s]; base ahead [m/s] and about z [rad/s].
+# Components of a velocity: hand along x, y, z [m/s]; base forward [m/s] and about z [rad/s].
 HAND, BASE = slice(0, 3), slice(3, 5)
 VELOCITIES = 5
 
 
 class VelocitySource(Protocol):
-    """An operator, live or a script."""
+    """Velocity commands of a live operator or a script."""
 
     def read(self, tick: int) -> Array:
         """Return the velocities from a tick to the next, (5,): see ``HAND`` and ``BASE``."""
@@ -42,7 +42,7 @@ class VelocityScript:
     velocity: Array
 
     def read(self, tick: int) -> Array:
-        """Return the velocity in force at ``tick``, shape (5,); zeros before the first entry."""
+        """Return the velocity that applies at ``tick``, shape (5,); zeros before the first entry."""
         k = int(np.searchsorted(self.ticks, tick, side="right")) - 1
         return self.velocity[k] if k >= 0 else np.zeros(VELOCITIES)
 
@@ -66,11 +66,11 @@ class TeleopOptions:
     hand_acceleration : float
         Maximum hand acceleration [m/s²].
     base_acceleration : (float, float)
-        Maximum acceleration of the base ahead and about z [m/s², rad/s²].
+        Maximum acceleration of the base, forward and about z [m/s², rad/s²].
     tolerance : float
         Distance from its target at which the hand counts as there [m].
     script : VelocityScript
-        Velocities of the scenario.
+        Velocities set in the scenario.
     """
 
     rate: float

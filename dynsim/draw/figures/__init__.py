@@ -1,6 +1,6 @@
-"""Figures of one record, or comparisons of several, written to a folder; or single figures.
+"""Figures of one record and comparisons of several records, written to a folder or returned one at a time.
 
-Matplotlib is loaded on the first drawing.
+Matplotlib is loaded when the first figure is drawn.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
 MEASURED, SIMULATED = "dynsim.draw.figures.measured", "dynsim.draw.figures.arm"
 # Modules that draw figures, with the sets of signals that they need. A module has ``draw`` and ``draw_comparison``, and
-# ``figures`` and ``comparisons``, which return a mapping of drawing functions. It draws records that have one of its
-# sets; the first module that matches is used.
+# ``figures`` and ``comparisons``, which return a mapping of drawing functions. A module can draw records that have all
+# signals of one of its sets; the first module that matches is used.
 MODULES: dict[str, tuple[set[str], ...]] = {
     "dynsim.draw.figures.snake": ({"posture"}, {"base_pose", "mode"}, {"w", "w_target"}),
     MEASURED: ({"q_goal"}, {"record_time"}, {"torque_estimate"}),
@@ -78,10 +78,10 @@ def draw_comparison(records: Mapping[str, Record], folder: Path, kind: str = "pn
     Raises
     ------
     RecordError
-        See :func:`draw`; also if the records are of different kinds.
+        In the same cases as for :func:`draw`, and if the records are of different kinds.
     """
     drawn = {name: record for name, record in records.items() if len(record)}
-    # In a comparison, measured runs are drawn like simulated runs, which have the same signals.
+    # In a comparison, measured runs are drawn in the same way as simulated runs, which have the same signals.
     arm = importlib.import_module(SIMULATED)
     modules = {arm if module.__name__ == MEASURED else module for module in map(_module, drawn.values())}
     if not modules:
@@ -94,12 +94,12 @@ def draw_comparison(records: Mapping[str, Record], folder: Path, kind: str = "pn
 
 @names_wrong_types
 def figure(records: Record | Mapping[str, Record], name: str, *, title: bool = True) -> Figure:
-    """Draw one figure of a record, or overlay several, and return the matplotlib Figure.
+    """Draw one figure of a record, or of several overlaid records, and return the matplotlib Figure.
 
     Parameters
     ----------
     records : Record or mapping of str to Record
-        A record, or several records and their names.
+        A record, or a mapping of names to records.
     name : str
         File name without suffix of a figure that ``dynsim plot`` writes: "energy", "compare_energy", …
     title : bool, optional
@@ -113,7 +113,7 @@ def figure(records: Record | Mapping[str, Record], name: str, *, title: bool = T
     Raises
     ------
     RecordError
-        If there is no figure of this name, or the record has no data for it.
+        If no figure has this name, or the record has no data for it.
 
     Examples
     --------
@@ -129,7 +129,7 @@ def figure(records: Record | Mapping[str, Record], name: str, *, title: bool = T
     if several and not records:
         raise RecordError("no records to draw")
     module = _module(next(iter(records.values()))) if isinstance(records, Mapping) else _module(records)
-    # Measured runs are compared with the figures of simulated runs.
+    # Comparisons of measured runs use the figures of simulated runs.
     home = importlib.import_module(SIMULATED) if several and module.__name__ == MEASURED else module
     style = importlib.import_module("dynsim.draw.figures.style")
     with _drawable(), style.look():
@@ -147,7 +147,7 @@ def figure(records: Record | Mapping[str, Record], name: str, *, title: bool = T
 
 @contextmanager
 def _drawable() -> Iterator[None]:
-    """Report errors in the block as errors of the record: records may come from any source and may lack data."""
+    """Convert errors in the block to RecordError, because records may come from any source and may lack data."""
     try:
         yield
     except DynsimError:

@@ -23,12 +23,13 @@ from dynsim.record.poses import point_positions
 from dynsim.record.scene import Point
 
 LOADS, MARGIN, TRACTION = "wheel_load", "tip_margin", "traction_demand"
-# Axis limits: the traction demand is unbounded without load, the tip margin if the ground carries almost no load.
+# Axis limits: the traction demand is unbounded for a wheel without load, and the tip margin is unbounded if the ground
+# carries almost no load.
 TRACTION_TOP, MARGIN_LOW = 2.5, -2.0
-# Colours and widths of left wheel, right wheel and caster; the left line is wider, so that it is visible at equal
-# loads.
+# Colours and line widths for the left wheel, right wheel and caster; the line of the left wheel is wider, so that it
+# remains visible at equal loads.
 LOOKS = ((style.BLUE, 2.0), (style.GREEN, 1.0), (style.ORANGE, 1.2))
-# Tracking: minimum range of the axes of positions and headings [m, °], so that rounding errors are not magnified.
+# Tracking: minimum range of the position and heading axes [m, °], so that rounding errors are not magnified.
 MIN_POSITION_RANGE, MIN_HEADING_RANGE = 1e-3, 0.1
 MILLI = 1e3
 # Values over time, and how they are drawn.
@@ -36,7 +37,7 @@ Curve = tuple[Array, dict[str, Any]]
 
 
 def overturning(record: Record) -> Figure | None:
-    """Draw loads of wheels and caster, tip margin and traction demand over time; None without a mobile base."""
+    """Draw wheel and caster loads, tip margin and traction demand over time; return None without a mobile base."""
     if not {LOADS, MARGIN, TRACTION} <= set(record):
         return None
     figure = style.new_figure(6.2, style.title(record, "loads and stability of the base"))
@@ -67,7 +68,7 @@ def overturning(record: Record) -> Figure | None:
     if np.nanmax(traction, initial=0.0) > TRACTION_TOP:
         note.append(f"traction demand cut off at {TRACTION_TOP:g}: almost no load")
     if bare.any():
-        note.append(f"undefined without load on a wheel: {percent(float(bare.mean()))} of the samples")
+        note.append(f"undefined if a wheel carries no load: {percent(float(bare.mean()))} of the samples")
     last = rows[2][-1]
     last.set_xlabel("\n".join([last.get_xlabel(), *note]))
     contacts.mark_all(rows, record)
@@ -75,7 +76,7 @@ def overturning(record: Record) -> Figure | None:
 
 
 def margin_comparison(records: Mapping[str, Record]) -> Figure | None:
-    """Overlay the tip margins of all variants; None without mobile bases."""
+    """Overlay the tip margins of all variants; return None if no variant has a mobile base."""
     shown = {name: record for name, record in records.items() if MARGIN in record}
     if not shown:
         return None
@@ -99,9 +100,9 @@ def margin_comparison(records: Mapping[str, Record]) -> Figure | None:
 
 
 def tracking(record: Record) -> Figure | None:
-    """Draw reference and actual pose of a mobile base over time, and their difference; None without a reference.
+    """Draw the reference and actual pose of a mobile base and their difference; return None without a reference.
 
-    For a stationary base only the difference is drawn.
+    For a stationary base, only the difference is drawn.
     """
     if not {"base_pose", "base_target"} <= set(record):
         return None
@@ -111,12 +112,12 @@ def tracking(record: Record) -> Figure | None:
     is_stationary = (
         _spread(np.hstack([target[:, :2], pose[:, :2]])) < MIN_POSITION_RANGE and _spread(heading) < MIN_HEADING_RANGE
     )
-    # Rounded to a nanometre, below which a stationary base shows rounding errors.
+    # Round to a nanometre, because smaller differences of a stationary base are rounding errors.
     away, turned = np.round(MILLI * error[:, :2], 6), np.round(180.0 / np.pi * error[:, 2], 6)
     rms = [style.number(_rms(values), 3) for values in (*away.T, turned)]
     curves: dict[str, list[Curve]] = {}
     if not is_stationary:
-        # One is dashed, because x and y may coincide.
+        # One of the lines is dashed, because x and y may coincide.
         x = _pair(target[:, 0], pose[:, 0], "x", style.AXIS_COLOURS["x"], "-")
         curves["position [m]"] = x + _pair(target[:, 1], pose[:, 1], "y", style.AXIS_COLOURS["y"], (0, (5, 4)))
         curves["heading [°]"] = _pair(heading[:, 0], heading[:, 1], "heading", style.BLACK, "-")
@@ -155,7 +156,7 @@ def _spread(values: Array) -> float:
 
 
 def base_error(record: Record) -> Array:
-    """Return actual minus reference pose of a base, (T, 3): ahead and left of the reference [m], heading [rad]."""
+    """Return the pose error (actual minus reference) of a base, (T, 3): forward and to the left [m], heading [rad]."""
     target = record["base_target"]
     error = record["base_pose"] - target
     return np.column_stack([_ahead_and_left(error[:, :2], target[:, 2]), error[:, 2]])
@@ -216,14 +217,14 @@ def _frame_margin(axes: Axes) -> None:
 
 
 def _mark_tipping(axes: Axes, records: Sequence[Record], colours: Sequence[str]) -> None:
-    """Draw lines and triangles at the tipping times within the axes; others would be drawn outside."""
+    """Draw lines and triangles at the tipping times within the axes, because others would be drawn outside."""
     low, high = axes.get_xlim()
     for record, colour in zip(records, colours, strict=True):
         for time in tipping_times(record):
             if not low <= time <= high:
                 continue
             axes.axvline(time, color=colour, linestyle=(0, (4, 2)), linewidth=0.9)
-            # Above the axes, where it is visible even at their edge.
+            # Draw the triangle above the axes, where it is visible even at their edge.
             top = axes.get_xaxis_transform()
             axes.plot(time, 1.0, "v", color=colour, markersize=4, transform=top, clip_on=False, zorder=5)
 
@@ -232,13 +233,14 @@ def _rms(values: Array) -> float:
     return float(np.sqrt(np.nanmean(values**2)))
 
 
-# View from above: path, arm, elbows and hand, supports, and centre of pressure in the frame of the base.
+# View from above: path, arm, elbows, hand and supports; and centre of pressure in the frame of the base.
 Rows = NDArray[np.intp]
 
 # Height of the base-frame panel if it is placed below the world panel [inch].
 BELOW = 2.9
 
-# Maximum number of support triangles, evenly spaced along the path, and their minimum distance relative to their size.
+# Maximum number of support triangles, evenly spaced along the path, and minimum distance between them, relative to
+# their size.
 TRIANGLES, APART = 6, 0.25
 ELBOW_COLOURS = (style.ORANGE, style.GREEN, "#8C6D31")
 ARM_ABOVE = "#A8A8A8"
@@ -246,7 +248,7 @@ TRIANGLE, INSIDE, OUTSIDE = style.SKY, style.PURPLE, style.PULLING
 
 
 def top_view(record: Record) -> Figure | None:
-    """Draw the run from above in the world, and the centre of pressure in the base frame; None without a base."""
+    """Draw the run from above in the world, and the centre of pressure in the base frame; return None if no base."""
     body, _ = skeleton(record)
     if len(body.scene.supports) != 3 or not {"base_pose", "center_of_pressure"} <= set(record):
         return None
@@ -256,7 +258,7 @@ def top_view(record: Record) -> Figure | None:
     low, high = _extent(body, rows)
     size = high - low
     wide = size[0] > 1.8 * size[1]
-    # In a separate row, the height of the world panel follows from its width, with 0.6 inch for labels.
+    # If the world panel has a separate row, its height follows from its width, with 0.6 inch for labels.
     above = 0.6 + 6.3 * float(size[1] / size[0])
     height = 0.8 + above + BELOW if wide else 0.9 + float(np.clip(3.9 * size[1] / size[0], 3.3, 6.0))
     figure = style.new_figure(height, style.title(record, "base from above"))
@@ -285,7 +287,7 @@ def pressure_in_base(record: Record) -> Array:
 
 
 def _extent(body: Skeleton, rows: Rows) -> tuple[Array, Array]:
-    """Return the corners of the world panel [m]; a distant centre of pressure may be outside."""
+    """Return the corners of the world panel [m]; a distant centre of pressure may be outside the panel."""
     record = body.record
     points = [record["hand_position"][:, :2]] if "hand_position" in record else []
     if (target := hand_target(record)) is not None:
@@ -348,7 +350,7 @@ def _draw_base_frame(axes: Axes, body: Skeleton, rows: Rows) -> None:
     middle = corners.mean(axis=0)
     for point, corner in zip(body.scene.supports, corners, strict=True):
         axes.plot(*corner, "o", color=ARM_COLOUR, markersize=3, zorder=6)
-        # Towards the middle, where there is space.
+        # Place the label towards the middle, where there is space.
         away = 16.0 * (middle - corner) / np.linalg.norm(middle - corner)
         axes.annotate(
             point.name,
@@ -378,7 +380,7 @@ def _draw_base_frame(axes: Axes, body: Skeleton, rows: Rows) -> None:
 
 
 def _draw_pressure(axes: Axes, body: Skeleton, path: Array) -> None:
-    """Draw the centre of pressure, (T, 2) in the axes; colours differ inside and outside the support triangle."""
+    """Draw the path of the centre of pressure, (T, 2), in different colours inside and outside the support triangle."""
     corners = np.array([point.position[:2] for point in body.scene.supports])
     at, outside = pressure_pieces(pressure_in_base(body.record), corners)
     points = np.stack([np.interp(at, np.arange(len(path)), column) for column in path.T], axis=1)
@@ -408,7 +410,7 @@ def pressure_pieces(path: Array, corners: Array) -> tuple[Array, NDArray[np.bool
     path, side = path[kept], np.roll(corners, -1, axis=0) - corners
     normal = np.stack([-side[:, 1], side[:, 0]], axis=1)
     normal *= np.sign((normal * (corners.mean(axis=0) - corners)).sum(axis=1))[:, None]
-    # Distances from the sides times their lengths, positive inside; linear along each piece.
+    # Distances from the sides times the lengths of the sides; they are positive inside and linear along each piece.
     distance = ((path[:, None] - corners) * normal).sum(axis=2)
     a, b = distance[:-1], distance[1:]
     row, crossed = np.nonzero(a * b < 0.0)
@@ -420,7 +422,7 @@ def pressure_pieces(path: Array, corners: Array) -> tuple[Array, NDArray[np.bool
 
 
 def _rows_along_path(pose: Array, rows: Rows, apart: float) -> list[int]:
-    """Return rows between which the base travels at least ``apart`` [m], including the first and the last."""
+    """Return rows between which the base travels at least ``apart`` [m], including the first and last rows."""
     distance = np.append(0.0, np.cumsum(np.hypot(*np.diff(pose[rows, :2], axis=0).T)))
     count = int(np.clip(distance[-1] / max(apart, 1e-9), 1, TRIANGLES - 1)) + 1
     return [

@@ -1,6 +1,6 @@
 """Figure of the normal contact forces over time, and marks of contact events on time axes.
 
-Under the bilateral law a force may have either sign; the region below zero is shaded. Under the unilateral law bands
+Under the bilateral law, a force may have either sign; the region below zero is shaded. Under the unilateral law, bands
 show the mode of each contact: open, sliding or sticking.
 """
 
@@ -21,8 +21,8 @@ from dynsim.record import Record
 from dynsim.record.content import Event
 from dynsim.record.measures import percent
 
-# Kinds of events that are marked: marker in matplotlib, the same marker as a character, and its meaning. Other kinds
-# have separate figures.
+# Kinds of events that are marked: matplotlib marker, the same marker as a character, and its meaning. Other kinds of
+# events have separate figures.
 MARKS: dict[str, tuple[str, str, str]] = {
     "landing": ("v", "▼", "landing"),
     "lift_off": ("^", "▲", "lift-off"),
@@ -43,15 +43,15 @@ WIDEST = 50
 
 
 def marked(record: Record, names: Iterable[str] | None = None) -> list[Event]:
-    """Return the marked events, of all or of the named contacts and joints."""
+    """Return the events to mark, for all contacts and joints or only for the named ones."""
     chosen = None if names is None else set(names)
     return [event for event in record.events if event.kind in MARKS and (chosen is None or event.name in chosen)]
 
 
 def mark(axes: Axes, events: Sequence[Event], colour: str = COLOUR, *, row: int = 0, lines: bool = True) -> None:
-    """Mark the events within the axes by a faint line and a marker, in rows counted down from the upper edge.
+    """Mark the events within the axes by a faint line and a marker in a row, counted down from the upper edge.
 
-    Negative rows are above the edge.
+    Rows with negative numbers are above the edge.
     """
     low, high = axes.get_xlim()
     inside = [event for event in events if low <= event.time <= high]
@@ -96,13 +96,13 @@ def mark_variants(
         for axes in panels:
             for row, (name, events) in enumerate(having.items()):
                 mark(axes, events, styles[name]["color"], row=-1 - row, lines=len(everything) <= LINES)
-            # An empty title reserves the space.
+            # A blank title reserves the space for the marks.
             axes.set_title(" ", fontsize=1.0, y=1.0, pad=MARK_ROW * len(having))
     explain(rows[-1][-1], everything)
 
 
 def explain(axes: Axes, events: Sequence[Event]) -> None:
-    """Add a legend of the marks below the label of the time axis, with the number of events."""
+    """Add a legend of the marks, with the number of events, below the label of the time axis."""
     count = Counter(event.kind for event in events)
     lines = [axes.get_xlabel()]
     for part in (f"{sign} {text} ({count[kind]})" for kind, (_, sign, text) in MARKS.items() if count[kind]):
@@ -129,17 +129,17 @@ MODES = (
 
 
 def forces(record: Record) -> Figure | None:
-    """Draw the normal force of each contact; None without contacts, or if none ever touched."""
+    """Draw the normal force of each contact; return None without contacts, or if no contact ever touched."""
     return _forces({"": record}, style.title(record, "normal contact forces"))
 
 
 def forces_comparison(records: Mapping[str, Record]) -> Figure | None:
-    """Draw the normal force of each contact, with all variants that have the contact overlaid."""
+    """Draw the normal force of each contact; variants that have the same contact are overlaid."""
     return _forces(records, style.comparison_title(list(records.values()), "normal contact forces"))
 
 
 def _forces(records: Mapping[str, Record], title: str) -> Figure | None:
-    """Draw rows of forces; for a single run (named ""), with contact modes or the time in which the surface pulls."""
+    """Draw rows of forces; for a single run (named ""), also contact modes, or the time during which surfaces pull."""
     runs, alone = list(records.values()), "" in records
     # Under the unilateral law most candidates never touch.
     names = [name for name in contact_names(runs) if any(_touched(record, name) for record in runs)]
@@ -149,7 +149,7 @@ def _forces(records: Mapping[str, Record], title: str) -> Figure | None:
     kind = "highest" if any(map(is_unilateral, runs)) else "lowest"
     note = "" if len(chosen) == len(names) else f", {len(chosen)} of {len(names)} contacts ({kind} forces)"
     having = {name: {v: r for v, r in records.items() if _touched(r, name)} for name in chosen}
-    # A legend has one entry per variant and one for the shading.
+    # The legend of a row has one entry per variant and one for the shading.
     more = sum(-(-(len(having[name]) + 1) // 2) - 1 for name in chosen) * style.LEGEND_ROW / 72.0
     figure = style.new_figure(1.0 + ROW * len(chosen) + more, title + note)
     series = [[values for r in having[name].values() for values in _series(r, name)] for name in chosen]
@@ -214,7 +214,7 @@ def _within(record: Record, name: str) -> str:
 def _extremes(record: Record, name: str) -> Array:
     """Return the minimum and maximum force over all integration steps [N], or an empty array if unknown.
 
-    They include peaks between samples.
+    These values include peaks between samples.
     """
     contact = _summary(record, name)
     if not contact:
@@ -235,7 +235,7 @@ def _series(record: Record, name: str) -> list[style.Series]:
 
 
 def _draw_samples(axes: Axes, record: Record, name: str, colour: str) -> None:
-    """Draw a dot at each sample of the transient if the samples are few enough to be distinguished."""
+    """Draw a dot at each sample of the transient, if there are few enough samples to distinguish them."""
     inside = record.time <= axes.get_xlim()[1]
     if inside.sum() <= DOTS:
         axes.plot(record.time[inside], _force(record, name)[inside], ".", color=colour, markersize=2.5)
@@ -260,7 +260,7 @@ def _force(record: Record, name: str) -> Array:
 
 
 def _most_interesting(names: list[str], records: Sequence[Record]) -> list[str]:
-    """Return all contacts, or the ``ROWS`` with the lowest (unilateral law: highest) forces, in their order."""
+    """Return all contacts, or the ``ROWS`` contacts with the lowest forces (unilateral law: highest), in order."""
     if len(names) <= ROWS:
         return names
     unilateral = any(map(is_unilateral, records))
@@ -276,7 +276,7 @@ def _most_interesting(names: list[str], records: Sequence[Record]) -> list[str]:
 
 
 def mode_bands(record: Record, name: str) -> list[tuple[float, float, int]]:
-    """Return begin, end [s] and mode of each interval in one mode, bounded by events of the contact, if any."""
+    """Return the begin, end [s] and mode of each interval in one mode, bounded by events of the contact, if any."""
     mode = np.rint(record[MODE][:, record.labels[MODE].index(name)]).astype(int)
     changes = [event.time for event in marked(record, [name])]
     time, bands, since = record.time, [], float(record.time[0])

@@ -31,13 +31,13 @@ TERMS = {
     "energy_potential": ("Δ potential energy", "#CC79A7"),
     "energy_magnetic": ("Δ magnetic energy", "#7F7F7F"),
 }
-# Largest ratio of final values that is drawn with a linear axis.
+# Largest ratio of final values for which a linear axis is used.
 LOG_RATIO = 8.0
-# Fraction of the turnover above which one term hides the others, which then get a separate panel.
+# Fraction of the energy turnover above which one term hides the others, which then get a separate panel.
 DOMINANT = 0.8
-# Smaller fractions of the largest term are rounding errors.
+# Terms below this fraction of the largest term are rounding errors.
 NOTHING = 1e-9
-# Net and drawn energy are one curve if they differ by no more than this fraction of the maximum.
+# Net and drawn energy are shown as one curve if they differ by no more than this fraction of the maximum.
 DIFFER = 0.01
 # A residual below this fraction of its limit is only printed, not drawn.
 SMALL_RESIDUAL = 0.1
@@ -49,7 +49,7 @@ def has_motors(record: Record) -> bool:
 
 
 def energy(record: Record) -> Figure | None:
-    """Draw net electrical energy, drawn energy if it differs, and mechanical work; None without motors."""
+    """Draw net electrical energy, drawn energy if it differs, and mechanical work; return None without motors."""
     if not has_motors(record):
         return None
     figure = style.new_figure(4.2, style.title(record, "electrical energy and mechanical work"))
@@ -74,7 +74,7 @@ def energy(record: Record) -> Figure | None:
 
 
 def energy_comparison(records: Mapping[str, Record]) -> Figure | None:
-    """Draw electrical energy over time and in total, and mechanical work, of all variants."""
+    """Draw the electrical energy of all variants over time and in total, and their mechanical work."""
     shown = {name: record for name, record in records.items() if has_motors(record)}
     if not shown:
         return None
@@ -94,7 +94,7 @@ def energy_comparison(records: Mapping[str, Record]) -> Figure | None:
         style.line(work, record.time, record["work_mechanical"], **styles[name])
     if logarithmic:
         style.log_axis(over_time)
-        # The first milliseconds would extend the axis by many almost empty decades.
+        # Values in the first milliseconds would extend the axis by many almost empty decades.
         over_time.set_ylim(least, 1.6 * finals.max())
     over_time.set_ylabel("electrical energy [J]")
     over_time.tick_params(labelbottom=False)
@@ -108,7 +108,7 @@ def energy_comparison(records: Mapping[str, Record]) -> Figure | None:
 
 
 def ledger(record: Record) -> Figure | None:
-    """Draw the stacked terms of the energy ledger and its residual; None without a ledger.
+    """Draw the stacked terms of the energy ledger and its residual; return None without a ledger.
 
     If Joule heat would hide the other terms, the main panel omits it, and a small panel shows all terms.
     """
@@ -204,14 +204,14 @@ def _residual(axes: Axes, record: Record, turnover: float) -> None:
 
 
 def _totals(axes: Axes, names: Sequence[str], values: Array, colours: Sequence[str], logarithmic: bool) -> None:
-    """Draw totals as bars, or as dots on a logarithmic axis, which has no zero.
+    """Draw totals as bars, or as dots on a logarithmic axis, on which bars would have no origin.
 
     Dots are labelled with their ratio to the largest total.
     """
     places, largest = np.arange(len(names)), float(values.max())
     if logarithmic:
         axes.scatter(places, values, s=60, c=colours, zorder=3)
-        # Space for the numbers on a logarithmic axis.
+        # Leave space for the numbers on a logarithmic axis.
         axes.set_ylim(0.6 * float(values.min()), 2.0 * largest)
         style.log_axis(axes)
         axes.margins(x=0.2)
@@ -229,23 +229,23 @@ def _totals(axes: Axes, names: Sequence[str], values: Array, colours: Sequence[s
 
 
 def _joules(values: Array, largest: float = 0.0) -> str:
-    """Format the last value; 0 if it is only rounding error of the largest value of the ledger."""
+    """Format the last value in joules; as 0 if it is only a rounding error of the ledger's largest value."""
     last = float(values[-1])
     return f"{style.number(0.0 if abs(last) < NOTHING * largest else last)} J"
 
 
-# Motor currents and voltages. Only the motors with the largest currents have separate lines, at most this number; if
-# there are more motors, the envelope of all is drawn too.
+# Motor currents and voltages. Maximum number of motors with separate lines, selected by their currents; if there are
+# more motors, the envelope of all motors is drawn too.
 LARGEST = 6
 
 
 def motors(record: Record) -> Figure | None:
-    """Draw motor currents and terminal voltages; None without motors."""
+    """Draw motor currents and terminal voltages; return None without motors."""
     if "current" not in record or record["current"].shape[1] == 0:
         return None
     signals = (("current", "current [A]"), ("voltage", "voltage [V]"))
     count = record["current"].shape[1]
-    # Selected by the current after the start, when all motors are active; the same motors in both panels.
+    # Select the motors by their current after the start, when all are active; both panels show the same motors.
     settled = record.time >= record.settle_time
     late = settled if settled.any() else slice(None)
     effort = np.sqrt((record["current"][late] ** 2).mean(axis=0))
@@ -279,11 +279,11 @@ def _draw(axes: Axes, record: Record, name: str, shown: np.ndarray, looks: Mappi
 # Hand and target: paths in three planes, and tracking error over time ([WM] Figs 4–6).
 PLANES = ((0, 1), (0, 2), (1, 2))
 MILLI = 1e3
-# A target that moves less than this is fixed [m].
+# A target that moves by less than this counts as fixed [m].
 HELD = 1e-6
-# Legend entries: target from the path of the hand, and from the goals of the joints.
+# Legend entries for targets that follow from a hand path, and from the goals of the joints.
 TARGET, GOALS = "target", "goals"
-# Mark of the start position of the hand, the same for all variants.
+# Marker for the start position of the hand, which is the same for all variants.
 START: dict[str, Any] = {
     "linestyle": "none",
     "marker": "o",
@@ -295,7 +295,7 @@ START: dict[str, Any] = {
 
 
 def path(record: Record) -> Figure | None:
-    """Draw hand path and target in xy, xz and yz at one scale; None without a hand."""
+    """Draw the hand path and its target in xy, xz and yz at one scale; return None without a hand."""
     return _paths({"hand": record}, style.title(record, "hand path"))
 
 
@@ -308,7 +308,7 @@ def _paths(records: Mapping[str, Record], title: str) -> Figure | None:
     shown = {name: record for name, record in records.items() if "hand_position" in record}
     if not shown:
         return None
-    # Three square panels and the legend, without extra space.
+    # The height fits three square panels and the legend, without extra space.
     figure = style.new_figure(2.62 + style.LEGEND_ROW * -(-(3 + len(shown)) // 4) / 72.0, title)
     panels = _planes(figure, list(shown.values()))
     styles = style.variant_styles(list(records))
@@ -323,7 +323,7 @@ def _paths(records: Mapping[str, Record], title: str) -> Figure | None:
 
 
 def error(record: Record) -> Figure | None:
-    """Draw the tracking error over time, components and norm; None without a target."""
+    """Draw the components and the norm of the tracking error over time; return None without a target."""
     target = hand_target(record)
     if target is None:
         return None
@@ -379,7 +379,7 @@ def error_comparison(records: Mapping[str, Record]) -> Figure | None:
 
 
 def _log_rows(panels: Sequence[Axes], settled: Array) -> None:
-    """Make the axes logarithmic; those of the whole run show the settled range if there is a transient panel."""
+    """Make the axes logarithmic; axes of the whole run show only the settled range if there is a transient panel."""
     for axes in panels:
         axes.autoscale(axis="y")
         style.log_axis(axes)
@@ -389,7 +389,7 @@ def _log_rows(panels: Sequence[Axes], settled: Array) -> None:
 
 
 def _planes(figure: Figure, records: list[Record]) -> list[Axes]:
-    """Create three square panels of one scale that contain all hands and targets."""
+    """Create three square panels with one scale that contain all hand paths and targets."""
     points = [record["hand_position"] for record in records]
     points += [target for record in records if (target := hand_target(record)) is not None]
     low, high = box_about(points)
@@ -398,12 +398,12 @@ def _planes(figure: Figure, records: list[Record]) -> list[Axes]:
     middle = 0.5 * (low + high)
     panels = list(figure.subplots(1, 3))
     for axes, (i, j) in zip(panels, PLANES, strict=True):
-        axes.set_aspect("equal", anchor="N")  # unused space is above the legend
+        axes.set_aspect("equal", anchor="N")  # put unused space above the legend
         axes.set_xlim(middle[i] - half, middle[i] + half)
         axes.set_ylim(middle[j] - half, middle[j] + half)
         axes.set_xlabel(f"{'xyz'[i]} [m]")
         axes.set_ylabel(f"{'xyz'[j]} [m]")
-        # Fewer ticks along x, where labels such as "−0.050" are wide.
+        # Use fewer ticks along x, because labels such as "−0.050" are wide.
         axes.locator_params(axis="x", nbins=4)
         axes.locator_params(axis="y", nbins=5)
     return panels
@@ -416,7 +416,7 @@ def _draw_target(axes: Axes, record: Record, plane: tuple[int, int]) -> None:
     target = wanted[:, plane]
     known = wanted[np.isfinite(wanted).all(axis=1)]
     if len(known) and float(np.ptp(known, axis=0).max()) <= HELD:
-        # Larger than the mark of the hand start, which may coincide with it.
+        # This marker is larger than the one at the start of the hand, with which it may coincide.
         axes.plot(*target[0], "x", label=target_name(record), color=style.BLACK, markersize=8, zorder=3)
         return
     axes.plot(*edge_on(target).T, label=target_name(record), color=style.BLACK, linestyle=(0, (4, 2)), zorder=3, lw=0.9)
@@ -424,14 +424,14 @@ def _draw_target(axes: Axes, record: Record, plane: tuple[int, int]) -> None:
 
 
 def target_name(record: Record) -> str:
-    """Return the legend entry of :func:`dynsim.record.measures.hand_target`."""
+    """Return the legend entry for the target from :func:`dynsim.record.measures.hand_target`."""
     return TARGET if "target_position" in record else GOALS
 
 
 def edge_on(points: Array) -> Array:
-    """Return a plane curve, (T, 2), or, if it is straight, only its end points.
+    """Return a plane curve, (T, 2), unchanged or, if it is straight, only its end points.
 
-    A line drawn back and forth would fill the gaps between its dashes.
+    A dashed line that is drawn back and forth would fill the gaps between its dashes.
     """
     points = style.sparse(points)
     if len(points) < 3 or not np.isfinite(points).all():
@@ -448,7 +448,7 @@ def _legend_below(figure: Figure, axes: Axes) -> None:
     followed = {line.get_label() for line in axes.get_lines() if line.get_linestyle() != "None"}
     axes.plot([], [], label="start of the hand", **START)
     for target in (TARGET, GOALS):
-        # A fixed target is a mark itself.
+        # A fixed target is itself drawn as a marker.
         if target in followed:
             axes.plot([], [], "x", color=style.BLACK, markersize=5, label=f"start of the {target}")
     style.legend_below(figure, [axes], 4)

@@ -1,4 +1,4 @@
-"""Figures of a measured run: joints and goals, servos, hand path and posture; and errors against a simulated run."""
+"""Figures of a measured run: joints and goals, servos, hand path, posture, and errors relative to a simulated run."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def draw(record: Record, folder: Path, kind: str = "png") -> list[Path]:
 
 
 def joints(record: Record) -> Figure | None:
-    """Draw every joint with its goal over time; None without recorded goals."""
+    """Draw every joint with its goal over time; return None without recorded goals."""
     followed = _followed(record)
     if not followed:
         return None
@@ -52,7 +52,7 @@ def joints(record: Record) -> Figure | None:
 
 
 def following_error(record: Record) -> Figure | None:
-    """Draw the following error (measured minus goal) of every joint over time and its size; None without goals."""
+    """Draw the following error (measured minus goal) of every joint and its magnitude; return None without goals."""
     followed = _followed(record)
     if not followed:
         return None
@@ -76,7 +76,7 @@ def following_error(record: Record) -> Figure | None:
     rms = [_finite(lambda e: np.sqrt(np.nanmean(e**2)), error) for error in errors]
     largest.bar(places, rms, color=style.BLUE, width=0.4, label="rms")
     largest.set_xticks(places, [label for label, *_ in shown], rotation=30 if len(shown) > 6 else 0, ha="center")
-    largest.set_ylabel(f"size in the replay{one_unit}")
+    largest.set_ylabel(f"magnitude in the replay{one_unit}")
     largest.margins(x=0.02)
     largest.grid(axis="x", visible=False)
     style.legend_above(largest)
@@ -85,7 +85,7 @@ def following_error(record: Record) -> Figure | None:
 
 
 def servos(record: Record) -> Figure | None:
-    """Draw measurements of the servos and the timing of the cycles; None without measurements."""
+    """Draw the measurements of the servos and the timing of the cycles; return None without measurements."""
     rows = [
         (name, label)
         for name, label in (
@@ -98,7 +98,7 @@ def servos(record: Record) -> Figure | None:
     ]
     if not rows:
         return None
-    # The same joints in every row, selected by the largest values in the first row.
+    # Every row shows the same joints, selected by the largest values in the first row.
     first, names = record[rows[0][0]], record.labels[rows[0][0]]
     size = [_finite(np.nanmax, np.abs(column)) for column in first.T]
     shown = [names[k] for k in np.sort(np.argsort(size)[::-1][:LINES])]
@@ -141,7 +141,10 @@ Followed = tuple[str, str, Array, Array]
 
 
 def _followed(record: Record) -> list[Followed]:
-    """Return label, unit, measurement and goal of all quantities with goals: positions, or rates without a position."""
+    """Return the label, unit, measurement and goal of all quantities with goals.
+
+    These are positions, or rates if no position is recorded with a goal.
+    """
     followed: dict[str, Followed] = {}
     own = [name for name, signal in record.signals.items() if signal.axis == TIME and signal.data.ndim == 2]
     names = [name for name in own if f"{name}_goal" in own and name != "hand_position"]
@@ -154,7 +157,7 @@ def _followed(record: Record) -> list[Followed]:
 
 
 def _largest(followed: Sequence[Followed], count: int) -> list[Followed]:
-    """Return all entries, or the ``count`` entries with the largest error, in their order."""
+    """Return all entries, or the ``count`` entries with the largest errors, in the original order."""
     errors = [_finite(np.nanmax, np.abs(measured - goal)) for _, _, measured, goal in followed]
     kept = np.sort(np.argsort(errors)[::-1][:count])
     return [followed[k] for k in kept]
@@ -173,7 +176,7 @@ def _mark_replay(axes: Axes, record: Record, *, named: bool = False) -> None:
             continue
         colour = style.PULLING if event.kind == "fault" else style.GREY
         axes.axvline(event.time, color=colour, linestyle=":", linewidth=0.8, zorder=1)
-        # The first states may follow each other within milliseconds.
+        # Label only some changes, because the first states may follow each other within milliseconds.
         if named and (event.kind == "fault" or event.name == "REPLAY"):
             axes.annotate(
                 event.name.lower(),
@@ -207,12 +210,12 @@ FIGURES: dict[str, Callable[[Record], Figure | None]] = {
 }
 
 
-# Errors between measured and simulated runs, for `dynsim hw compare`.
+# Errors between measured and simulated runs, drawn for `dynsim hw compare`.
 
 # Number of joints drawn in colour by default, selected by the largest rms errors.
 HIGHLIGHTED = 4
 FAINT: dict[str, Any] = {"color": "#CFCFCF", "linewidth": 0.7}
-# On top and dashed, so that both are visible if they agree.
+# Simulated values are drawn on top and dashed, so that both curves are visible if they agree.
 SIMULATED: dict[str, Any] = {"color": style.BLACK, "linewidth": 0.9, "linestyle": (0, (4, 3))}
 
 
@@ -260,8 +263,8 @@ def draw_errors(title: str, time: Array, quantities: Sequence[Compared], named: 
     quantities : sequence of Compared
         Quantities to draw.
     named : sequence of str
-        Joints to draw in colour; for a quantity without a named joint, the ``HIGHLIGHTED`` joints with the largest
-        error.
+        Joints to draw in colour; if a quantity has no named joint, the ``HIGHLIGHTED`` joints with the largest errors
+        are drawn in colour.
     path : Path
         File to write.
 

@@ -1,4 +1,4 @@
-"""Figures of a brace plan: posture with forces along the path, heat by brace set, map of single braces, robustness."""
+"""Figures of a brace plan: posture and forces along the path, heat by brace set, single braces, and robustness."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from dynsim.draw.figures.style import BLUE, GREEN, GREY, ORANGE, PULLING, Array,
 
 # Maximum length of the arrow of the largest force, relative to the height of the view.
 ARROW = 0.35
-# An arm that leaves its plane by less than this fraction of its length is not drawn from above.
+# An arm that leaves its vertical plane by less than this fraction of its length is not drawn from above.
 FLAT = 0.02
-# Values with a larger ratio are drawn on a logarithmic axis.
+# Values whose ratio exceeds this are drawn on a logarithmic axis.
 WIDE = 20.0
 # Margin on each side of the arm in the view from above [m].
 MARGIN = 0.1
@@ -27,7 +27,7 @@ MARGIN = 0.1
 
 @dataclass(frozen=True)
 class Pose:
-    """Arm at one time; coordinates are along its heading, to its left, and up [m].
+    """Posture of the arm at one time; coordinates are along its heading, to its left, and up [m].
 
     Attributes
     ----------
@@ -62,13 +62,14 @@ class PlanPicture:
     ground : tuple of ndarray
         Distance from the nearest surface on a grid: along, up, and (up, along) [m].
     sets : mapping of int to sequence
-        Label and heat [W] of brace sets, by number of braces; the first set of each number is the answer.
+        Labels and heat [W] of brace sets, by number of braces; the first set for each number is the planner's answer.
     survives : mapping of int to bool or None
         Whether each answer survives verification.
     singles : mapping of str to float
         Heat of single braces by candidate [W].
     corners : mapping of int to tuple
-        For each answer, by number of braces: planned heat [W]; labels, heat [W] and hand error [mm] of the corners.
+        For each answer, by number of braces: planned heat [W]; labels, heat [W] and hand error [mm] for each corner
+        case.
     """
 
     title: str
@@ -83,7 +84,7 @@ class PlanPicture:
 
 
 def posture(picture: PlanPicture) -> Figure | None:
-    """Draw the best plan at several times with brace forces, also from above if it leaves its plane."""
+    """Draw the best plan at several times with brace forces, and also from above if the arm leaves its plane."""
     if not picture.poses:
         return None
     along, up, gap = picture.ground
@@ -97,7 +98,7 @@ def posture(picture: PlanPicture) -> Figure | None:
     side = views[0]
     side.contourf(along, up, gap, levels=[-1e9, 0.0], colors=["#D9D9D9"])
     side.contour(along, up, gap, levels=[0.0], colors=[GREY], linewidths=0.8)
-    # Most arrows come from below the braces, and must stay within the view.
+    # Most arrows start below the braces and must stay within the view.
     lowest = min(pose.points[:, 2].min(initial=up[-1]) for pose in picture.poses)
     length = min(ARROW * float(np.ptp(up)), float(lowest - up[0]))
     largest = max(float(np.linalg.norm(pose.forces, axis=1).max(initial=0.0)) for pose in picture.poses)
@@ -116,7 +117,7 @@ def posture(picture: PlanPicture) -> Figure | None:
 
 
 def _draw_poses(axes: Axes, picture: PlanPicture, seen: list[int], largest: float, length: float) -> None:
-    """Draw links, forces, and the numbers of braces at their points in the last pose; names are in the legend."""
+    """Draw links and forces, and number the braces in the last pose; the legend contains their names."""
     for k, pose in enumerate(picture.poses):
         shade = 0.25 + 0.75 * (k + 1) / len(picture.poses)
         for line in pose.lines:
@@ -146,7 +147,7 @@ def _draw_poses(axes: Axes, picture: PlanPicture, seen: list[int], largest: floa
 
 
 def heat_by_set(picture: PlanPicture) -> Figure | None:
-    """Draw the planned heat of the best sets of each size, and the simulated heat of the answers (filled)."""
+    """Draw the planned heat of the best brace sets of each size; answers are filled and show their simulated heat."""
     rows = [(count, label, heat, k) for count, sets in picture.sets.items() for k, (label, heat) in enumerate(sets)]
     if not rows:
         return None
@@ -163,7 +164,7 @@ def heat_by_set(picture: PlanPicture) -> Figure | None:
 
 
 def single_braces(picture: PlanPicture) -> Figure | None:
-    """Draw the minimum heat of an arm with one brace, by braced point, in the middle of the path without slip."""
+    """Draw the minimum heat with one brace for each braced point, in the middle of the path and without slip."""
     if not picture.singles:
         return None
     heats = list(picture.singles.values())
@@ -184,7 +185,7 @@ def _dots(
 ) -> Figure:
     """Draw a row with a dot and its text for each value.
 
-    Bars would have no natural start on the logarithmic axis that a wide range needs.
+    Bars would have no natural origin on the logarithmic axis that a wide range requires.
     """
     figure = style.new_figure(1.1 + 0.26 * len(values), title)
     axes = figure.subplots()
@@ -193,7 +194,7 @@ def _dots(
     middle = np.sqrt(low * high) if wide else 0.5 * high
     for y, (value, text, mark) in enumerate(zip(values, texts, marks, strict=True)):
         axes.plot(value, y, color=BLUE, markersize=6.0, linestyle="none", clip_on=False, zorder=3, **mark)
-        # Towards the middle, where there is space.
+        # Place the text towards the middle, where there is space.
         offset, side = (7.0, "left") if value <= middle else (-7.0, "right")
         axes.annotate(
             text, (value, y), xytext=(offset, 0.0), textcoords="offset points", ha=side, va="center", fontsize=7.0
@@ -210,11 +211,11 @@ def _dots(
 
 
 def robustness(picture: PlanPicture) -> Figure | None:
-    """Draw heat relative to the plan, and hand error, of the answers in scenes that differ from the plan."""
+    """Draw the heat (relative to the plan) and hand error of the answers in scenes that differ from the plan."""
     shown = {count: corners for count, corners in picture.corners.items() if len(corners[1]) > 1}
     if not shown:
         return None
-    figure = style.new_figure(4.2, f"{picture.title}: plans with errors of the scene")
+    figure = style.new_figure(4.2, f"{picture.title}: plans in scenes with errors")
     upper, lower = figure.subplots(2, 1, sharex=True)
     labels = [label for label, _, _ in next(iter(shown.values()))[1]]
     width = 0.8 / len(shown)
@@ -225,7 +226,7 @@ def robustness(picture: PlanPicture) -> Figure | None:
         upper.bar(at, [heat / planned for _, heat, _ in corners], width, color=colour, label=label)
         lower.bar(at, [error for _, _, error in corners], width, color=colour)
     upper.axhline(1.0, color="black", linewidth=0.6)
-    upper.set_ylabel("heat over planned")
+    upper.set_ylabel("heat / planned heat")
     lower.set_ylabel("hand error, rms [mm]")
     lower.set_xticks(range(len(labels)), labels, rotation=25.0, ha="right", fontsize=6.5)
     style.legend_above(upper, columns=len(shown))

@@ -1,4 +1,4 @@
-"""Figures of the posture of an arm: 3D view and side view with elbows, surfaces, target and hand path; comparison."""
+"""Figures of an arm's posture: 3D and side views with elbows, surfaces, target and hand path; comparisons."""
 
 from __future__ import annotations
 
@@ -26,27 +26,27 @@ from dynsim.record.measures import hand_target
 from dynsim.record.poses import POSITION, contact_positions, point_positions
 from dynsim.record.scene import WORLD, Point, Scene, SceneSurface
 
-# Number of postures that are drawn faintly, evenly spaced in time, in addition to the last one.
+# Number of postures, evenly spaced in time, that are drawn faintly in addition to the last one.
 FAINT = 6
 # Labels of contacts: font size, and height of two lines [point].
 LABEL_SIZE, LABEL_HEIGHT = 7.0, 19.0
 # Distance from the centre of a contact mark to its label [point].
 NEAR_CONTACT = 7.0
-# Smaller extents count as zero, because body poses are in single precision [m].
+# Extents below this [m] count as zero, because body poses are stored in single precision.
 NOTHING = 1e-6
 
 
 @dataclass(frozen=True)
 class Skeleton:
-    """Robot with the poses of its bodies over time."""
+    """Robot of a record with the poses of its bodies over time."""
 
     record: Record
     scene: Scene
 
     def segments(self, row: int) -> Array:
-        """Return lines from each parent to its body, and from the body of the hand to the hand, (m, 2, 3) [m].
+        """Return lines from each parent to its child body, and from the hand's body to the hand, (m, 2, 3) [m].
 
-        There is no line to a body that moves freely relative to its parent or the world.
+        No line leads to a body that moves freely relative to its parent or the world.
         """
         points, base = self.record[POSITION][row].astype(np.float64), self.scene.base
         lines = []
@@ -73,11 +73,11 @@ class Skeleton:
         return [[corners for corners, _ in self.solids(k)] for k in self.rows_shown()]
 
     def postures(self) -> list[Array]:
-        """Return the segments at the shown samples, the last sample last."""
+        """Return the segments at the samples of :meth:`rows_shown`; the last sample comes last."""
         return [self.segments(k) for k in self.rows_shown()]
 
     def rows_shown(self) -> list[int]:
-        """Return the samples at which the robot is drawn, the last one last; empty if it never had a finite pose."""
+        """Return the samples at which the robot is drawn, in order of time; empty if it never had a finite pose."""
         if not self.scene.bodies:
             return []
         rows = np.flatnonzero(np.isfinite(self.record[POSITION]).all(axis=(1, 2)))
@@ -86,9 +86,9 @@ class Skeleton:
         return list(dict.fromkeys(rows[np.linspace(0, len(rows) - 1, FAINT + 1).astype(int)].tolist()))
 
     def contacts(self) -> list[tuple[Point, SceneSurface, Array, float]]:
-        """Return point, surface, position and normal force (NaN if unknown) of each contact at the end.
+        """Return the point, surface, position and normal force (NaN if unknown) of each contact at the end of the run.
 
-        If there is a force, the position is on the surface. Under the unilateral law only contacts that touched are
+        If a force acts, the position is on the surface. Under the unilateral law, only contacts that touched are
         returned.
         """
         record = self.record
@@ -130,7 +130,7 @@ class SidePlane(Projection):
     @property
     def label(self) -> str:
         """Label of the horizontal axis of the plane."""
-        # Rounded first; adding 0 removes the sign of a negative zero.
+        # Round first; adding 0 removes the sign of a negative zero.
         azimuth = round(float(np.degrees(np.arctan2(self.axes[0, 1], self.axes[0, 0])))) + 0
         return f"distance from {self.where}, azimuth {azimuth}° [m]"
 
@@ -143,7 +143,7 @@ def side_plane(record: Record, drawn: Sequence[Array]) -> SidePlane:
     spread = (points - origin)[:, :2]
     spread = spread[np.isfinite(spread).all(axis=1)]
     if not len(spread) or np.abs(spread).max() < NOTHING:
-        # The arm starts upright: use its later postures.
+        # The arm starts upright, so use its later postures.
         spread = np.concatenate([segments.reshape(-1, 3) for segments in drawn] or [points])[:, :2] - origin[:2]
     first = np.array([1.0, 0.0])
     if np.abs(spread).max(initial=0.0) >= NOTHING:
@@ -155,7 +155,7 @@ def side_plane(record: Record, drawn: Sequence[Array]) -> SidePlane:
 
 @dataclass(frozen=True)
 class Label:
-    """Label of a contact at ``place`` (x, z) [m] in the side plane, on one ``side`` of it, ``level`` labels away."""
+    """Label of a contact at ``place`` (x, z) [m] in the side plane, on the given ``side``, ``level`` labels away."""
 
     text: str
     place: Array
@@ -164,7 +164,7 @@ class Label:
 
     @property
     def half(self) -> Array:
-        """Half of its width and height [point]."""
+        """Half the width and height of the label [point]."""
         return 0.5 * np.array([LABEL_SIZE * 0.65 * max(map(len, self.text.splitlines())), LABEL_HEIGHT])
 
     @property
@@ -214,7 +214,7 @@ def with_labels(extent: tuple[Array, Array], labels: Sequence[Label], scale: flo
 def bounds(records: Sequence[Record], drawn: Sequence[Array]) -> tuple[Array, Array]:
     """Return the corners of the box of a 3D view [m]."""
     low, high = box_about(_clouds(records, drawn))
-    # A flat scene still needs some depth.
+    # Even a flat scene needs some depth.
     extra = np.maximum(0.15 * float((high - low).max() or 1.0) - 0.5 * (high - low), 0.0)
     return low - extra, high + extra
 
@@ -223,7 +223,7 @@ def extent_of(plane: SidePlane, drawn: Sequence[Array], records: Sequence[Record
     """Return the corners of a side view [m]."""
     low, high = box_about([plane.project(points) for points in _clouds(records, drawn)])
     span = float((high - low).max() or 1.0)
-    # An upright arm alone would leave no width for the axis.
+    # The extent of an upright arm alone would leave no width for the axis.
     extra = np.maximum(np.array([0.3, 0.05]) * span - 0.5 * (high - low), 0.0) + 0.05 * span
     return low - extra, high + extra
 
@@ -245,7 +245,7 @@ FULL, HALF = 440.0, 205.0
 
 
 def posture(record: Record) -> Figure | None:
-    """Draw the arm at the end of the run and, faintly, before; None for a record without a hand.
+    """Draw the arm at the end of the run and, faintly, at earlier times; return None for a record without a hand.
 
     If the record does not describe the arm, only paths are drawn, with a note.
     """
@@ -259,14 +259,14 @@ def posture(record: Record) -> Figure | None:
     wide = np.hypot(high[0] - low[0], high[1] - low[1]) > 2.2 * (high[2] - low[2])
     extent = extent_of(plane, everything, [record])
     size = extent[1] - extent[0]
-    # Height of the side view at its width, plus the labels of its axis, title and legend.
+    # The height of the side view follows from its width, plus the axis labels, title and legend.
     height = 5.6 if wide else 1.15 + float(np.clip(HALF / 72.0 * size[1] / size[0], 1.5, 3.4))
     room = np.array([FULL, np.inf]) if wide else np.array([HALF, 72.0 * (height - 1.15)])
     extent, scale = _with_labels(extent, [body], plane, room)
     before = ", ".join(style.number(float(record.time[row]), 2) for row in body.rows_shown()[:-1])
     faint = f"; faint, at {before} s" if before else ""
     figure = style.new_figure(height, style.title(record, f"posture at {record.time[-1]:.4g} s{faint}"))
-    # Side by side, the labels of the 3D view need some space to their right.
+    # If the views are side by side, the labels of the 3D view need some space to their right.
     grid = figure.add_gridspec(2, 1, height_ratios=[1.25, 1.0]) if wide else figure.add_gridspec(1, 2, wspace=0.15)
     space: Any = figure.add_subplot(grid[0], projection="3d")
     side = figure.add_subplot(grid[1])
@@ -280,7 +280,7 @@ def posture(record: Record) -> Figure | None:
 
 
 def posture_comparison(records: Mapping[str, Record]) -> Figure | None:
-    """Draw side views of all variants at one scale; None if no arm can be drawn."""
+    """Draw side views of all variants at one scale; return None if no arm can be drawn."""
     bodies = {name: skeleton(record)[0] for name, record in records.items() if "hand_position" in record}
     shown = {name: body for name, body in bodies.items() if body.scene.bodies}
     if not shown:
@@ -310,7 +310,7 @@ def posture_comparison(records: Mapping[str, Record]) -> Figure | None:
         axes.label_outer()
     for axes in grid.ravel()[len(shown) :]:
         axes.set_axis_off()
-    # Labels of narrow panels would overlap, so only one panel has a label.
+    # The axis labels of narrow panels would overlap, so only one panel has a label.
     for axes in grid[:, [k for k in range(columns) if columns > 2 and k != columns // 2]].ravel():
         axes.set_xlabel("")
     style.legend_below(figure, list(grid.ravel()), 5)
@@ -322,7 +322,7 @@ def _with_labels(
 ) -> tuple[tuple[Array, Array], float]:
     """Return the extent with space for contact labels, and the scale [point/m] at which it fits ``room`` [point]."""
     wide, scale = extent, float((room / (extent[1] - extent[0])).min())
-    for _ in range(3):  # smaller pictures need more room for labels
+    for _ in range(3):  # repeat, because a smaller picture needs more room for labels
         labels = [label for body in bodies for label in contact_labels(body, plane, scale)]
         wide = with_labels(extent, labels, scale)
         scale = float((room / (wide[1] - wide[0])).min())
@@ -330,7 +330,7 @@ def _with_labels(
 
 
 def _frame_side(axes: Axes, plane: SidePlane, extent: tuple[Array, Array], surfaces: Sequence[SceneSurface]) -> None:
-    """Set limits and labels, and draw surfaces: grey inside (C < 0), and a line where the plane cuts them."""
+    """Set limits and labels, and draw surfaces: grey inside (C < 0), with a line at the cut with the side plane."""
     low, high = extent
     axes.set_aspect("equal", adjustable="box")
     axes.set_xlim(low[0], high[0])
@@ -356,7 +356,7 @@ def _side_view(
     path: str = style.BLUE,
     named: bool = True,
 ) -> None:
-    """Draw the side view; if ``named``, the legend states depth and surface of penetrations."""
+    """Draw the side view; if ``named`` is set, the legend states the depth and surface of penetrations."""
     record, drawn = body.record, body.postures()
     for k, base in enumerate(body.bases()):
         last = k == len(drawn) - 1
@@ -370,7 +370,7 @@ def _side_view(
             colors=colour,
             linewidths=2.4 if last else 1.2,
             alpha=_opacity(k, len(drawn)),
-            # Round ends of faint segments would overlap and form dark dots.
+            # If faint segments had round ends, these would overlap and form dark dots.
             capstyle="round" if last else "butt",
             zorder=3 if last else 2,
         )
@@ -423,13 +423,13 @@ def _opacity(k: int, count: int) -> float:
 
 def _space_view(axes: Axes3D, body: Skeleton, bounds: tuple[Array, Array], zoom: float) -> None:
     (low, high), record, drawn = bounds, body.record, body.postures()
-    # Fixed drawing order: sorted by depth, the floor would hide the contacts on it.
+    # Use a fixed drawing order; if objects were sorted by depth, the floor would hide the contacts on it.
     axes.computed_zorder = False
     for surface in body.scene.surfaces:
         _draw_surface(axes, surface, low, high)
     base = body.solids(body.rows_shown()[-1]) if drawn else []
     if base:
-        # One collection, because a collection sorts its faces by depth.
+        # Draw all faces in one collection, because a collection sorts its faces by depth.
         shown = np.concatenate([corners[faces] for corners, faces in base])
         solid = Poly3DCollection(shown, facecolors=BASE_COLOUR, linewidths=0, shade=True, antialiased=False, zorder=2.5)
         axes.add_collection3d(solid, autolim=False)
@@ -452,7 +452,7 @@ def _space_view(axes: Axes3D, body: Skeleton, bounds: tuple[Array, Array], zoom:
     for _, _, position, force in body.contacts():
         axes.plot(*position[:, None], linestyle="none", zorder=7, **_contact_mark(force))
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-    # The square of the axes is smaller than the space available to a long arm: fill the space without clipping.
+    # The square of the axes is smaller than the space available for a long arm. Fill the space without clipping.
     axes.set_box_aspect(tuple(high - low), zoom=zoom)
     for artist in axes.get_children():
         artist.set_clip_on(False)
@@ -466,8 +466,8 @@ def _space_view(axes: Axes3D, body: Skeleton, bounds: tuple[Array, Array], zoom:
     ):
         ticks = MaxNLocator(2 + int(3 * share), steps=[1, 2, 5, 10]).tick_values(a, b)
         ticks = ticks[(ticks >= a) & (ticks <= b)]
-        # A short axis has space only for the outer ticks; the y axis, which begins at the end of the x axis, for the
-        # far one.
+        # A short axis has space only for its outer ticks; a short y axis, which begins at the end of the x axis, has
+        # space only for its far tick.
         short = share < SHORT_AXIS and len(ticks) > (1 if axis is axes.yaxis else 2)
         axis.set_ticks((ticks[-1:] if axis is axes.yaxis else ticks[[0, -1]]) if short else ticks)
         axis.set_pane_color((1.0, 1.0, 1.0, 0.0))
@@ -491,14 +491,14 @@ def _draw_surface(axes: Axes3D, surface: SceneSurface, low: Array, high: Array) 
 
 
 def _within(grid: Array, low: Array, high: Array) -> Array:
-    """Return the points near the arm, with NaN for all others."""
+    """Return the points of a grid with NaN in place of all points that are not near the arm."""
     room = 0.1 * float((high - low).max())
     near = ((grid >= low - room) & (grid <= high + room)).all(axis=-1, keepdims=True)
     return np.where(near, grid, np.nan)
 
 
 def _contact_mark(force: float) -> dict[str, Any]:
-    """Return the mark of a contact: blue triangle up if pushed, red triangle down if pulled, grey dot otherwise."""
+    """Return the marker of a contact: blue triangle up if pushed, red triangle down if pulled, otherwise grey dot."""
     if force < 0.0:
         marker, colour, label = "v", style.PULLING, "contact, surface pulls"
     elif force > 0.0:

@@ -1,7 +1,7 @@
 """Figures and animation of a snake run, and comparisons of runs, from their records alone.
 
-Postures in top and side view with grounded and lifted wheels and the support polygon; controlled variable and target;
-joint angles and limits; cost, smallest singular value, support margin, modes.
+The figures show postures in top and side view with grounded and lifted wheels and the support polygon; the controlled
+variables and their targets; joint angles and limits; and cost, smallest singular value, support margin and modes.
 """
 
 from __future__ import annotations
@@ -43,11 +43,11 @@ from dynsim.draw.figures.snake_view import (
 from dynsim.record import Record
 from dynsim.snake.lifting import snake_geometry
 
-# Numbers of postures: in an animation, in a row, and overlaid in one picture.
+# Number of postures in an animation, in a row, and overlaid in one picture.
 FRAMES, IN_A_ROW, IN_A_PICTURE = 50, 6, 7
 # A logarithmic axis cannot show an error of exactly zero.
 TINY = 1e-16
-# Greys of postures over time, because the lines next to them are coloured.
+# Shades of grey for postures over time, because the lines next to them are coloured.
 SHADES = LinearSegmentedColormap.from_list("shades", ["#CFCFCF", "#000000"])
 
 
@@ -57,7 +57,7 @@ def draw(record: Record, folder: Path, kind: str = "png") -> list[Path]:
 
 
 def draw_comparison(records: Mapping[str, Record], folder: Path, kind: str = "png") -> list[Path]:
-    """Draw overlays of variants, and figures and tables next to [T] for its experiments; return the files."""
+    """Draw overlays of variants and, for experiments of [T], comparisons with the paper; return the files."""
     scenarios = {record.summary["scenario"] for record in records.values()}
     written = tanaka2019.write_tables(scenarios.pop(), records, folder) if len(scenarios) == 1 else []
     return written + style.save_all(comparisons(records), records, folder, kind)
@@ -77,7 +77,10 @@ def figures(record: Record) -> dict[str, Callable[[Record], Figure]]:
 
 
 def comparisons(records: Mapping[str, Record]) -> dict[str, Callable[[Mapping[str, Record]], Figure]]:
-    """Return the drawing functions of several runs by file name; comparisons with [T] only if all have one scenario."""
+    """Return the drawing functions for several runs by file name.
+
+    Comparisons with [T] are included only if all runs have the same scenario.
+    """
     scenarios = {record.summary["scenario"] for record in records.values()}
     published = tanaka2019.figures(scenarios.pop(), records) if len(scenarios) == 1 else {}
     return {"comparison": comparison, "postures": strips, **published}
@@ -166,7 +169,7 @@ def tracking(record: Record) -> Figure:
         style.at_least(axis, 2e-3)
         axis.set_ylabel(f"{SYMBOLS.get(name, name)} [{'m' if i < 3 else 'rad'}]")
         style.shade(axis, record.time, record["gripper"] > 0, "#EEEEEE", "gripper closed")
-    # White background, so that grey entries are visible on an entirely grey panel.
+    # Use a white background, so that grey entries are visible on an entirely grey panel.
     axes[0, 0].legend(facecolor="white", edgecolor="none")
     for axis, part, unit in zip(axes[3], ("position", "attitude"), ("m", "rad"), strict=True):
         error = record[f"{part}_error"]
@@ -178,7 +181,7 @@ def tracking(record: Record) -> Figure:
 
 
 def joints(record: Record) -> Figure:
-    """Draw the joint angles of head and base part with their limits; dots mark joints out of the allocation."""
+    """Draw the joint angles of the head and base part with their limits; dots mark joints excluded from allocation."""
     geometry = snake_geometry(record)
     n_h, pitch, upper, lower = geometry.head_joints, geometry.pitch, geometry.upper, geometry.lower
     phi, labels = record["phi"], record.labels["phi"]
@@ -198,7 +201,7 @@ def joints(record: Record) -> Figure:
             axis.axhline(limit, color="black", ls="-.", lw=0.8)
         axis.set_ylabel(f"{title} [rad]")
         style.legend_beside(axis)
-    axes[-1].set_xlabel("t [s]      (dash-dotted: limits; dots: joint out of the allocation at its limit)")
+    axes[-1].set_xlabel("t [s]      (dash-dotted: limits; dots: joint excluded from allocation at its limit)")
     return figure
 
 
@@ -227,7 +230,7 @@ def redundancy(record: Record) -> Figure:
 
 
 def _over_time(axis: Axes, record: Record, values: NDArray[np.float64], many: bool) -> None:
-    """Draw a line, or with ``many`` mode changes, which would fill the panel, its range and minimum in intervals."""
+    """Draw a line or, if ``many`` mode changes would fill the panel, its range and minimum in each interval."""
     if not many:
         axis.plot(record.time, values, color=GROUND)
         return

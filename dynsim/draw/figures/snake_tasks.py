@@ -1,4 +1,4 @@
-"""Figures of a snake at work: torques of its servos, grasps of its gripper, and motion of objects."""
+"""Figures of a snake at work: servo torques, grasps, and motion of objects."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from dynsim.record.measures import GRIPPER_STATES
 from dynsim.record.poses import ORIENTATION, POSITION
 from dynsim.record.quaternion import continuous, of_turn, product, rotated
 
-# Number of servos (largest rms torque) with separate colours; maximum number of objects in a figure.
+# Number of servos (with the largest rms torques) that have separate colours; maximum number of objects in a figure.
 LOADED, OBJECTS = 4, 4
 FAINT = "#B0B0B0"
 # Colours of the bands for the states of the gripper.
@@ -26,7 +26,7 @@ STATES = dict(zip(GRIPPER_STATES, ("#FFFFFF", "#FDEFD3", "#E1F3EC", "#FAE6F0"), 
 EVENTS = {"captures": (0, (5, 2)), "slips": (0, (1, 1)), "loses": "-", "releases": (0, (5, 2, 1, 2))}
 # Smallest distance on the logarithmic axis [mm].
 LEAST = 0.1
-# If the gripper is closer to the axis of a hinge, the hinge angle follows from its orientation [m].
+# If the gripper is closer to the axis of a hinge than this [m], the hinge angle is computed from its orientation.
 ON_AXIS = 0.01
 
 
@@ -43,7 +43,7 @@ def makers(record: Record) -> dict[str, Callable[[Record], Figure]]:
 
 
 def servos(record: Record) -> Figure:
-    """Draw shaft torques with stall torque, nominal torque and gear friction; equal servos share a panel."""
+    """Draw the shaft torques with stall torque, nominal torque and gear friction; servos of one type share a panel."""
     kinds: dict[tuple[float, ...], list[dict[str, Any]]] = {}
     for motor in record.summary["motors"]:
         if "stall_torque_N_m" in motor:
@@ -77,7 +77,7 @@ def servos(record: Record) -> Figure:
 
 
 def gripper(record: Record) -> Figure:
-    """Draw the distance to the grasp frame, and forces and torques on the grasped object with their bounds."""
+    """Draw the distance to the nearest grasp frame, and the forces and torques on the grasped object with bounds."""
     grip = None if record.scene is None else record.scene.grip
     forces = _held_forces(record)
     rows = 1 if forces is None else 3
@@ -107,7 +107,7 @@ def gripper(record: Record) -> Figure:
 
 
 def objects(record: Record) -> Figure:
-    """Draw position of objects on joints and of the head, and load of the joint; or the height of free objects."""
+    """Draw the positions of jointed objects and of the head, and joint loads; for free objects, draw the height."""
     bodies = object_bodies(record)
     some = list(bodies)[:OBJECTS]
     note = "" if len(some) == len(bodies) else f" ({len(some)} of {len(bodies)})"
@@ -138,7 +138,7 @@ def _panels(record: Record, name: str, body: int) -> list[Callable[[Axes], None]
 
 
 def _moved(axis: Axes, record: Record, name: str, body: int) -> None:
-    """Draw the coordinate of an object on a hinge or rails, and the motion of the gripper along it while grasped."""
+    """Draw the coordinate of an object on a hinge or rails, and the gripper's motion along it during a grasp."""
     assert record.scene is not None
     turns = record.scene.bodies[body].joint.kind == "revolute"
     scale, unit = (180.0 / np.pi, "°") if turns else (1e3, "mm")
@@ -156,7 +156,7 @@ def _moved(axis: Axes, record: Record, name: str, body: int) -> None:
 
 
 def _followed(record: Record, w: Array, body: int) -> Array:
-    """Return the rotation about, or displacement along, the axis of the joint of a body, of poses ``w``, (T,)."""
+    """Return the rotation of poses ``w`` about the axis of a body's joint, or the displacement along it, (T,)."""
     assert record.scene is not None
     joint = record.scene.bodies[body].joint
     axis = rotated(record[ORIENTATION][0, body].astype(float), np.array(joint.axis))
@@ -173,7 +173,7 @@ def _followed(record: Record, w: Array, body: int) -> Array:
 
 
 def _joint_loads(record: Record, name: str) -> dict[str, Array]:
-    """Return torques or forces that a hinge or rails exert on their object, by cause."""
+    """Return the torques or forces that a hinge or rails exert on their object, by cause."""
     signals = (("friction", "joint_friction", name), ("spring", "tie_force", f"{name}.spring"))
     return {
         text: record[signal][:, record.labels[signal].index(label)]
@@ -208,17 +208,17 @@ def _standing(axis: Axes, record: Record, name: str, columns: list[int]) -> None
 
 
 def _held_forces(record: Record) -> Array | None:
-    """Return forces x, y, z [N] and torques [N m] of the gripper on its object, (T, 6); None on the kinematic level."""
+    """Return the forces x, y, z [N] and torques [N m] of the gripper on its object, (T, 6); None at kinematic level."""
     names = [name for name in record.labels.get("tie_force", ()) if name.startswith("gripper.")]
     if not names:
         return None
-    # It holds one object at a time. The signal is the force on the first body of a tie, the gripper.
+    # The gripper holds one object at a time. The signal is the force on the first body of a tie, which is the gripper.
     columns = [record.labels["tie_force"].index(name) for name in names]
     return -record["tie_force"][:, columns].reshape(len(record), -1, 6).sum(axis=1)
 
 
 def _holds(record: Record, name: str) -> list[tuple[int, int]]:
-    """Return the first row and the row after the last of each grasp of an object."""
+    """Return, for each grasp of an object, its first row and the row after its last row."""
     spans: list[tuple[int, int]] = []
     for event in record.events:
         if event.name != name or event.kind not in ("gripper captures", "gripper releases", "gripper loses"):
@@ -243,7 +243,7 @@ def _finish(axes: Array, record: Record) -> None:
             for time in times:
                 axis.axvline(time, color="#555555", ls=EVENTS[kind], lw=0.8, label=f"_{kind}")
         style.legend_beside(axis)
-    # One legend below all panels.
+    # Add one legend below all panels.
     named = {h.get_label(): h for h in (*axes[0].collections, *axes[0].lines) if str(h.get_label()).startswith("_")}
     texts = [*STATES, *EVENTS]
     shown = {text: named[f"_{text}"] for text in texts if f"_{text}" in named}

@@ -1,4 +1,4 @@
-"""Parts shared by all snake figures: colours, top and side view of one posture, chart of modes."""
+"""Parts that all snake figures share: colours, top and side views of one posture, and mode charts."""
 
 from __future__ import annotations
 
@@ -29,18 +29,19 @@ OBJECT = "#E9CFA6"
 SYMBOLS = {"alpha": "α", "beta": "β", "gamma": "γ"}
 # Maximum number of modes whose numbers fit above the bars of a chart.
 NUMBERED = 30
-# Number of intervals of a run. If it has more modes, shares and ranges in the intervals are drawn instead of each mode.
+# Number of intervals into which a run is divided. If it has more modes than this, fractions and ranges for each
+# interval are drawn instead of each mode.
 INTERVALS = 160
 # Colours of fractions of time from 0 to 1.
 SHARES = LinearSegmentedColormap.from_list("shares", [LIFT, GROUND])
-# Minimum height of a top view relative to its width, because a straight robot is a thin line.
+# Minimum height of a top view relative to its width, because a straight robot appears as a thin line.
 MIN_HEIGHT = 0.3
 # Font size of tick labels at the vertical axes of postures [point].
 SMALL = 6.5
 
 
 def object_bodies(record: Record) -> dict[str, int]:
-    """Return names and bodies of the objects whose poses are in the record."""
+    """Return the names and body indices of the objects whose poses are in the record."""
     if record.scene is None or POSITION not in record:
         return {}
     return {body.name: k for k, body in enumerate(record.scene.bodies) if body.name in record.scene.objects}
@@ -52,7 +53,7 @@ class View:
     def __init__(self, record: Record, row: int) -> None:
         scene = record.scene
         if scene is None:
-            raise RecordError("cannot draw the record of a snake without a scene, which contains wheels and links")
+            raise RecordError("cannot draw the record of a snake without a scene that contains its wheels and links")
         self.row, self.time, self.mode = row, float(record.time[row]), int(record["mode"][row])
         self.points: Array = record["posture"][row]
         self.path: Array = record["w"][:, :2]
@@ -77,7 +78,7 @@ class View:
         return self.project(np.concatenate([self.points, *wheels, *self.objects]), above)
 
     def draw(self, axes: Axes, above: bool) -> None:
-        """Draw objects, body, controlled point and wheels; from above also support polygon and centre of mass."""
+        """Draw objects, body, controlled point and wheels and, from above, the support polygon and centre of mass."""
         objects = (self.project(corners, above) for corners in self.objects)
         add_outlines(axes, objects, fc=OBJECT, ec=BODY, lw=0.5, zorder=1.5)
         if above:
@@ -90,7 +91,7 @@ class View:
         axes.plot(*flat.T, "-", color=BODY, lw=1.8, zorder=3, solid_capstyle="round")
         axes.plot(*flat[0], "o", color=HEAD, ms=4, zorder=5)
         for down, pair in zip(self.grounded, self.wheels, strict=True):
-            # In side view a lifted pair is drawn slightly above the ground; the model has no height for it ([T] II.A).
+            # In side view, a lifted pair is drawn slightly above the ground; the model has no height for it ([T] II.A).
             raised = np.array([0.0, 0.0 if above or down else 0.35 * self.radius])
             look: dict[str, Any] = {"facecolor": GROUND if down else LIFT, "edgecolor": GROUND, "lw": 0.7}
             wheels = (self.project(corners, above) + raised for corners in pair)
@@ -100,7 +101,7 @@ class View:
 def posture_grid(title: str, lines: Mapping[str, Sequence[tuple[View, str]]], one_scale: bool = True) -> Figure:
     """Draw labelled rows of top views with their titles, and the path of the controlled point in green.
 
-    With ``one_scale`` all rows show the same area, otherwise each row the area it needs.
+    With ``one_scale``, the areas of all rows have the same size; otherwise each row shows the area that it needs.
     """
     columns = max(map(len, lines.values()))
     clouds = [[view.extent(above=True) for view, _ in line] for line in lines.values()]
@@ -126,7 +127,7 @@ def posture_grid(title: str, lines: Mapping[str, Sequence[tuple[View, str]]], on
         for column in range(len(line), columns):
             row[column].set_visible(False)
             if k > 0:
-                axes[k - 1, column].tick_params(labelbottom=True)  # the lowest one there
+                axes[k - 1, column].tick_params(labelbottom=True)  # the lowest panel in this column
         for axis, (view, text) in zip(row, line, strict=False):
             axis.plot(*view.path.T, color=TARGET, lw=1.0, zorder=2)
             view.draw(axis, above=True)
@@ -141,7 +142,7 @@ def posture_grid(title: str, lines: Mapping[str, Sequence[tuple[View, str]]], on
 
 
 def posture_strip(title: str, line: Sequence[tuple[View, str]]) -> Figure:
-    """Draw postures with their titles: top view above, side view along the heading of the base below."""
+    """Draw postures with their titles: the top view above, and the side view along the heading of the base below."""
     views = [view for view, _ in line]
     top = _not_flat(limits([view.extent(above=True) for view in views], 0.08))
     side = limits([view.extent(above=False) for view in views], 0.08)
@@ -246,7 +247,7 @@ def _shares(axis: Axes, record: Record, holds: NDArray[Any], places: NDArray[np.
 
 
 def error_axis(axis: Axes, *errors: NDArray[np.float64]) -> None:
-    """Set the limits of a logarithmic error axis such that rounding errors (an exact first sample) do not extend it."""
+    """Set the limits of a logarithmic error axis so that rounding errors (an exact first sample) do not extend it."""
     values = np.concatenate(errors)
     values = values[values > 1e-15]
     if len(values):
@@ -261,14 +262,14 @@ def moments(record: Record, count: int) -> NDArray[np.int64]:
 
 
 def limits(clouds: list[NDArray[np.float64]], margin: float) -> tuple[float, float, float, float]:
-    """Return x and y limits that contain all points, with a margin."""
+    """Return x and y limits that contain all points and a margin."""
     points = np.vstack(clouds)
     (x0, y0), (x1, y1) = points.min(axis=0) - margin, points.max(axis=0) + margin
     return float(x0), float(x1), float(y0), float(y1)
 
 
 def _not_flat(box: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
-    """Increase the height of limits that would be a strip too thin for ticks."""
+    """Increase the height of limits if they form a strip that is too thin for ticks."""
     x0, x1, y0, y1 = box
     more = max(0.0, MIN_HEIGHT * (x1 - x0) - (y1 - y0)) / 2
     return x0, x1, y0 - more, y1 + more

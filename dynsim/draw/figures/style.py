@@ -24,16 +24,16 @@ from dynsim.system.terminal import plain
 
 T = TypeVar("T")
 Array = NDArray[np.float64]
-# A quantity over time: times (T,), values (T,) or (T, k).
+# A quantity over time: times, (T,), and values, (T,) or (T, k).
 Series = tuple[Array, Array]
 
-# Colours of Okabe and Ito, which colour-blind readers can distinguish; yellow is omitted because it is too faint on
+# Colours of Okabe and Ito, which colour-blind readers can distinguish; yellow is omitted, because it is too faint on
 # white.
 BLUE, ORANGE, GREEN, PURPLE, SKY, BLACK = "#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#000000"
-# Reserved for pulling contacts in every figure, so no variant has it.
+# This colour is reserved for pulling contacts in every figure, so no variant uses it.
 PULLING = "#D55E00"
 GREY = "#7F7F7F"
-# Parts of links that lie below a surface because they have no contact point.
+# Colour of parts of links that are below a surface because they have no contact point.
 DEEP = "#882255"
 VARIANT_COLOURS = (BLUE, GREEN, ORANGE, PURPLE, SKY, BLACK, "#8C6D31")
 AXIS_COLOURS = {"x": BLUE, "y": GREEN, "z": ORANGE}
@@ -66,12 +66,12 @@ _LOOK: Any = {
     "ytick.major.width": 0.6,
     "legend.frameon": False,
     "legend.handlelength": 1.8,
-    # A line of a million points overflows the cell block of Agg unless it is drawn in pieces.
+    # A line with a million points overflows Agg's cell block unless it is drawn in pieces.
     "agg.path.chunksize": 20_000,
 }
-# Curves in space with more points are thinned; a figure is about 1200 pixels wide.
+# Curves in space with more points than this are thinned; a figure is about 1200 pixels wide.
 LINE_POINTS = 4000
-# A transient panel shows this multiple of the transient, unless that is more than this fraction of the run.
+# A transient panel shows TRANSIENT_ROOM times the transient, unless this exceeds TRANSIENT_MAX_SHARE of the run.
 TRANSIENT_ROOM, TRANSIENT_MAX_SHARE = 1.2, 0.8
 # Height of a legend row [point].
 LEGEND_ROW = 12.5
@@ -79,7 +79,7 @@ LEGEND_ROW = 12.5
 
 @contextmanager
 def look() -> Iterator[None]:
-    """Apply the matplotlib settings of dynsim in a ``with`` block."""
+    """Apply dynsim's matplotlib settings in a ``with`` block."""
     with matplotlib.rc_context(_LOOK):
         yield
 
@@ -88,7 +88,7 @@ def new_figure(height: float, title: str, *, width: float = WIDTH) -> Figure:
     """Create an empty figure with ``height`` and ``width`` [inch], independent of pyplot and displays."""
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
-    # A long title is smaller, so that it is not cut off.
+    # A long title has a smaller font, so that it is not cut off.
     figure.suptitle(title, fontsize=TITLE * min(1.0, TITLE_LONG / max(len(title), 1)))
     return figure
 
@@ -101,14 +101,14 @@ def save(figure: Figure, path: Path) -> Path:
     RecordError
         If the file cannot be written; an existing file is then unchanged.
     """
-    # Names from files may contain control characters, for which fonts have no glyph.
+    # Names from files may contain control characters, for which fonts have no glyphs.
     for text in figure.findobj(Text):
         text.set_text(plain(text.get_text()))
     figure.set_dpi(DPI)
     kind = path.suffix.removeprefix(".")
     with replacing(path) as stream, matplotlib.rc_context({"svg.hashsalt": path.stem}):
         if kind == "png":
-            # Draws once; ``savefig`` draws twice, the first time for the layout.
+            # This draws once; ``savefig`` would draw twice, the first time for the layout.
             FigureCanvasAgg(figure).print_png(stream)
         else:
             date = {"pdf": "CreationDate", "svg": "Date"}[kind]
@@ -136,9 +136,10 @@ def comparison_title(records: Sequence[Record], subject: str) -> str:
 
 
 def variant_styles(names: Sequence[T]) -> dict[T, dict[str, Any]]:
-    """Return colour, width and (beyond seven curves) line style of variants, or of curves of one run, by position.
+    """Return the colour, width and line style of each variant, or of each curve of one run, by position.
 
-    Later curves are on top and thinner, so that equal curves remain visible.
+    Line styles differ only if there are more than seven curves. Later curves are on top and thinner, so that equal
+    curves remain visible.
     """
     count = len(VARIANT_COLOURS)
     dashes = ("-", (0, (5, 1.5)), (0, (1, 1)), (0, (5, 1, 1, 1)))
@@ -177,7 +178,7 @@ def at_least(axes: Axes, span: float) -> None:
 
 
 def shade_below_zero(axes: Axes, label: str) -> None:
-    """Draw the zero line and shade the part of the axes below it, if any."""
+    """Draw the zero line, and shade the part of the axes below it, if any."""
     axes.axhline(0.0, color=PULLING, linewidth=0.8)
     low, high = axes.get_ylim()
     if low < 0.0:
@@ -201,10 +202,10 @@ def legend_beside(axes: Axes) -> None:
 
 
 def legend_above(axes: Axes, columns: int = 3) -> None:
-    """Place the legend above the axes, where it hides nothing, with space for all its rows."""
+    """Place the legend above the axes, where it hides no curves, with space for all of its rows."""
     rows = -(-len(axes.get_legend_handles_labels()[1]) // columns)
     legend = axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=columns, borderaxespad=0.0)
-    # It may extend over the panel to its left; an empty title reserves the space above.
+    # The legend may extend over the panel to its left; a blank title reserves the space above.
     legend.set_in_layout(False)
     axes.set_title(" ", y=1.0, pad=6.0 + LEGEND_ROW * max(rows - 1, 0))
 
@@ -245,14 +246,14 @@ def time_rows(
     rows : sequence of sequences of Series
         For each row, the series that will be drawn in it.
     settle : float
-        Time from which the values count as settled [s].
+        Time from which on the values count as settled [s].
     compress : bool, optional
         Use a logarithmic scale beyond the settled range in the transient panel.
 
     Returns
     -------
     list of tuple of Axes
-        For each row (transient, whole run) or (whole run,); draw everything in all of them.
+        For each row, the axes (transient, whole run) or (whole run,); draw all curves in all of them.
     """
     end = max(time[-1] for row in rows for time, _ in row)
     longest = TRANSIENT_MAX_SHARE * end / TRANSIENT_ROOM
@@ -281,7 +282,7 @@ def time_rows(
 
 @dataclass(frozen=True)
 class Transient:
-    """End of the transient of a row [s], range of its axis afterwards, and absolute value of its peak."""
+    """End of a row's transient [s], range of the row's axis afterwards, and absolute value of the peak."""
 
     end: float
     low: float
@@ -290,7 +291,7 @@ class Transient:
 
 
 def _transient(row: Sequence[Series], settle: float) -> Transient | None:
-    """Return the transient of a row, or None if its axis need not be limited."""
+    """Return the transient of a row, or None if the axis of the row need not be limited."""
     settled = np.concatenate([values[time >= settle].ravel() for time, values in row])
     everything = np.concatenate([values.ravel() for _, values in row])
     settled, everything = settled[np.isfinite(settled)], everything[np.isfinite(everything)]
@@ -311,7 +312,7 @@ def _transient(row: Sequence[Series], settle: float) -> Transient | None:
 
 
 def _compress(axes: Axes, transient: Transient) -> None:
-    """Make the axis linear within the settled range and logarithmic beyond, so that a peak does not hide the rest."""
+    """Make the axis linear within the settled range and logarithmic beyond it, so that a peak hides no details."""
     settled = max(abs(transient.low), abs(transient.high))
     if transient.largest > 3.0 * settled:
         axes.set_yscale("symlog", linthresh=settled)
@@ -320,6 +321,6 @@ def _compress(axes: Axes, transient: Transient) -> None:
         axes.set_yticks([-tick for tick in ticks[::-1]] + [0.0, *ticks])
         axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: number(value)))
         axes.yaxis.set_minor_locator(NullLocator())
-        # Curves have a kink where the scale changes, so the scale is stated.
+        # Curves have a kink at the point where the scale changes, so the figure states the scale.
         text = f"logarithmic beyond ±{number(settled, 2)}"
         axes.text(0.98, 0.03, text, transform=axes.transAxes, ha="right", color=GREY, fontsize=6.5)

@@ -1,6 +1,6 @@
-"""Figures of a sweep: values over the grid, energy against error, distributions and sensitivities.
+"""Figures of a sweep: values over the grid, energy versus error, distributions and sensitivities.
 
-Only the table of the sweep is needed.
+The figures require only the table of the sweep.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from dynsim.draw.figures.style import Array
 from dynsim.record.sensitivity import LEVEL, sensitivities, spread
 
 ENERGY = "electrical_energy_J"
-# Label, and factor to its unit. The first error in the table is drawn.
+# Label of each quantity, and factor to the unit in the label. The first error that the table contains is drawn.
 ENERGIES = {ENERGY: ("electrical energy [J]", 1.0)}
 ERRORS = {
     "hand_error_rms_m": ("hand error, rms [mm]", 1e3),
     "final_position_error_m": ("final position error [mm]", 1e3),
 }
-# Parts of units at the end of summary keys.
+# Words in units at the end of summary keys.
 UNITS = {"m", "s", "rad", "N", "A", "V", "W", "J", "kg", "per"}
 # Maximum number of parameters in a tornado diagram, and of bars in a histogram.
 _BARS, _BINS = 12, 40
-# Values with a larger ratio are drawn on a logarithmic axis or colour scale.
+# Values whose ratio exceeds this are drawn on a logarithmic axis or colour scale.
 _WIDE = 8.0
-# Height and width of a panel; heights of a bar of a tornado diagram, of the margins, and of a colour bar [inch].
+# Height and width of a panel, and heights of a bar in a tornado diagram, of the margins, and of a colour bar [inch].
 _PANEL, _ACROSS, _BAR, _ROOM = 2.1, 3.5, 0.22, 0.9
 _COLOURS = 0.5
 # Maximum length of an axis label, a panel title, and a part of the figure title [characters].
@@ -47,18 +47,18 @@ _MARKERS, _NUMBERED = "osD^vP*X", 12
 
 @dataclass(frozen=True)
 class Sweep:
-    """Table of runs.
+    """Table of the runs of a sweep.
 
     Attributes
     ----------
     name : str
         Name of the scenario.
     rows : sequence of mapping
-        Numbers and values by column; a failed run has only its varied values.
+        Results and varied values by column; a failed run has only its varied values.
     grid, sampled : sequence of str
         Columns that were varied.
     known : sequence of str
-        All variants of the scenario in their order; colours do not depend on which variants were run.
+        All variants of the scenario in their order, so that colours do not depend on which variants were run.
     plotted : sequence of str
         Columns to draw; default: energy and error.
     """
@@ -72,12 +72,12 @@ class Sweep:
 
     @property
     def variants(self) -> list[str]:
-        """Variants in the order of the table; one without a name if there are no variants."""
+        """Variants in the order of the table; a single variant without a name if the table lists no variants."""
         return list(dict.fromkeys(str(row.get("variant", "")) for row in self.rows))
 
     @property
     def failed(self) -> str:
-        """Number of runs without numbers, for titles; "" if all runs have numbers."""
+        """Text for titles with the number of failed runs; "" if no run failed."""
         bad = sum(all(row.get(key) is None for key in self.metrics) for row in self.rows)
         return f"; {bad} of {len(self.rows)} failed" if bad else ""
 
@@ -104,7 +104,7 @@ class Sweep:
 
 
 def named(key: str) -> tuple[str, float]:
-    """Return label and scale of a number from its key and the unit in the key; ``base.tip_margin_min`` has no unit.
+    """Return the label and scale of a result from its key and the unit in it; ``base.tip_margin_min`` has no unit.
 
     The part before the last dot is unchanged: ``elbow_c: normal force max [N]``.
     """
@@ -137,7 +137,7 @@ def draw(sweep: Sweep, folder: Path, kind: str = "png") -> list[Path]:
 
 
 def lines(sweep: Sweep) -> Figure | None:
-    """Draw energy and error over the only key of the grid; None without a grid, or with several keys."""
+    """Draw energy and error over the grid if it has a single key; return None if it has no or several keys."""
     if len(sweep.grid) != 1:
         return None
     (key,) = sweep.grid
@@ -168,7 +168,7 @@ def lines(sweep: Sweep) -> Figure | None:
 
 
 def heat_map(sweep: Sweep) -> Figure | None:
-    """Draw energy and error over the first two keys of the grid, for each variant; the mean over all others."""
+    """Draw energy and error of each variant over the first two grid keys, averaged over all other keys."""
     if len(sweep.grid) < 2:
         return None
     x, y = sweep.grid[:2]
@@ -197,7 +197,7 @@ def heat_map(sweep: Sweep) -> Figure | None:
             axes.set_title(variant)
             _name_cells(axes, "y", y, ys)
             _name_cells(axes, "x", x, xs)
-        # Below its column; next to it, its label would be at the next column.
+        # Place the colour bar below its column; next to it, the label would be at the next column.
         bar = figure.colorbar(image, ax=list(column), label=label, location="bottom", aspect=30, pad=0.02)
         if isinstance(norm, LogNorm):
             style.log_axis(bar.ax, "x")
@@ -211,11 +211,11 @@ def heat_map(sweep: Sweep) -> Figure | None:
 
 
 def pareto(sweep: Sweep) -> Figure | None:
-    """Draw energy against error of all runs, and number the runs of the Pareto front; None without both numbers."""
+    """Draw energy versus error of all runs, and number the runs on the Pareto front; return None if one is missing."""
     if sweep.plotted or len(sweep.metrics) < 2:
         return None
     (energy, (energy_label, _)), (error, (error_label, scale)) = sweep.metrics.items()
-    figure = style.new_figure(3.6, f"{sweep.name}: energy against error, {len(sweep.rows)} runs{sweep.failed}")
+    figure = style.new_figure(3.6, f"{sweep.name}: energy versus error, {len(sweep.rows)} runs{sweep.failed}")
     axes = figure.subplots()
     styles, last = sweep.looks, max(len(sweep.variants) - 1, 1)
     for k, variant in enumerate(sweep.variants):
@@ -238,7 +238,7 @@ def pareto(sweep: Sweep) -> Figure | None:
         *front.T,
         color=style.BLACK,
         linewidth=0.7,
-        # No run is to the left of and below the steps.
+        # No run is both to the left of the steps and below them.
         drawstyle="steps-post",
         marker="o",
         markersize=5,
@@ -264,10 +264,10 @@ def best(points: Sequence[tuple[float, float]]) -> Array:
 
 
 def samples(sweep: Sweep) -> Figure | None:
-    """Draw the distribution of energy and error over the samples; None without samples.
+    """Draw the distribution of energy and error over the samples; return None without samples.
 
-    There is one row per variant and grid point: variation by the grid is not part of the distribution, and all grid
-    points have the same draws. With many grid points, evenly spaced ones are shown.
+    The figure has one row per variant and grid point, because variation due to the grid is not part of the distribution
+    and all grid points have the same draws. If there are many grid points, only some, evenly spaced, are shown.
     """
     if not sweep.sampled:
         return None
@@ -281,7 +281,7 @@ def samples(sweep: Sweep) -> Figure | None:
     figure = style.new_figure(
         _PANEL * len(variants) * len(shown) + _ROOM,
         f"{sweep.name}: {len(sweep.rows)} runs with random parameters{sweep.failed}{note}",
-        # A title with two numbers and their intervals is as wide as a panel.
+        # A panel must be as wide as a title with two numbers and their intervals.
         width=max(style.WIDTH, _ACROSS * len(metrics)),
     )
     rows = [(variant, grid_place) for variant in variants for grid_place in shown]
@@ -290,7 +290,7 @@ def samples(sweep: Sweep) -> Figure | None:
     panels = figure.subplots(len(rows), len(metrics), squeeze=False)
     for row, (variant, grid_place) in zip(panels, rows, strict=True):
         here = list(_at(sweep.of(variant), grid_place))
-        # A single grid point is not named.
+        # If there is only one grid point, the title does not name it.
         values = {key: style.number(value) if _numeric([value]) else value for key, value in grid_place.items()}
         where = [f"{names[key]} = {value}" for key, value in values.items()] if len(places) > 1 else []
         texts = [variant] * bool(variant) + [_short(", ".join(where), _HEAD - len(variant))] * bool(where)
@@ -326,7 +326,7 @@ def _distribution(axes: Axes, values: Array, head: str, colour: str) -> None:
 
 
 def tornado(sweep: Sweep) -> Figure | None:
-    """Draw the effect of one standard deviation of each sampled key; None if no linear model can be fitted."""
+    """Draw the effect of one standard deviation of each sampled key; return None if no linear model can be fitted."""
     effects = {
         (variant, metric): fit
         for variant in sweep.variants
@@ -365,10 +365,10 @@ def _fit(sweep: Sweep, variant: str, metric: str) -> Any:
     if not rows or not sweep.sampled:
         return None
     values = np.array([row[metric] for row in rows], dtype=float)
-    # Remove the effect of the grid from the effect of the samples.
+    # Remove the effect of the grid, so that only the effect of the samples remains.
     for here in _grouped(rows, sweep.grid).values():
         values[here] -= values[here].mean()
-    # All grid points have the same draws: each counts once, otherwise the intervals would be too narrow.
+    # All grid points have the same draws. Count each draw once, otherwise the intervals would be too narrow.
     draws = list(_grouped(rows, sweep.sampled).values())
     parameters = np.array([[rows[draw[0]][key] for key in sweep.sampled] for draw in draws], dtype=float)
     return sensitivities(parameters, np.array([values[draw].mean() for draw in draws]))
@@ -408,7 +408,7 @@ def _values(rows: Sequence[Mapping[str, Any]] | Iterator[Mapping[str, Any]], met
 
 
 def _scale(axes: Axes, which: str, values: Array) -> None:
-    """Use a logarithmic axis for positive values of very different size, otherwise start at zero if possible."""
+    """Use a logarithmic axis for positive values of very different magnitude; otherwise start at zero if possible."""
     values = values[np.isfinite(values)]
     low, high = values.min(initial=np.inf), values.max(initial=-np.inf)
     if _is_wide(low, high):
@@ -424,7 +424,7 @@ def _with_interval(value: float, half: float) -> str:
 
 
 def _is_wide(low: float, high: float) -> bool:
-    """Return whether values between these limits are positive and of very different size."""
+    """Return whether values between these limits are positive and differ widely in magnitude."""
     return bool(low > 0.0 and high > _WIDE * low)
 
 

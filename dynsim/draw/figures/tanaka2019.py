@@ -78,7 +78,7 @@ def figures(scenario: str, records: Mapping[str, Record]) -> dict[str, Maker]:
 
 
 def figures_of_run(record: Record) -> dict[str, Callable[[Record], Figure]]:
-    """Return the drawing functions of comparisons with [T] that need one run only."""
+    """Return the drawing functions of comparisons with [T] that require only one run."""
     return {"fig_13": picking_up} if record.summary["scenario"] in PICK_UPS and record["gripper"].any() else {}
 
 
@@ -102,7 +102,7 @@ def _bars(
 
 
 def positioning(records: Mapping[str, Record]) -> Figure:
-    """Table III of [T]: deviation from the target displacement, measured in [T] and simulated here."""
+    """Draw Table III of [T]: deviation from the target displacement, measured in [T] and simulated here."""
     moved = [name for name in TABLE_III if name in records]
     figure = style.new_figure(4.7, "displacements of the head and Table III of [T]")
     axes = figure.subplots(2, 1, sharex=True)
@@ -125,7 +125,7 @@ def positioning(records: Mapping[str, Record]) -> Figure:
 
 
 def dynamic_positioning(records: Mapping[str, Record]) -> Figure:
-    """Table III of [T]: deviation from the target displacement, measured in [T] and simulated in three ways."""
+    """Draw Table III of [T]: deviation from the target displacement, measured in [T] and simulated in three ways."""
     moved = [name for name in TABLE_III if name in records]
     figure = style.new_figure(6.6, "displacements of the head and Table III of [T]")
     axes = figure.subplots(6, 1, sharex=True)
@@ -148,8 +148,8 @@ def dynamic_positioning(records: Mapping[str, Record]) -> Figure:
 
 
 def sag_and_feedback(records: Mapping[str, Record]) -> Figure:
-    """Figs 7(a) and 7(b) of [T]: the head while β changes, by feedforward and with the head measured."""
-    figure = style.new_figure(7.2, "the head while β changes, as in Fig 7 of [T]")
+    """Draw Figs 7(a) and 7(b) of [T]: the head while β changes, with feedforward and with a measured head pose."""
+    figure = style.new_figure(7.2, "head while β changes, as in Fig 7 of [T]")
     axes = figure.subplots(6, 2, sharex=True, sharey="row")
     shown = {"beta": "(a) feedforward", "beta_measured": "(b) measured by motion capture"}
     for column, (name, title) in zip(axes.T, shown.items(), strict=True):
@@ -167,7 +167,7 @@ def sag_and_feedback(records: Mapping[str, Record]) -> Figure:
 
 
 def wheel_loads(records: Mapping[str, Record]) -> Figure:
-    """Draw the loads of the wheel pairs over time, for every manoeuvre by feedforward."""
+    """Draw the loads of the wheel pairs over time, for every manoeuvre with feedforward."""
     moved = [name for name in TABLE_III if name in records]
     figure = style.new_figure(1.25 * len(moved) + 1.2, "loads of the wheel pairs")
     axes = figure.subplots(len(moved), 1, sharex=True, squeeze=False)[:, 0]
@@ -186,7 +186,7 @@ def wheel_loads(records: Mapping[str, Record]) -> Figure:
 
 
 def motion(records: Mapping[str, Record]) -> Figure:
-    """Figs 8 and 16 of [T]: top views over time with the costs of eq 19 and eq 20."""
+    """Draw Figs 8 and 16 of [T]: top views over time with the costs of eq 19 and eq 20."""
     shown = {"cyclic": "eq 19\n(Fig 8)", "eq20": "eq 20 printed\n(Fig 16)", "eq20_min": "eq 20, 1/min d\n(Fig 16)"}
     lines = {}
     for name, label in shown.items():
@@ -194,7 +194,7 @@ def motion(records: Mapping[str, Record]) -> Figure:
         views = [_view_at(record, t) for t in (0.0, 2.0, 7.0, 12.0, 17.0, np.inf)]
         area = record["support_area"]
         lines[label] = [(v, f"{v.time:.0f} s, mode {v.mode}, {area[v.row]:.3f} m²") for v in views]
-    return posture_grid("eq 19 and eq 20, as in Figs 8 and 16 of [T], with the area of the support", lines)
+    return posture_grid("eq 19 and eq 20, as in Figs 8 and 16 of [T], with the area of the support polygon", lines)
 
 
 def _view_at(record: Record, time: float) -> View:
@@ -202,7 +202,7 @@ def _view_at(record: Record, time: float) -> View:
 
 
 def head_and_cost(record: Record) -> Figure:
-    """Fig 9 of [T]: pose of the head, mode and V over time, and the error that its text states."""
+    """Draw Fig 9 of [T]: head pose, mode and V over time, and the error stated in the text of [T]."""
     figure = style.new_figure(6.9, style.title(record, "head, mode and cost, as in Fig 9 of [T]"))
     axes = figure.subplots(4, 2, sharex=True)
     time = record.time
@@ -228,7 +228,7 @@ def head_and_cost(record: Record) -> Figure:
 
 
 def joint_angles(record: Record) -> Figure:
-    """Fig 10 of [T]: every joint angle over time with its limits."""
+    """Draw Fig 10 of [T]: every joint angle over time with its limits."""
     geometry, phi = snake_geometry(record), record["phi"]
     names, count = record.labels["phi"], phi.shape[1]
     lines = -(-count // 3)
@@ -240,7 +240,7 @@ def joint_angles(record: Record) -> Figure:
         axis.plot(record.time, phi[:, j], color=GROUND, label="simulated")
         for bound in (geometry.lower[j], geometry.upper[j]):
             axis.axhline(bound, color="black", ls="-.", lw=0.8, label="joint limit")
-        out, label = record["at_limit"][:, j] > 0, "out of the allocation at its limit"
+        out, label = record["at_limit"][:, j] > 0, "excluded from allocation at its limit"
         axis.plot(record.time[out], phi[out, j], ".", color=HEAD, ms=3, label=label)
         if "phi_command" in record:
             axis.plot(record.time, record["phi_command"][:, j], ":", color="red", lw=1.2, label="commanded")
@@ -267,10 +267,10 @@ def policies(records: Mapping[str, Record]) -> Figure:
 
 
 def door(record: Record) -> Figure:
-    """Fig 14 of [T]: the pull with its stops at joint limits and the postures after switching modes, top view."""
+    """Draw Fig 14 of [T], seen from above: pulling the door, stops at joint limits, and postures after mode changes."""
     fixing = record["mode"][0]
     changes = mode_sequence(record)
-    # A stop ends with the first mode other than the fixing mode, a recovery with the return to the fixing mode.
+    # A stop ends with the first mode other than the fixing mode; a recovery ends with the return to the fixing mode.
     stops = [
         (t, STOPPED if mode != fixing else "after switching modes")
         for (_, before), (t, mode) in pairwise(changes)
@@ -282,7 +282,7 @@ def door(record: Record) -> Figure:
     for k, (time, caption) in enumerate(shown):
         view = _view_at(record, time)
         if caption == STOPPED:
-            view = View(record, max(view.row - 1, 0))  # before the change that ends the stop
+            view = View(record, max(view.row - 1, 0))  # the sample before the change that ends the stop
         opened = opening(record)[view.row]
         titled.append((view, f"({'abcdefghijklmnop'[k]}) {caption}\n{view.time:.1f} s, {opened:.1f}°"))
     lines = {" " * start: titled[start : start + 3] for start in range(0, len(titled), 3)}
@@ -291,10 +291,10 @@ def door(record: Record) -> Figure:
 
 
 def picking_up(record: Record) -> Figure:
-    """Fig 13 of [T]: reaching, grasping, after picking up; with the object, if the scenario has one."""
+    """Draw Fig 13 of [T]: reaching, grasping and after picking up, with the object if the scenario has one."""
     closed = np.flatnonzero(record["gripper"])
     height = record["w"][closed, 2]
-    lifted = closed[np.argmax(height > height.max() - 1e-4)]  # the first time; later ones differ by rounding
+    lifted = closed[np.argmax(height > height.max() - 1e-4)]  # the first time; later ones differ only by rounding
     shown = ((closed[0] // 2, "1: reaching"), (closed[0], "2: grasping"), (lifted, "3: after picking up"))
     line = [(View(record, int(row)), f"{caption}, t = {record.time[row]:.1f} s") for row, caption in shown]
     return posture_strip(style.title(record, "picking up, as in Fig 13 of [T]"), line)

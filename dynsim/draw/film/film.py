@@ -1,4 +1,4 @@
-"""Film of one or several robots side by side, with a clock and a plot with a cursor, and its encoding as GIF or MP4."""
+"""Film of one robot or several side by side, with a clock and a plot with a time cursor, encoded as GIF or MP4."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from dynsim.system.arguments import names_wrong_types
 from dynsim.system.files import replacing
 from dynsim.system.terminal import plain
 
-# Signals plotted by default: the first one in a record, or in one of several records.
+# Signals plotted by default: the first of these that a record, or any of several records, contains.
 SIGNALS_OF_ONE = (
     "contact_normal_force",
     "wheel_load",
@@ -41,7 +41,7 @@ SIGNALS_OF_ONE = (
 SIGNALS_OF_SEVERAL = ("energy_electrical", "hand_error", "position_error", "tip_margin", "support_margin", "q", "phi")
 DPI = 100
 CURSOR = "#202428"
-# Number of columns of a signal that are drawn as lines (the largest); a band shows the range of all columns.
+# Number of columns of a signal that are drawn as lines (the largest by rms); a band shows the range of all columns.
 NAMED = 4
 # Minimum width of a plot with a legend next to it [pixel], and maximum length of a name in the legend.
 LEGEND_MIN, MAX_LETTERS = 400, 16
@@ -77,7 +77,7 @@ class Strip:
                 self._draw(records, self.signal)
 
     def frame(self, time: float) -> Image.Image | None:
-        """Return the plot with its cursor at a time [s], or None if there is nothing to plot."""
+        """Return the plot with its cursor at a time [s], or None if no signal can be plotted."""
         if self._image is None:
             return None
         image = self._image.copy()
@@ -121,7 +121,7 @@ class Strip:
         axes.set_ylim(*_limits([record[name] for record in having.values()]))
         if several or len(axes.lines) > 1:
             handles, labels = axes.get_legend_handles_labels()
-            # The range of all columns is first, because it is behind the lines.
+            # The range of all columns is the first entry, because it is drawn behind the lines.
             most = max((self._size[1] - 20) // LEGEND_ROW, 1)
             self.legend = tuple(labels[:most])
             look: dict[str, Any] = {"bbox_to_anchor": (1.0, 1.0), "fontsize": 6.5, "borderaxespad": 0.2}
@@ -132,7 +132,7 @@ class Strip:
 
 
 def largest(values: style.Array, count: int) -> list[int]:
-    """Return at most ``count`` columns of values, (T, n), with the largest rms values over time, in their order."""
+    """Return the indices of the ``count`` columns of values, (T, n), with the largest rms over time, in order."""
     effort = np.nan_to_num(values.astype(float) ** 2).sum(axis=0)
     return sorted(np.argsort(-effort, kind="stable")[:count].tolist())
 
@@ -160,7 +160,7 @@ def chosen(records: Mapping[str, Record], signal: str | None) -> str | None:
 
 
 def _limits(values: list[style.Array]) -> tuple[float, float]:
-    """Return the range of the axis, cutting off a spike that would compress the rest."""
+    """Return the range of the axis; a spike that would compress the rest of the curve is cut off."""
     pooled = np.concatenate([array.ravel() for array in values])
     pooled = pooled[np.isfinite(pooled)]
     if not len(pooled):
@@ -179,18 +179,18 @@ def _limits(values: list[style.Array]) -> tuple[float, float]:
 GIF_FPS_MAX = 50
 # Maximum number of pixels of all frames of a GIF; each takes one byte of memory.
 GIF_PIXELS_MAX = 1_000_000_000
-# Maximum number of frames of a film; more would take hours to paint.
+# Maximum number of frames in a film; more frames would take hours to render.
 FRAMES_MAX = 100_000
 # Number of frames from which the palette of a GIF is computed.
 SAMPLED = 6
 # Palette colours that differ by no more than this (of 255) are merged.
 NEARLY = 9
-# Quality parameter (CRF) of H.264: smaller values give better and larger files; 18 is nearly lossless.
+# Quality parameter (CRF) of H.264; smaller values give better quality and larger files, and 18 is nearly lossless.
 QUALITY = 20
 
 
 def check(kind: str, fps: int) -> None:
-    """Check format and frame rate before the first frame is painted.
+    """Check the format and the frame rate before the first frame is rendered.
 
     Raises
     ------
@@ -210,12 +210,12 @@ def check(kind: str, fps: int) -> None:
 def write_gif(
     stream: BinaryIO, frames: Iterable[Image.Image], sampled: Iterable[Image.Image], count: int, fps: int, last_s: float
 ) -> None:
-    """Write a GIF with one palette, computed from ``sampled`` frames, which avoids flicker.
+    """Write a GIF with a single palette, computed from ``sampled`` frames, which avoids flicker.
 
     ``last_s`` is the extra duration of the last frame [s].
     """
     palette = _palette(list(sampled))
-    # Hundredths of a second; rounding errors do not add up over the film.
+    # Times in hundredths of a second; rounding the end times avoids accumulating errors over the film.
     ends = np.rint(100.0 * np.arange(count + 1) / fps).astype(int)
     times = (10 * np.diff(ends)).tolist()
     times[-1] += round(1000 * last_s)
@@ -229,7 +229,7 @@ def _palette(frames: list[Image.Image]) -> Image.Image:
     sheet = Image.new("RGB", (width, height * len(frames)))
     for k, frame in enumerate(frames):
         sheet.paste(frame, (0, k * height))
-    # Fixed colours of marks, which have few pixels; similar colours are merged with them.
+    # Keep the colours of marks, which have few pixels; similar colours are merged with them.
     kept = np.array([ImageColor.getrgb(colour) for colour in (*VARIANT_COLOURS, PULLING, GREY, "#FFFFFF")])
     colours = sheet.quantize(120, method=Image.Quantize.MEDIANCUT).getpalette() or []
     others = np.array(colours, dtype=int).reshape(-1, 3)[:120]
@@ -240,7 +240,7 @@ def _palette(frames: list[Image.Image]) -> Image.Image:
 
 
 def write_mp4(stream: BinaryIO, frames: Iterable[Image.Image], fps: int, last_s: float) -> None:
-    """Write H.264 video that every browser and office program can play.
+    """Write an H.264 video that all browsers and office programs can play.
 
     ``last_s`` is the extra duration of the last frame [s].
 
@@ -280,7 +280,7 @@ def _av() -> Any:
 HEAD, PLOT = 26, 0.24
 # Minimum height of the plot, and minimum size of a film with a plot [pixel].
 PLOT_MIN, WITH_PLOT = 84, (240, 220)
-# Margin around a robot: maximum [pixel], and relative to a small frame.
+# Margin around a robot: maximum [pixel], and margin relative to a small frame.
 ROOM, ROOM_SHARE = 14, 0.05
 # Minimum width and height of the cell of one robot [pixel].
 CELL_MIN = 60
@@ -289,7 +289,7 @@ FPS_MAX, SPEED_MAX = 120, 1000.0
 
 
 class Film:
-    """Frames of records at equal steps of their common time.
+    """Frames of records at equal steps of their common time axis.
 
     Parameters
     ----------
@@ -304,7 +304,7 @@ class Film:
     fps : int, optional
         Frame rate [1/s], 1 to 120.
     plot : str, optional
-        Signal to plot below the robots; "" for no plot; default: chosen automatically if there is space.
+        Signal to plot below the robots; "" for no plot; default: a signal is chosen automatically if there is space.
 
     Attributes
     ----------
@@ -352,7 +352,7 @@ class Film:
         has_room = width >= WITH_PLOT[0] and height >= WITH_PLOT[1]
         if plot and not has_room:
             raise RecordError(
-                f"a film with a plot must be at least {WITH_PLOT[0]}x{WITH_PLOT[1]}, not {width}x{height}"
+                f"a film with a plot must be at least {WITH_PLOT[0]}x{WITH_PLOT[1]} pixels, got {width}x{height}"
             )
         self._strip = Strip(kept, strip, plot) if plot != "" and has_room else None
         has_plot = self._strip is not None and self._strip.signal is not None
@@ -471,7 +471,7 @@ def write(
     hold : float, optional
         Extra duration of the last frame [s], 0 to 60.
     plot : str, optional
-        Signal to plot below the robots; "" for no plot; default: chosen automatically if there is space.
+        Signal to plot below the robots; "" for no plot; default: a signal is chosen automatically if there is space.
     progress : callable, optional
         Called after each frame with the number of frames so far and in total.
 
@@ -483,8 +483,8 @@ def write(
     Raises
     ------
     RecordError
-        As for :class:`Film`; also if the format is unknown, PyAV is missing for an MP4, the film has too many frames,
-        or the file cannot be written.
+        In the same cases as for :class:`Film`, and if the format is unknown, PyAV is missing for an MP4, the film has
+        too many frames, or the file cannot be written.
 
     Examples
     --------
@@ -534,14 +534,14 @@ def _times(records: Mapping[str, Record], speed: float, fps: int) -> Array:
     start = min((float(record.time[0]) for record in records.values() if len(record)), default=0.0)
     end = max((float(record.time[-1]) for record in records.values() if len(record)), default=0.0)
     frames = (end - start) * fps / speed
-    if not frames < FRAMES_MAX:  # before the array of times is created
+    if not frames < FRAMES_MAX:  # check before the array of times is created
         raise RecordError(f"too many frames ({frames:.3g}, limit {FRAMES_MAX}); raise --speed or lower --fps")
     steps = math.ceil(round(frames, 6))
     return np.minimum(start + np.arange(steps + 1) * (speed / fps), end)
 
 
 def _layout(count: int, area: tuple[int, int, int, int], seen: Array) -> tuple[list[tuple[int, int]], tuple[int, int]]:
-    """Return positions and size of ``count`` cells in an area, in the rows and columns that show the robots largest.
+    """Return the positions and size of ``count`` cells in an area, arranged so that the robots appear largest.
 
     Parameters
     ----------

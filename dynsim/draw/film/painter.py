@@ -1,7 +1,7 @@
 """Frames of one robot: static background drawn once, moving faces drawn from far to near; drawing tools and camera.
 
-Painted with Pillow at ``FINER`` times the size and then reduced, which smooths all edges. Faces are sorted by the depth
-of their centres, which suffices for faces that are small compared with their distances.
+Frames are painted with Pillow at ``FINER`` times their size and then reduced, which smooths all edges. Faces are sorted
+by the depth of their centres, which is sufficient for faces that are small compared with their distances.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ def arrow(draw: ImageDraw.ImageDraw, tail: Array, head: Array, colour: str, widt
 
 
 def ring(draw: ImageDraw.ImageDraw, x: float, y: float, radius: float, colour: str, width: int) -> None:
-    """Draw a circle around a dot [pixel]."""
+    """Draw a circle with a dot at its centre [pixel]."""
     draw.circle((x, y), radius, outline=colour, width=width)
     draw.circle((x, y), 2, fill=colour)
 
@@ -113,7 +113,7 @@ def labels(
     draw : ImageDraw
         Target of the drawing.
     texts : sequence of tuple
-        Text, centre of its lower edge (2,) [pixel], colour.
+        Text, centre of its lower edge, (2,) [pixel], and colour.
     face : FreeTypeFont
         Font.
     size : tuple of int
@@ -133,7 +133,7 @@ def labels(
         x = min(max(float(anchor[0]) - 0.5 * width, 0.0), size[0] - width)
         y = min(max(float(anchor[1]) - height, 0.0), size[1] - height)
         for _ in texts:
-            # Move it above the labels that it would hide.
+            # Move the label above the labels that it would hide.
             hidden = [box for box in boxes if x < box[2] and box[0] < x + width and y < box[3] and box[1] < y + height]
             if not hidden:
                 break
@@ -190,12 +190,12 @@ TRIANGLES = 20_000
 PAPER, GROUND, LINES, FAINT, SURFACE = "#FFFFFF", "#F1F3F5", "#D3D8DE", "#ECEEF1", "#C9D3DE"
 BODY, HUB, WHEEL, SUPPORT = "#AEB7C4", "#4A5260", "#3A4048", "#D5EAF8"
 FRICTION = "#7A3E9D"
-# Friction forces below this fraction of the largest normal force have no arrow.
+# Friction forces below this fraction of the largest normal force are drawn without an arrow.
 MIN_FRICTION_SHARE = 1e-3
 MODES = {0: GREY, 1: ORANGE, 2: GREEN}
 # Direction to the light in view coordinates: right, up, towards the viewer.
 LIGHT = np.array([-0.35, 0.75, 0.56]) / np.linalg.norm([-0.35, 0.75, 0.56])
-# Image height below which texts are smaller [pixel].
+# Image height below which a smaller font is used [pixel].
 SMALL_HEIGHT = 200
 # Maximum number of points of a path.
 PATH_POINTS = 600
@@ -205,7 +205,7 @@ PATH_POINTS = 600
 class _Solids:
     """Faces of all moving solids: corners in body frames, faces with four corners, colours.
 
-    ``aside``: displacement of the corners by an open and a closed gripper, (2, n, 3) [m].
+    ``aside`` contains the displacements of the corners for an open and a closed gripper, (2, n, 3) [m].
     """
 
     corners: Array
@@ -224,7 +224,7 @@ class Painter:
     robot : DrawnRobot
         Robot to paint.
     camera : Camera
-        Camera for an image of ``FINER`` times the size.
+        Camera for an image that is ``FINER`` times as large.
     size : tuple of int
         Width and height of the image [pixel].
     bounds : tuple of ndarray
@@ -257,7 +257,7 @@ class Painter:
         self._fixed = [shown for shape in robot.scene.fixed if (shown := drawn_shape(shape, meshes)) is not None]
         self._meshes = simplified(meshes.unique, TRIANGLES)
         self._wheels = wheel_groups(record, robot.scene)
-        # The body with the gripper.
+        # Find the body that carries the gripper.
         hand = robot.scene.hand
         self._grip = gripping(record)
         self._gripped = hand.body if hand is not None and self._grip is not None else WORLD
@@ -268,7 +268,7 @@ class Painter:
         self._paths = dict(paths(record, robot.scene))
         self._supports = supports(robot.scene, self._wheels)
         self._pressure = cop_of(record)
-        # Smaller text in the smaller images of several robots.
+        # Use smaller text in the smaller images of several robots.
         self._font = font((13 if size[1] >= SMALL_HEIGHT else 11) * FINER)
         self.labels: list[Box] = []
         self._still = self._background(*bounds)
@@ -290,13 +290,13 @@ class Painter:
                 self._paint_sunk(draw, point, position, turn, row, share)
             forces = [self._paint_contact(draw, contact, position, turn, row, share) for contact in self._contacts]
             self._paint_hand(draw, position, turn)
-            # Last, so that labels are on top.
+            # Paint texts last, so that they are on top.
             self._paint_grip_state(draw, row)
             self.labels = labels(draw, [force for force in forces if force], self._font, image.size, PAPER)
         return image.reduce(FINER)
 
     def _pose(self, time: float) -> tuple[Array, Array, int, float]:
-        """Return positions and orientations of all bodies at a time, the preceding sample and the fraction after it."""
+        """Return the positions and orientations of all bodies at a time, the last sample and the fraction after it."""
         row, share = 0, 0.0
         if len(self._time) > 1:
             row = int(np.clip(np.searchsorted(self._time, time, side="right") - 1, 0, len(self._time) - 2))
@@ -341,7 +341,7 @@ class Painter:
         return [(shape, side * np.outer(both["aside"], [0.0, 1.0, 0.0])) for side in (-1.0, 1.0)]
 
     def _colours(self, shape: dict[str, Any], faces: int, plain: str) -> Array:
-        """Return the colours of the faces of a shape, (n, 3): from the shape, from its mesh file, or a default."""
+        """Return the colours of a shape's faces, (n, 3): from the shape, its mesh file, or a default colour."""
         colours = np.tile(np.array(_rgb(plain), dtype=float), (faces, 1))
         if "colour" in shape:
             colours[:] = 255.0 * np.array(shape["colour"][:3])
@@ -374,7 +374,7 @@ class Painter:
         return image
 
     def _paint_surface(self, draw: ImageDraw.ImageDraw, surface: SceneSurface, low: Array, high: Array) -> None:
-        """Paint a small sphere or cylinder as a closed solid, any other surface as a patch near the robot."""
+        """Paint a small sphere or cylinder as a closed solid, and any other surface as a patch near the robot."""
         colour = np.array(_rgb(SURFACE))
         round_one = surface.kind in ("sphere", "cylinder")
         drawn = drawn_surface(surface, low, high) if round_one else {"kind": surface.kind}
@@ -385,11 +385,11 @@ class Painter:
         radius = float(drawn["radius"])
         shape = {"q": HERE, **drawn, "size": [abs(radius), drawn.get("length", 0.0)]}
         corners, faces = solid(shape, [], finer=3)
-        # If the robot is inside, the far wall is visible.
+        # If the robot is inside the surface, only the far wall must be visible.
         self._paint_faces(draw, corners, faces if radius > 0.0 else faces[:, ::-1], colour)
 
     def _paint_floor(self, draw: ImageDraw.ImageDraw, low: Array, high: Array, z: float, *, real: bool = True) -> None:
-        """Paint a horizontal plane with a grid (in side view, the area below it), or only the grid if not ``real``."""
+        """Paint a horizontal plane with a grid (in side view: the area below), or only the grid if not ``real``."""
         width, height = (side * FINER for side in self.size)
         up = float(self.camera.axes[2][2])
         level = float(self.camera.project(np.array([*(0.5 * (low + high))[:2], z]))[1])
@@ -399,7 +399,7 @@ class Painter:
             draw.rectangle([0, level, width, height], fill=GROUND)
             draw.line([0, level, width, level], fill=GREY, width=FINER)
             return
-        # Visible part: the corners of the image projected along the line of sight.
+        # The visible part is the corners of the image, projected along the line of sight.
         seen = np.array([[0.0, 0.0], [width, 0.0], [width, height], [0.0, height]])
         flat = (seen - self.camera.middle) * np.array([1.0, -1.0]) / self.camera.scale
         points = self.camera.origin + flat @ self.camera.axes[:2]
@@ -440,10 +440,10 @@ class Painter:
         *,
         both: bool = False,
     ) -> None:
-        """Paint faces that are turned to the viewer (or ``both`` sides), from far to near, lit from the upper left."""
+        """Paint faces that face the viewer (or ``both`` sides), from far to near, lit from the upper left."""
         seen = self.camera.project(corners)
         shown = seen[faces]
-        # Area and direction from the diagonals; this also works for a triangle that repeats a corner.
+        # Compute area and direction from the diagonals; this also works for a triangle that repeats a corner.
         a, b = shown[:, 2] - shown[:, 0], shown[:, 3] - shown[:, 1]
         scale = np.array([1.0, -1.0, self.camera.scale])
         normal = np.cross(a * scale, b * scale)
@@ -470,7 +470,7 @@ class Painter:
         return outline(np.array(points)) if points else np.zeros((0, 2))
 
     def _paint_pressure(self, draw: ImageDraw.ImageDraw, hull: Array, row: int) -> None:
-        """Paint a ring at the centre of pressure or mass; orange outside the support polygon."""
+        """Paint a ring at the centre of pressure or mass, in orange if it is outside the support polygon."""
         if self._pressure is None or not np.isfinite(self._pressure[1][row]).all():
             return
         at = self._pressure[1][row]
@@ -489,7 +489,7 @@ class Painter:
     ) -> tuple[str, Array, str] | None:
         """Paint arrows of the normal and total force: away from the surface if it pushes, towards it if it pulls.
 
-        Returns the text of the force, its position [pixel] and colour, or None without a force.
+        Returns the text that states the force, its position [pixel] and colour, or None without a force.
         """
         if contact.at is None:
             at = _on(contact.point.body, np.array(contact.point.position), position, turn)
@@ -525,7 +525,7 @@ class Painter:
     def _paint_force(
         self, draw: ImageDraw.ImageDraw, at: Array, force: Array, pulls: bool, colour: str, width: int
     ) -> Array:
-        """Paint the arrow of a force [N] at a contact, on the free side; return its far end [pixel]."""
+        """Paint the arrow of a force [N] at a contact, on the free side; return the far end of the arrow [pixel]."""
         size = float(np.linalg.norm(force))
         long = max(0.13 * self.robot.reach * min((size / self._full) ** 0.5, 1.6), 14.0 * FINER / self.camera.scale)
         here = self.camera.project(at)[:2]
@@ -564,6 +564,6 @@ def _on(body: int, point: Array, position: Array, turn: Array) -> Array:
 
 
 def _finite_path(points: Array) -> Array:
-    """Return the finite points of a path, at most ``PATH_POINTS``."""
+    """Return the finite points of a path, thinned to at most ``PATH_POINTS``."""
     points = points[np.isfinite(points).all(axis=1)]
     return points[np.linspace(0, len(points) - 1, min(len(points), PATH_POINTS)).astype(int)] if len(points) else points

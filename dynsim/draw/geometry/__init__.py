@@ -1,1 +1,1 @@
-"""Geometry of the robots and surfaces of a record, for figures, films and pages."""
+"""Geometry of the robots and surfaces in a record, for figures, films and pages."""

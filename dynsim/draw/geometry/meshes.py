@@ -1,4 +1,4 @@
-"""Meshes of URDF robots: found, read once each, and simplified to a number of triangles for a page or film."""
+"""Meshes of URDF robots: search for mesh files, read each once, and limit the number of triangles in a page or film."""
 
 from __future__ import annotations
 
@@ -48,9 +48,9 @@ class Mesh(NamedTuple):
 
 
 def read_mesh(path: Path) -> Mesh:
-    """Read a mesh file (STL, OBJ or COLLADA), in the frame and unit of URDF.
+    """Read a mesh file (STL, OBJ or COLLADA) in the frame and units of URDF.
 
-    The unit of a COLLADA file is applied; its upward axis is ignored, as in other robot viewers.
+    The unit of a COLLADA file is applied; its up axis is ignored, as in other robot viewers.
 
     Raises
     ------
@@ -68,7 +68,7 @@ def read_mesh(path: Path) -> Mesh:
         raise RecordError(f"{path}: cannot read mesh: {' '.join(str(error).split())[:200]}") from error
     corners, triangles, colours = mesh
     if not len(triangles) or triangles.min() < 0 or triangles.max() >= len(corners):
-        raise RecordError(f"{path}: has no triangles, or triangles with invalid corner indices")
+        raise RecordError(f"{path}: the mesh has no triangles, or triangles with invalid corner indices")
     good = np.isfinite(corners[triangles]).all(axis=(1, 2))
     return Mesh(corners, triangles[good], None if colours is None else colours[good])
 
@@ -117,7 +117,7 @@ def _collada(content: bytes) -> Mesh:
         raise ValueError("a zip archive, not a COLLADA text; unpack it")
     content = _utf8(content)
     _ColladaBudget(content).check()
-    # Remove invalid colours: otherwise the geometry that uses them would be lost.
+    # Remove invalid colours; otherwise the geometry that uses them would be lost.
     content = _COLOUR.sub(lambda match: match[0] if len(match[1].split()) > 2 else b"", content)
     for text in (content, re.sub(b"<bind_material>.*?</bind_material>", b"", content, flags=re.DOTALL)):
         document = collada.Collada(io.BytesIO(text), ignore=[collada.DaeError])
@@ -248,7 +248,7 @@ _PRIMITIVES = ("triangles", "polylist", "polygons", "trifans", "tristrips", "lin
 
 
 def _diffuse(material: Any) -> Array:
-    """Return red, green and blue of a material from 0 to 1; NaN if it has a texture or no colour."""
+    """Return the red, green and blue of a material from 0 to 1; NaN if it has a texture or no colour."""
     colour = getattr(material.effect, "diffuse", None)
     if isinstance(colour, tuple) and len(colour) > 2 and np.isfinite(colour[:3]).all():
         return np.clip(colour[:3], 0.0, 1.0)
@@ -257,19 +257,20 @@ def _diffuse(material: Any) -> Array:
 
 # Maximum number of triangles of all meshes of a page, about 1 MB.
 TRIANGLES = 100_000
-# Corners closer than this fraction of the mesh size are merged; STL repeats them for every triangle.
+# Corners closer than this fraction of the mesh size are merged; STL files repeat corners for every triangle.
 _WELD = 2.0**-20
-# Fractions for merging before a mesh is simplified, because thin triangles, frequent in CAD meshes, hinder
-# simplification. The next fraction is tried if more than this multiple of the allowed triangles is left.
+# Fractions of the mesh size for merging corners before a mesh is simplified, because thin triangles, which are frequent
+# in CAD meshes, hinder simplification. The next fraction is tried if more than _TOO_MANY times the allowed number of
+# triangles remains.
 _COARSE, _TOO_MANY = (1 / 500, 1 / 250, 1 / 120, 1 / 60, 1 / 30), 1.5
-# Parameter of fast_simplification: edges are collapsed up to an error of 1 % of the size.
+# Aggressiveness parameter of fast_simplification; edges are collapsed up to an error of 1 % of the mesh size.
 _AGGRESSIVENESS = 2.5
 # Minimum number of triangles of a solid (a tetrahedron).
 _MIN_TRIANGLES = 4
 
 
 class Meshes:
-    """Set of distinct meshes; mesh files are searched for in the folder of the robot file of a record."""
+    """Set of distinct meshes; mesh files are searched for in the folder of a record's robot file."""
 
     def __init__(self) -> None:
         self.unique: list[Mesh] = []
@@ -307,7 +308,10 @@ class Meshes:
         return missing + [f"{reason}; a rod instead" for reason in self._unreadable]
 
     def _places(self, file: str) -> Iterator[Path]:
-        """Yield possible paths of a mesh: next to the robot file, or in its package, as in ROS or above that file."""
+        """Yield possible paths of a mesh: next to the robot file, or in its package.
+
+        Packages are searched for as in ROS, and in the folders above the robot file.
+        """
         if not file.startswith("package://"):
             for folder in self._folders:
                 yield folder / file.removeprefix("file://")
@@ -350,19 +354,19 @@ def welded(mesh: Mesh, near: float = _WELD) -> Mesh:
     Raises
     ------
     ValueError
-        If nothing is left.
+        If no triangles remain.
     """
     corners, triangles, colours = mesh
     low, size = _box(corners[triangles])
     if not size > 0.0:
-        raise ValueError("a mesh without size")
+        raise ValueError("the mesh has zero size")
     _, first, number = np.unique(
         np.rint((corners - low) / (near * size)), axis=0, return_index=True, return_inverse=True
     )
     faces = number.reshape(-1)[triangles]
     whole = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
     if not whole.any():
-        raise ValueError("a mesh without faces")
+        raise ValueError("the mesh has no faces")
     used, faces = np.unique(faces[whole], return_inverse=True)
     return Mesh(corners[first[used]], faces.reshape(-1, 3), None if colours is None else colours[whole])
 
@@ -377,8 +381,9 @@ def _box(corners: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
 def simplified(meshes: Sequence[Mesh], most: int = TRIANGLES) -> list[Mesh]:
     """Simplify meshes to about ``most`` triangles in total; smaller meshes are unchanged.
 
-    Edges collapse where the surface changes least (quadric error metrics, Garland and Heckbert 1997). Parts of one
-    colour are simplified separately, the largest first, and keep their borders, so that no gaps open between them.
+    Edges are collapsed in the places where this changes the surface least (quadric error metrics, Garland and Heckbert
+    1997). Parts with different colours are simplified separately, the largest first, and keep their borders, so that no
+    gaps open between them.
     """
     limit = _limit([len(rows) for mesh in meshes for rows in _by_colour(mesh)], most)
     return [_simplified(mesh, limit) for mesh in meshes]
@@ -408,7 +413,7 @@ def _by_colour(mesh: Mesh) -> list[NDArray[np.intp]]:
 
 
 def _limit(counts: Sequence[int], most: int) -> int:
-    """Return the size to which larger parts must be reduced, so that all parts have ``most`` triangles in total."""
+    """Return the size to which larger parts must be reduced so that all parts together have ``most`` triangles."""
     left = most
     for k, count in enumerate(sorted(counts)):
         share = left // (len(counts) - k)
@@ -427,7 +432,7 @@ def _decimated(mesh: Mesh, rows: NDArray[np.intp], most: int) -> Mesh:
         return Mesh(corners, faces, paint)
     from fast_simplification import simplify
 
-    # Scaled to unit size, because the thresholds are lengths and a mesh may be in millimetres.
+    # Scale to unit size, because the thresholds are lengths and a mesh may be in millimetres.
     low, size = _box(corners)
     unit = (corners - low) / size
     fewer, faces = simplify(unit, faces.astype(np.int32), target_count=most, agg=_AGGRESSIVENESS, preserve_border=True)

@@ -1,4 +1,4 @@
-"""Moving robot of a record for pages and films: bodies, wheels, surfaces, poses, paths, contacts, penetrations."""
+"""Moving robot in a record, for pages and films: bodies, wheels, surfaces, poses, paths, contacts, penetrations."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from dynsim.record.scene import NOT_BELOW, WORLD, Point, Scene, Vector3
 Array = NDArray[np.float64]
 # Maximum error of poses interpolated between the frames of a page [m].
 POSE_ERROR = 4e-5
-# Maximum number of frames; longer runs have fewer frames than POSE_ERROR requires.
+# Maximum number of frames in a page; longer runs have fewer frames than POSE_ERROR requires.
 FRAMES = 20_000
 WORLD_AXES = np.eye(3)
 HERE_POINT: Vector3 = (0.0, 0.0, 0.0)
@@ -34,7 +34,7 @@ def robots(records: Mapping[str, Record]) -> dict[str, DrawnRobot]:
     """
     drawn = {name: robot for name, record in records.items() if (robot := robot_of(record)) is not None}
     if not drawn:
-        raise RecordError("nothing to view: a record needs samples, a scene, and the poses of its bodies")
+        raise RecordError("no record can be viewed: a record needs samples, a scene, and the poses of its bodies")
     return drawn
 
 
@@ -49,12 +49,12 @@ class DrawnRobot:
 
 
 def gripping(record: Record) -> Array | None:
-    """Return the state of the gripper, (T,): its number, or 1 if closed; None without a gripper."""
+    """Return the state of the gripper, (T,): the number of the state, or 1 if closed; None without a gripper."""
     return next((record[name] for name in ("gripper_state", "gripper") if name in record), None)
 
 
 def placed(record: Record) -> tuple[Scene | None, str]:
-    """Return the scene of a record with body poses, or None and the reason."""
+    """Return the scene of a record with body poses, or None and the reason why it cannot be used."""
     scene = record.scene
     if scene is None or not scene.bodies:
         return None, "the record has no scene"
@@ -80,13 +80,13 @@ def robot_of(record: Record) -> DrawnRobot | None:
 
 
 def _frames(record: Record, reach: float) -> NDArray[np.intp]:
-    """Return every 2^n-th sample and the last, such that the others can be interpolated to ``POSE_ERROR``."""
+    """Return every 2^n-th sample and the last, so that interpolation of the others is accurate to ``POSE_ERROR``."""
     count = len(record)
     position, turn = record[POSITION].reshape(count, -1), record[ORIENTATION].reshape(count, -1)
     stride, arm = 1, min(reach, 1.0)
     while 4 * stride < count:
         rows = _every(count, 2 * stride)
-        # Omitted samples, and the ends of their intervals.
+        # Compare the omitted samples with the ends of their intervals.
         between = np.delete(np.arange(count), rows)
         left = np.searchsorted(rows, between) - 1
         a, b = rows[left], rows[left + 1]
@@ -111,7 +111,7 @@ def bounds(robots: Sequence[DrawnRobot], axes: Array = WORLD_AXES) -> tuple[Arra
     """Return the corners, (3,) and (3,) [m], of the box along ``axes``, (3, 3), in which everything moves."""
     pooled = moving(robots) @ axes.T
     low, high = pooled.min(axis=0), pooled.max(axis=0)
-    # A robot that hardly moves does not fill the window, and a flat scene has some depth.
+    # A robot that hardly moves must not fill the window, and a flat scene needs some depth.
     span, reach = float((high - low).max()), max(robot.reach for robot in robots)
     smallest = max(0.24 * span, 0.6 * reach if span < 0.6 * reach else 0.0)
     room = np.maximum(0.5 * (smallest - (high - low)), 0.0) + 0.03 * smallest + max(map(_thickness, robots))
@@ -127,7 +127,7 @@ def moving(robots: Sequence[DrawnRobot]) -> Array:
             record[POSITION].reshape(-1, 3).astype(np.float64),
             *(path for _, path in paths(record, robot.scene)),
         ]
-        # The last samples of a diverging run are far from all others.
+        # The last samples of a diverging run are far away from all other samples.
         points += clouds if record.complete else [_without_ends(cloud) for cloud in clouds]
         for shape in robot.scene.fixed:
             middle, half = np.array(shape.position), 0.5 * max(shape.size) if shape.kind != "mesh" else 0.0
@@ -143,7 +143,7 @@ def _without_ends(points: Array) -> Array:
 
 
 def _thickness(robot: DrawnRobot) -> float:
-    """Return approximately how far shapes extend from the lines between bodies [m]."""
+    """Return the approximate distance by which shapes extend from the lines between bodies [m]."""
     shapes = [shape for body in robot.scene.bodies for shape in body.shapes]
     round_ = [shape.size[0] for shape in shapes if shape.kind in ("cylinder", "capsule", "sphere")]
     boxes = [0.5 * sorted(shape.size)[1] for shape in shapes if shape.kind == "box"]
@@ -152,9 +152,9 @@ def _thickness(robot: DrawnRobot) -> float:
 
 
 def azimuth(robots: Sequence[DrawnRobot]) -> float:
-    """Return the horizontal direction of the largest extent of robot and hand, (−π/2, π/2] about z [rad].
+    """Return the horizontal direction of the largest extent of robot and hand path, (−π/2, π/2] about z [rad].
 
-    The page looks across this direction.
+    The viewing direction of the page is perpendicular to this direction.
     """
     clouds = [robot.record[POSITION][robot.rows][..., :2].reshape(-1, 2).astype(np.float64) for robot in robots]
     clouds += [path[robot.rows, :2] for robot in robots for _, path in paths(robot.record, robot.scene)]
@@ -191,9 +191,9 @@ class DrawnContact:
     tangent : (T, 3) ndarray or None
         Tangential force [N], if recorded.
     mode : (T,) ndarray or None
-        0 open, 1 slips, 2 sticks, under the unilateral law.
+        Mode under the unilateral law: 0 open, 1 sliding, 2 sticking.
     at : (T, 3) ndarray or None
-        Position of the force on a sphere or capsule [m]; None: the point itself.
+        Position at which the force acts on a sphere or capsule [m]; None: the force acts at the point itself.
     """
 
     point: Point
@@ -241,7 +241,7 @@ class Penetration:
     body, position : int, tuple of float
         Index of the body, and point in its frame [m].
     least : float
-        Smallest depth that counts [m]: the radius plus the resolution of the poses.
+        Smallest depth that counts as a penetration [m]: the radius plus the resolution of the poses.
     depth : (T,) ndarray
         Depth below the surface [m], negative above it.
     """
@@ -255,9 +255,10 @@ class Penetration:
 
 
 def penetrations(record: Record, scene: Scene, rows: NDArray[np.intp] | slice = slice(None)) -> list[Penetration]:
-    """Return joints, and the hand, that are below surfaces at samples of the record.
+    """Return the joints, and the hand, that are below surfaces at samples of the record.
 
-    Surfaces support only declared contact points. Bodies of a mobile base and wheels are excluded.
+    This can happen because surfaces support only declared contact points. Bodies of a mobile base and wheels are
+    excluded.
     """
     wheels = {k for k, body in enumerate(scene.bodies) if body.joint.signal == "rho"} | set(scene.base)
     points = [(body.joint.name, k, HERE_POINT) for k, body in enumerate(scene.bodies) if k not in wheels]
@@ -276,7 +277,7 @@ def penetrations(record: Record, scene: Scene, rows: NDArray[np.intp] | slice = 
 
 
 def largest_force(contacts: Sequence[DrawnContact]) -> float:
-    """Return the force with an arrow of full length [N]: the 98th percentile, so that a peak does not shrink others."""
+    """Return the force whose arrow has full length [N]: the 98th percentile, so that peaks do not shrink the others."""
     sizes = np.abs(np.concatenate([contact.force for contact in contacts])) if contacts else np.zeros(0)
     sizes = sizes[np.isfinite(sizes)]
     return max(float(np.percentile(sizes, 98.0)) if len(sizes) else 1.0, 1e-6)

@@ -15,14 +15,15 @@ from dynsim.record.poses import ORIENTATION, POSITION
 from dynsim.record.quaternion import of_turn, rotated
 from dynsim.record.scene import HERE, WORLD, Body, Scene, SceneSurface, Shape
 
-# Points along each side of the drawn part of a curved surface, and along each side of a box face.
+# Number of points along each side of the drawn part of a curved surface, and along each side of a box face.
 PATCH, FACE = 41, 13
 
 
 def surface_grids(surface: SceneSurface, low: Array, high: Array) -> list[Array]:
     """Return grids of points on a surface, (n, m, 3) [m] each; NaN marks missing points.
 
-    They cover a height field, the six faces of a box, or the part of a quadric near the box from ``low`` to ``high``.
+    The grids cover a height field, the six faces of a box, or the part of a quadric near the box from ``low`` to
+    ``high``.
     """
     if surface.kind == "height_field":
         x, y = np.meshgrid(*surface.grid)
@@ -45,9 +46,9 @@ def _box_faces(surface: SceneSurface) -> list[Array]:
 
 
 def quadric_patch(surface: SceneSurface, low: Array, high: Array) -> Array:
-    """Return points of a quadric above its tangent plane near a box, at the root of C nearest along the normal.
+    """Return points of a quadric near a box, each at the root of C nearest along the normal of a tangent plane.
 
-    With r = r₀ + s n on the normal n, C(r) = a s² + b s + c, where a = n·Q n/2, b = n·(Q r₀ + b) and c = C(r₀).
+    With r = r₀ + s n along the normal n, C(r) = a s² + b s + c, where a = n·Q n/2, b = n·(Q r₀ + b) and c = C(r₀).
 
     Parameters
     ----------
@@ -59,8 +60,8 @@ def quadric_patch(surface: SceneSurface, low: Array, high: Array) -> Array:
     Returns
     -------
     (n, n, 3) ndarray
-        Points [m]; NaN without a root, or if the root is farther than the longest edge of the box. A plane has only
-        four corners, so that it has no seams.
+        Points [m]; NaN if there is no root, or if the root is farther away than the longest edge of the box. A plane
+        has only four corners, so that it has no seams.
     """
     anchor, normal = 0.5 * (low + high), np.array([0.0, 0.0, 1.0])
     for _ in range(20):
@@ -68,7 +69,7 @@ def quadric_patch(surface: SceneSurface, low: Array, high: Array) -> Array:
             return np.full((2, 2, 3), np.nan)
         normal = surface.normal(anchor)
         anchor = anchor - surface.gap(anchor) * normal
-    # Along the axes of the world if possible.
+    # The grid is along the axes of the world if possible.
     across = np.eye(3)[:2] if abs(normal[2]) > 0.99 else np.linalg.svd(normal[None])[2][1:]
     reach = (box_corners(low, high) - anchor) @ across.T
     Q = np.array(surface.Q)
@@ -80,7 +81,7 @@ def quadric_patch(surface: SceneSurface, low: Array, high: Array) -> Array:
     c = surface.value(start)
     inside = b * b - 4.0 * a * c
     with np.errstate(all="ignore"):
-        # The smaller root, in the form that also holds for a = 0.
+        # Compute the smaller root in the form that also holds for a = 0.
         step = -2.0 * c / (b + np.copysign(np.sqrt(np.where(inside >= 0.0, inside, np.nan)), b))
     points = start + step[..., None] * normal
     points[~(np.abs(step) <= float((high - low).max()))] = np.nan
@@ -88,10 +89,10 @@ def quadric_patch(surface: SceneSurface, low: Array, high: Array) -> Array:
 
 
 def round_patch(surface: SceneSurface, low: Array, high: Array) -> Array:
-    """Return points of a sphere or cylinder, (n, n, 3) [m]: all of a small one, or the part nearest to a box.
+    """Return points of a sphere or cylinder, (n, n, 3) [m]: the whole surface if it is small, or the part near a box.
 
-    The meridians or generators start at the point nearest to the box, so that the part has a smooth edge. On a sphere
-    it is an ellipse as long and as wide as the box, but at least half as wide as long.
+    The meridians or generators start at the point nearest to the box, so that the part has a smooth edge. On a sphere,
+    the part is an ellipse that is as long and as wide as the box, but at least half as wide as it is long.
     """
     centre, radius = np.array(surface.position), abs(float(surface.radius or 0.0))
     middle, reach = 0.5 * (low + high), 0.6 * float(np.linalg.norm(high - low))
@@ -107,7 +108,7 @@ def round_patch(surface: SceneSurface, low: Array, high: Array) -> Array:
     towards = away / size
     turn = np.linspace(-1.0, 1.0, PATCH)
     if axis is None:
-        # Along the longest edge of the box that does not point to the centre; the box may be much longer than wide.
+        # Use the longest edge of the box that does not point to the centre; the box may be much longer than it is wide.
         edges = np.eye(3)[np.argsort(low - high)]
         along = next(edge for edge in edges if abs(edge @ towards) < 0.9)
         along = along - towards * (along @ towards)
@@ -151,18 +152,18 @@ def box_about(clouds: Sequence[Array], room: float = 0.0) -> tuple[Array, Array]
 
 Array = NDArray[np.float64]
 Faces = NDArray[np.int64]
-# Number of faces around a round solid, and between its equator and a pole.
+# Number of faces around a round solid, and from its equator to a pole.
 AROUND, RINGS = 28, 4
-# Number of short pieces at each end of a long rod, as long as its radius.
+# Number of short pieces, each as long as the radius, at each end of a long rod.
 ENDS = 3
 # Radius of a rod drawn for a body without shapes, relative to the reach of the robot.
 ROD = 0.008
-# A spherical or cylindrical surface larger than this multiple of the view is drawn only near the robot.
+# A spherical or cylindrical surface is drawn only near the robot if it is larger than this multiple of the view.
 LARGE = 4.0
 
 
 def drawn_shape(shape: Shape, meshes: Meshes) -> dict[str, Any] | None:
-    """Return a shape in the format of the page, or None if its mesh was not found."""
+    """Return a shape in the data format of the page, or None if its mesh was not found."""
     drawn: dict[str, Any] = {
         "kind": shape.kind,
         "size": list(shape.size),
@@ -188,7 +189,7 @@ def body_shapes(scene: Scene, reach: float, meshes: Meshes) -> list[list[dict[st
     for k, body in enumerate(scene.bodies):
         shapes = [shown for shape in body.shapes if (shown := drawn_shape(shape, meshes)) is not None]
         wanted = [child for child in scene.bodies if child.parent == k]
-        # A rod extends from its joint, a wheel surrounds it.
+        # A rod extends from its joint, whereas a wheel surrounds its joint.
         bare = not shapes or (_is_tube(body) and np.abs(body.shapes[0].position).max() > 1e-9)
         if not shapes and k not in base:
             ends = [np.array(child.joint.position) for child in wanted if not child.joint.part_of]
@@ -207,7 +208,7 @@ def body_shapes(scene: Scene, reach: float, meshes: Meshes) -> list[list[dict[st
 
 
 def _stems(scene: Scene, k: int) -> list[dict[str, Any]]:
-    """Return thin rods to the hand of a body whose first shape ends before the hand."""
+    """Return thin rods from a body to the hand if the first shape of the body ends before the hand."""
     tube = scene.bodies[k].shapes[0]
     far = float(np.linalg.norm(tube.position)) + 0.5 * tube.size[1] + tube.size[0]
     ends = [np.array(point.position) for point in scene.points if point.role == "hand" and point.body == k]
@@ -223,13 +224,16 @@ def thinnest(shapes: list[list[dict[str, Any]]]) -> float:
 
 
 def gripper(shapes: list[list[dict[str, Any]]], reach: float) -> dict[str, Any]:
-    """Return two fingers at the hand, as boxes in its body frame [m]: distance ahead, and aside open and closed."""
+    """Return two gripper fingers as boxes in the frame of the hand's body [m].
+
+    The result contains their forward distance, and their lateral distances when open and when closed.
+    """
     size = max(1.7 * thinnest(shapes), 0.012 * reach)
     return {"size": [1.6 * size, 0.4 * size, 0.8 * size], "ahead": 0.5 * size, "aside": [0.8 * size, 0.28 * size]}
 
 
 def _is_tube(body: Body) -> bool:
-    """Return whether a body is drawn as a rod of dynsim: its first shape is a cylinder or capsule without colour."""
+    """Return whether dynsim draws a body as a rod: its first shape is a cylinder or capsule without a colour."""
     return bool(body.shapes) and body.shapes[0].kind in ("cylinder", "capsule") and body.shapes[0].colour is None
 
 
@@ -255,7 +259,7 @@ def _hub(body: Body, radius: float) -> dict[str, Any]:
 
 
 def from_z(direction: Array) -> Array:
-    """Return a rotation from z to a unit vector, (4,)."""
+    """Return a rotation that maps the z axis to a unit vector, as a quaternion, (4,)."""
     axis = np.cross([0.0, 0.0, 1.0], direction)
     size = float(np.linalg.norm(axis))
     if size < 1e-12:
@@ -264,7 +268,7 @@ def from_z(direction: Array) -> Array:
 
 
 def drawn_surface(surface: SceneSurface, low: Array, high: Array) -> dict[str, Any]:
-    """Return a surface near the box from ``low`` to ``high``, in which everything moves, in the format of the page."""
+    """Return a surface in the data format of the page, near the box ``low`` to ``high`` in which everything moves."""
     drawn: dict[str, Any] = {"name": surface.name, "kind": surface.kind}
     span = float((high - low).max())
     near = abs(surface.radius or 0.0) <= LARGE * span
@@ -314,7 +318,7 @@ def solid(shape: dict[str, Any], meshes: list[Mesh], finer: int = 1) -> tuple[Ar
     elif shape["kind"] == "box":
         corners, faces = _box(np.array(size))
     else:
-        # Radius and height of rings, from bottom to top.
+        # Radii and heights of rings, from bottom to top.
         rings_each = RINGS * finer
         angle = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 2 * rings_each + 1)
         radius = size[0]
@@ -335,9 +339,9 @@ def solid(shape: dict[str, Any], meshes: list[Mesh], finer: int = 1) -> tuple[Ar
 def _cuts(radius: float, half: float) -> Array:
     """Return heights from −half to half at which a round side is cut into pieces.
 
-    The pieces are as long as the radius, in a long rod at most three at each end. Faces are painted in the order of
-    their centres: the centre of an uncut rod that leans towards the viewer may be nearer than the hub at its end, which
-    the rod would hide.
+    The pieces are as long as the radius; a long rod has at most three of them at each end. Faces are painted in the
+    order of their centres. If a rod that leans towards the viewer were not cut, its centre might be nearer than the hub
+    at its end, and the rod would hide the hub.
     """
     if 2.0 * half <= 2.0 * ENDS * radius:
         return np.linspace(-half, half, max(int(np.ceil(2.0 * half / max(radius, 1e-12))), 1) + 1)
@@ -366,7 +370,7 @@ def _turned(rings: Array, sides: int) -> tuple[Array, Faces]:
 
 
 def grid_faces(grid: Array) -> tuple[Array, Faces]:
-    """Return corners and finite cells of a grid of points, (n, m, 3)."""
+    """Return the corners and the finite cells of a grid of points, (n, m, 3)."""
     rows, columns, _ = grid.shape
     number = np.arange(rows * columns).reshape(rows, columns)
     cells = np.stack([number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]], axis=-1).reshape(-1, 4)
@@ -384,7 +388,10 @@ def corners_of(record: Record, scene: Scene, body: int, row: int) -> list[tuple[
 
 
 def outline(points: Array) -> Array:
-    """Return the corners of the convex hull of plane points, (n, 2) → (m, 2), counterclockwise; the ends of a line."""
+    """Return the corners of the convex hull of plane points, (n, 2) → (m, 2), counterclockwise.
+
+    If the points are on a line, its ends are returned.
+    """
     from scipy.spatial import ConvexHull, QhullError  # imported here because it takes a third of a second
 
     try:
@@ -393,7 +400,7 @@ def outline(points: Array) -> Array:
         return np.asarray(points[np.lexsort(points.T)[[0, -1]]])
 
 
-# Groups of wheels, their ground contact, support polygon, and centre of pressure or mass.
+# Groups of wheels, their ground contact, the support polygon, and the centre of pressure or mass.
 @dataclass(frozen=True)
 class WheelGroups:
     """Groups of wheels that are lifted together.
@@ -403,9 +410,9 @@ class WheelGroups:
     names : tuple of str
         Names of the groups.
     places : tuple of tuple of tuple of int
-        For each group, body and index of the shape of its wheels.
+        For each group, the body and the shape index of each of its wheels.
     down : (T, groups) ndarray or None
-        1 on the ground, 0 lifted, if recorded.
+        1 if a group is on the ground, 0 if it is lifted; None if not recorded.
     """
 
     names: tuple[str, ...] = ()
@@ -429,14 +436,14 @@ def wheel_groups(record: Record, scene: Scene) -> WheelGroups:
 
 
 def _pair_wheels(scene: Scene, pair: int) -> tuple[tuple[int, int], ...]:
-    """Return the wheels of a pair: shapes of its body beyond the centre line, and wheels that rotate on it."""
+    """Return the wheels of a pair: shapes of its body away from the centre line, and wheels that rotate on it."""
     own = [(pair, k) for k, shape in enumerate(scene.bodies[pair].shapes) if shape.position[1] != 0.0]
     turning = [k for k, body in enumerate(scene.bodies) if body.parent == pair and body.joint.position[1] != 0.0]
     return (*own, *((k, 0) for k in turning))
 
 
 def supports(scene: Scene, groups: WheelGroups) -> list[dict[str, Any]]:
-    """Return the points that span the support polygon: body, position, and group of wheels."""
+    """Return the points that span the support polygon, each with its body, position and group of wheels."""
     if scene.supports:
         return [{"body": point.body, "p": list(point.position), "group": -1} for point in scene.supports]
     points = []
@@ -447,7 +454,10 @@ def supports(scene: Scene, groups: WheelGroups) -> list[dict[str, Any]]:
 
 
 def cop_of(record: Record) -> tuple[str, Array] | None:
-    """Return the point that must be in the support polygon: centre of pressure (base) or of mass (snake), (T, 2)."""
+    """Return the point that must be in the support polygon: centre of pressure (base) or centre of mass (snake).
+
+    The result contains the name of the point and its positions, (T, 2).
+    """
     for signal, name in (("center_of_pressure", "centre of pressure"), ("centre_of_mass", "centre of mass")):
         if signal in record:
             return name, np.asarray(record[signal][:, :2], dtype=np.float64)

@@ -1,6 +1,6 @@
 """Write a self-contained HTML page that shows records in 3D.
 
-The page contains scene, data and program, and works in any browser without a network. It depends on records alone:
+The page contains the scene, data and program, and works in any browser without a network. It depends only on records:
 simulated and measured records are shown in the same way. See :mod:`dynsim.draw.page.content`.
 """
 

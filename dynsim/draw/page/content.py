@@ -51,10 +51,10 @@ from dynsim.record.scene import Scene
 from dynsim.system.arguments import names_wrong_types
 from dynsim.system.files import replacing
 
-# Compression of time series: quantised, differenced, and split into byte planes.
+# Compression of time series, which are quantised, differenced, and split into byte planes.
 
-# Largest code of a finite value by number of bits; 32 bits are used if half a step of 16 bits exceeds the allowed
-# error.
+# Largest code for a finite value, by number of bits; 32 bits are used if half a quantisation step with 16 bits exceeds
+# the allowed error.
 _CODES = {16: 2**16 - 2, 32: 2**32 - 2}
 _TYPES: dict[int, np.dtype[Any]] = {16: np.dtype("<u2"), 32: np.dtype("<u4")}
 
@@ -87,7 +87,7 @@ class Blocks:
         return header | {"offset": low.tolist(), "scale": scale.tolist()}
 
     def raw(self, data: NDArray[Any]) -> dict[str, Any]:
-        """Add an array of integers ≥ 0 unchanged (for meshes), little endian, in 16 bits, or 32 if necessary."""
+        """Add an array of integers ≥ 0 unchanged (for meshes), little-endian, in 16 bits, or in 32 if necessary."""
         bits = 16 if data.max(initial=0) < 2**16 else 32
         return {"at": self._append(data.astype(_TYPES[bits]).tobytes()), "count": int(data.size), "bits": bits}
 
@@ -97,21 +97,21 @@ class Blocks:
         return sum(map(len, self._parts[:-1]))
 
     def packed(self, head: dict[str, Any]) -> str:
-        """Return head and blocks as text: head length in 4 bytes, head as JSON, blocks; compressed, in base64."""
+        """Return the length of the head in 4 bytes, the head as JSON, and the blocks; compressed and in base64."""
         text = json.dumps(head, allow_nan=False, separators=(",", ":"), ensure_ascii=True).encode("ascii")
         content = len(text).to_bytes(4, "little") + text + b"".join(self._parts)
-        # Without a time stamp, so that equal records give equal pages.
+        # Omit the time stamp, so that equal records give identical pages.
         return base64.b64encode(gzip.compress(content, 6, mtime=0)).decode("ascii")
 
 
 def packed_mesh(mesh: Mesh, blocks: Blocks) -> dict[str, Any]:
-    """Return a mesh in the format of the page: corners in 16 bits within their box, triangles, and their colours."""
+    """Return a mesh in the data format of the page: corners in 16 bits within their box, triangles, and colours."""
     corners, triangles, colours = mesh
     low, high = corners.min(axis=0), corners.max(axis=0)
     step = np.where(high > low, (high - low) / 65535.0, 1.0)
     paint: dict[str, Any] = {}
     if colours is not None:
-        # −1 marks a missing colour, because NaN is not equal to itself.
+        # Use −1 for a missing colour, because NaN is not equal to itself.
         palette, number = np.unique(np.round(np.nan_to_num(colours, nan=-1.0), 3), axis=0, return_inverse=True)
         paint["palette"] = [None if row[0] < 0.0 else row.tolist() for row in palette]
         paint["paint"] = blocks.raw(number.reshape(-1))
@@ -126,14 +126,15 @@ def packed_mesh(mesh: Mesh, blocks: Blocks) -> dict[str, Any]:
 Array = NDArray[np.float64]
 # Maximum number of samples of a plotted signal; for longer signals the minimum and maximum of each bin are kept.
 PLOTTED = 8000
-# Maximum relative difference between heat by the trapezoidal rule and recorded heat; currents may jump between samples.
+# Maximum relative difference between the recorded heat and the heat by the trapezoidal rule; currents may jump between
+# samples.
 HEAT_ERROR = 0.05
 # Signals that are shown in the 3D view but not in plots.
 _SHOWN = {POSITION, ORIENTATION, "posture"}
 
 
 def packed(records: Mapping[str, Record], *, ghost: bool = False) -> str:
-    """Return head and blocks of a page in base64, see :func:`dynsim.draw.page.content.page`.
+    """Return the head and the blocks of a page in base64, see :func:`dynsim.draw.page.content.page`.
 
     Raises
     ------
@@ -313,7 +314,7 @@ def _signals(record: Record, blocks: Blocks) -> tuple[list[dict[str, Any]], dict
 
 
 def _resolution(values: Array) -> float:
-    """Return the resolution required in a plot of most values; a peak at the start does not make it coarser."""
+    """Return the resolution required to plot most of the values; a peak at the start does not make it coarser."""
     known = values[np.isfinite(values)]
     if not len(known):
         return np.inf
@@ -331,7 +332,7 @@ def _hand_error(record: Record) -> dict[str, Signal]:
 
 
 def _thinned(time: Array, values: NDArray[Any]) -> tuple[Array, Array]:
-    """Return at most ``PLOTTED`` samples; for a longer run, the two extremes of each bin in their order."""
+    """Return at most ``PLOTTED`` samples; for a longer run, these are the two extremes of each bin, in their order."""
     values = np.asarray(values, dtype=np.float64)
     if len(time) <= PLOTTED:
         return time, values
@@ -346,9 +347,9 @@ def _thinned(time: Array, values: NDArray[Any]) -> tuple[Array, Array]:
     return np.append(at, time[-1]), np.concatenate([kept, values[-1:]])
 
 
-# HTML text of a page: scripts and styles, three.js from its package, and the data.
+# HTML text of a page, with scripts and styles, three.js from its package, and the data.
 SCRIPTS = ("decode", "solids", "marks", "actor", "stage", "plots", "controls", "main")
-"""Files of the program of the page, in loading order."""
+"""Files of the page's program, in loading order."""
 _THREE = ("jupyter_threejs_sage", "static/r130/three.min.js")
 
 
@@ -362,7 +363,7 @@ def page(records: Mapping[str, Record], *, ghost: bool = False, scripts: Sequenc
     ghost : bool, optional
         Overlay several records, the first one solid; default: side by side.
     scripts : sequence of str, optional
-        Additional JavaScript programs. They run after the program of the page, which they access as ``dynsim``.
+        Additional JavaScript programs. They run after the page's program, which they can access as ``dynsim``.
     connect : str, optional
         The only address to which the page may connect (for live driving); default: none.
 
@@ -412,7 +413,7 @@ def write(records: Mapping[str, Record], path: str | os.PathLike[str], *, ghost:
     Raises
     ------
     RecordError
-        As for :func:`page`; also if the file cannot be written.
+        In the same cases as for :func:`page`, and if the file cannot be written.
 
     Examples
     --------
@@ -480,7 +481,7 @@ class Inline:
     height: int = 640
 
     def _repr_html_(self) -> str:
-        # Scripts may run, but without the rights of the notebook.
+        # Scripts may run, but without the permissions of the notebook.
         return (
             f'<iframe sandbox="allow-scripts allow-downloads" srcdoc="{html.escape(self.page)}" '
             f'style="width:100%;height:{int(self.height)}px;border:0" title="dynsim"></iframe>'
@@ -529,7 +530,7 @@ def show(*records: Record, ghost: bool = False, height: int = 640) -> Inline:
     *records : Record
         Records to show, side by side.
     ghost : bool, optional
-        Overlay the records after the first one on it instead.
+        Overlay the records on the first one instead of showing them side by side.
     height : int, optional
         Height of the frame in a notebook [pixel].
 

@@ -1,7 +1,7 @@
-"""Small dense (Delassus) systems of constraint forces: solver for dependent rows, split of the load, uniqueness test.
+"""Small dense (Delassus) systems for constraint forces: solver for dependent rows, load sharing, uniqueness test.
 
-One row format serves every constraint: up to two links, ROW (the constrained motion is ROW · V), TARGET (the required
-J vdot) and DIRECTION (the wrench of a unit force). Under sliding friction row and direction differ, so the p×p matrix
+All constraints share one row format: up to two links, ROW (the constrained motion is ROW · V), TARGET (the required
+J vdot) and DIRECTION (the wrench of a unit force). With sliding friction, row and direction differ, so the p×p matrix
 is not symmetric.
 """
 
@@ -49,7 +49,7 @@ def solve_small(small, state, p):
     if p == 2:
         a, b, c, d = small[0, 0, 0], small[0, 0, 1], small[0, 1, 0], small[0, 1, 1]
         determinant = a * d - b * c
-        # Well conditioned: Cramer's rule is as accurate as elimination.
+        # For a well-conditioned matrix, Cramer's rule is as accurate as elimination.
         floors = state[0, ka.ROW_FLOOR] * state[1, ka.ROW_FLOOR]
         if every(abs(determinant) > 1e-3 * (abs(a * d) + abs(b * c)) + floors):
             x, y = state[0, ka.RHS] / determinant, state[1, ka.RHS] / determinant
@@ -60,7 +60,7 @@ def solve_small(small, state, p):
 
 @noinline_kernel
 def solve_many(small, state, p):
-    """Do the work of :func:`solve_small` for any number of rows, without closed forms."""
+    """Solve as :func:`solve_small` for any number of rows, without closed-form solutions."""
     force = state[:, ka.FORCE]
     for i in range(p):
         force[i] = state[i, ka.RHS]
@@ -75,8 +75,9 @@ def solve_many(small, state, p):
 def solve_dependent(small, state, p):
     """Solve as :func:`solve_small` for rows that are known to depend on each other.
 
-    Pivots of columns in their order may not show it: the last pivot is the inverse of an entry of the inverse, large
-    for a row with almost no part in the dependence. Forces would be as large as rounding allows.
+    Pivots in the order of the columns may not reveal the dependence: the last pivot is the reciprocal of an entry of
+    the inverse matrix and is large for a row that hardly takes part in the dependence. The forces would then be as
+    large as rounding allows.
     """
     rank = least_norm(small, state[:, ka.RHS], state[:, ka.FORCE], p, dependent_pivot(small, state, p))
     return 1 if rank < p else 0
@@ -97,9 +98,9 @@ def dependent_pivot(small, state, p):
 # Split of forces among dependent rows of sticking points, held joints and stops, within their bounds if possible.
 
 
-# A unit split direction whose component along a normal row is smaller does not change that normal force.
+# A unit split direction whose component along a normal row is smaller than this does not change that normal force.
 NORMAL_PART = 1e-6
-# Value in place of a bound, for stops, which push one way.
+# Value used instead of a bound for stops, which push in one direction only.
 ONE_WAY = -1.0
 
 
@@ -113,7 +114,7 @@ def margin(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Workspace,
 
 @internal_kernel
 def dry_margin(unilateral: UnilateralArrays, ws: Workspace, k):
-    """Return the margin of dry friction that holds a joint: its bound minus its force [N m or N]."""
+    """Return the margin of the dry friction that holds a joint: its bound minus its magnitude [N m or N]."""
     return holding_bound(unilateral, k) - abs(ws.rows[unilateral.dry_table[k, ku.DRY_ROW], ka.FORCE])
 
 
@@ -121,18 +122,18 @@ def dry_margin(unilateral: UnilateralArrays, ws: Workspace, k):
 def admissible_forces(model: ModelArrays, contacts: ContactArrays, unilateral: UnilateralArrays | None, ws: Workspace):
     """Replace forces of dependent sticking rows that exceed their bounds, and record forces of joints.
 
-    The forces change in the null space of the rows: accelerations change only if rows are not fully dependent.
+    The forces change within the null space of the rows, so accelerations change only if rows are not fully dependent.
     """
     if unilateral is None:  # resolved at compile time
         return
-    # Small, because it is inlined into the right-hand side.
+    # This function is kept small, because it is inlined into the right-hand side.
     if unilateral.number[ku.REDUNDANT] == 1.0 or unilateral.stop.shape[0] + unilateral.dry.shape[0] > 0:
         check_forces(model, contacts, unilateral, ws)
 
 
 @noinline_kernel
 def check_forces(model: ModelArrays, contacts: ContactArrays, unilateral: UnilateralArrays, ws: Workspace):
-    """Do the work of :func:`admissible_forces` if there are dependent rows, stops or dry friction."""
+    """Implement :func:`admissible_forces` for systems with dependent rows, stops or dry friction."""
     unilateral.number[ku.SPLIT] = 0.0
     if unilateral.number[ku.REDUNDANT] == 1.0 and beyond_bounds(contacts, unilateral, ws):
         split_forces(model, contacts, unilateral, ws)
@@ -142,7 +143,7 @@ def check_forces(model: ModelArrays, contacts: ContactArrays, unilateral: Unilat
 
 @internal_kernel
 def beyond_bounds(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Workspace):
-    """True if a sticking point or held joint needs more force than its friction allows, or a closed stop pulls."""
+    """Return whether a sticking point or held joint needs more force than friction allows, or a closed stop pulls."""
     for k in range(ws.contacts.shape[0]):
         if ws.active[k, ka.MODE] == ka.STICKING and margin(contacts, unilateral, ws, k) < 0.0:
             return True
@@ -162,10 +163,10 @@ def bound_of_row(unilateral: UnilateralArrays, ws: Workspace, r):
 
 @noinline_kernel
 def split_forces(model: ModelArrays, contacts: ContactArrays, unilateral: UnilateralArrays, ws: Workspace):
-    """Compute the best split of all sticking forces, in FORCE of the rows; its worst margin goes to BEST_MARGIN.
+    """Write the best split of all sticking forces to FORCE of the rows, and its worst margin to BEST_MARGIN.
 
-    Pivots of J M⁻¹ Jᵀ are squares: rows that count as dependent at a pivot of 1e-10 may differ by 1e-5, and then a
-    change of split changes accelerations by this fraction. They are updated to agree with the forces.
+    The pivots of J M⁻¹ Jᵀ are squares: rows that count as dependent at a pivot of 1e-10 may differ by 1e-5, and then a
+    change of the split changes accelerations by this fraction. The accelerations are updated to agree with the forces.
     """
     room, index, mu, rows = unilateral.room, unilateral.index, unilateral.vector[0], ws.rows
     first, row = index[0], index[1]
@@ -209,10 +210,11 @@ def change_of_coupling(N, width, i, force, out, p):
 
 @internal_kernel
 def find_splits(unilateral: UnilateralArrays, ws: Workspace):
-    """Write the directions in which sticking forces may change to NULL_SPACE, right after ``derivative``.
+    """Write the directions in which sticking forces may change to NULL_SPACE; call right after ``derivative``.
 
-    index[0] is the first row of each sticking point, then of each held joint, then of each closed stop; index[1] has
-    the rows in the table, followed by the coupling rows: their forces change with the others, without bounds.
+    index[0] contains the first row of each sticking point, then of each held joint, then of each closed stop. index[1]
+    contains the table rows of these rows, followed by the coupling rows, whose forces change with the other forces but
+    have no bounds.
 
     Returns
     -------
@@ -221,7 +223,7 @@ def find_splits(unilateral: UnilateralArrays, ws: Workspace):
     count : int
         Number of sticking points, held joints and closed stops.
     p : int
-        Number of their rows.
+        Number of the rows of these points, joints and stops.
     ties : int
         Number of coupling rows.
     """
@@ -262,20 +264,20 @@ def first_split_row(ws: Workspace, k):
 
 @internal_kernel
 def normal_is_open(unilateral: UnilateralArrays, ws: Workspace, k):
-    """True if the last splits leave the normal force of sticking candidate k undetermined."""
+    """Return whether the last splits leave the normal force of sticking candidate k undetermined."""
     return row_shares(unilateral, first_split_row(ws, k))
 
 
 @internal_kernel
 def point_shares(unilateral: UnilateralArrays, ws: Workspace, k):
-    """True if the last splits leave a force of sticking candidate k undetermined."""
+    """Return whether the last splits leave a force of sticking candidate k undetermined."""
     row = first_split_row(ws, k)
     return row_shares(unilateral, row) or row_shares(unilateral, row + 1) or row_shares(unilateral, row + 2)
 
 
 @internal_kernel
 def joint_shares(unilateral: UnilateralArrays, ws: Workspace, k):
-    """True if the last splits leave the dry friction that holds joint k undetermined."""
+    """Return whether the last splits leave the dry friction that holds joint k undetermined."""
     row = ka.MOST_ROWS * ws.counts[ka.STUCK]
     for j in range(k):
         row += unilateral.dry_table[j, ku.DRY_HOLDS]
@@ -284,7 +286,7 @@ def joint_shares(unilateral: UnilateralArrays, ws: Workspace, k):
 
 @internal_kernel
 def row_shares(unilateral: UnilateralArrays, row):
-    """True if the last splits leave the force of one of their rows undetermined."""
+    """Return whether the last splits leave the force in a given row undetermined."""
     largest = 0.0
     for c in range(int(unilateral.number[ku.WIDTH])):
         largest = max(largest, abs(unilateral.room[ku.NULL_SPACE, row, c]))
@@ -303,28 +305,29 @@ def stops_that_share(unilateral: UnilateralArrays):
     return sharing
 
 
-# Test whether the contacts determine their forces: determinant and diagonal of J M⁻¹ F.
+# Test whether the contact forces are uniquely determined, from the determinant and the diagonal of J M⁻¹ F.
 
 
 UNIQUE, REVERSED, SEVERAL = 0, 1, 2
 
-# Blocks of the scratch ``room``, (ROOM, p, p); of SIGNS and FORCES only the first row is used.
+# Blocks of the scratch array ``room``, (ROOM, p, p); only the first row of SIGNS and FORCES is used.
 FRICTIONLESS, FRICTION, BASIS, MATRIX, PRODUCT, SIGNS, FORCES = 0, 1, 2, 3, 4, 5, 6
 ROOM = 7
-# A determinant above this fraction of the bound from its terms is clearly positive.
+# A determinant above this fraction of the sum of the magnitudes of its terms is clearly positive.
 CLEAR = 1e-3
-# A normal mobility below this fraction of the mobility along the force is the square of rounding.
+# A normal mobility below this fraction of the mobility along the force is the square of a rounding error.
 IMMOBILE = 1e-24
-# Rounding: below these fractions a diagonal entry or a force has no sign, and two solutions are equal.
+# Rounding tolerances: below these fractions, a diagonal entry or a force has no sign, and two solutions count as equal.
 DIAGONAL_TOLERANCE = 1e-12
 FORCE_TOLERANCE = 1e-9
 
 
 @internal_kernel
 def clearly_unique(ws: Workspace):
-    """True without rows, or for one or two rows without dissipative friction whose determinant is clearly positive.
+    """Return whether at most two rows, without dissipative friction, have a clearly positive determinant.
 
-    Small, because it is inlined into the step: passing the tables to the full check costs as much as a sweep.
+    Without rows, the result is True. This function is small, because it is inlined into the step: passing the tables to
+    the full check costs as much as a sweep.
     """
     small, p = ws.small, ws.counts[ka.ROWS]
     if p == 0 or p > 2:
@@ -340,7 +343,7 @@ def clearly_unique(ws: Workspace):
 
 @internal_kernel
 def dominant(ws: Workspace, room):
-    """True without friction, or if every A(σ) is strictly diagonally dominant, so that none is singular."""
+    """Return whether contacts are frictionless or every A(σ) is strictly diagonally dominant, hence not singular."""
     small, p = ws.small, ws.counts[ka.ROWS]
     frictional = False
     for k in range(p):
@@ -375,17 +378,18 @@ def split_matrix(ws: Workspace, room):
 
 @internal_kernel
 def force_verdict(ws: Workspace, room, since, t):
-    """Return UNIQUE, or why the constraint forces at the state of ``ws`` are not unique, right after ``derivative``.
+    """Return UNIQUE, or the reason why the constraint forces are not unique; call right after ``derivative``.
 
-    REVERSED: the determinant of J M⁻¹ F with the present signs, relative to the frictionless one, is not positive, or
-    every diagonal entry is negative. SEVERAL: other signs of dissipative contacts also agree with their forces.
+    REVERSED: the determinant of J M⁻¹ F with the present signs, relative to the frictionless determinant, is not
+    positive, or every diagonal entry is negative. SEVERAL: other signs of dissipative contacts also agree with their
+    forces.
 
     Parameters
     ----------
     room : (ROOM or more, p or more, p or more) ndarray
         Scratch.
     since : (c,) ndarray
-        First time at which the contact's diagonal entry was negative [s], updated here; inf: never.
+        First time at which the contact's diagonal entry was negative [s], or inf if it never was; updated here.
     """
     if dominant(ws, room):
         return UNIQUE
@@ -428,7 +432,7 @@ def force_verdict(ws: Workspace, room, since, t):
 
 @internal_kernel
 def drop_immobile(ws: Workspace, room):
-    """Zero the rows of points that no joint moves along their normals: their entries are rounding, of any sign."""
+    """Zero the rows of points that no joint moves along their normals; the entries are rounding errors of any sign."""
     p = ws.counts[ka.ROWS]
     for k in range(p):
         along = 0.0
@@ -476,7 +480,7 @@ def solve_choice(ws: Workspace, room, rank):
 
 @internal_kernel
 def another_solution(ws: Workspace, room):
-    """True if the forces in ``room`` have the signs that they were solved for and differ from the forces of ``ws``."""
+    """Return whether the forces in ``room`` have the signs assumed for them and differ from the forces in ``ws``."""
     largest, difference, p = 0.0, 0.0, ws.counts[ka.ROWS]
     for k in range(p):
         force = room[FORCES, 0, k]

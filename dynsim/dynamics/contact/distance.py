@@ -1,8 +1,8 @@
 """Signed distances φ from surfaces, with unit normal n = ∇φ and curvature H = ∂²φ, and the nearest point of an axis.
 
-Plane, sphere, cylinder: exact everywhere. Box: edges rounded by a radius, exact outside and down to that radius inside;
-n is continuous, H jumps where a flat face meets its round edge (φ is C¹). Height field z = h(x, y), a bicubic C²
-spline: exact along the normal through the foot point; n and H are continuous.
+For planes, spheres and cylinders, φ is exact everywhere. Boxes have edges rounded by a radius; φ is exact outside and
+down to that depth inside, n is continuous, and H jumps where a flat face meets a rounded edge (φ is C¹). Height fields
+z = h(x, y) are bicubic C² splines; φ is exact along the normal through the foot point, and n and H are continuous.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from dynsim.jit.kernel import internal_kernel, kernel
 
 # ShapeArrays.kind, int
 SURFACE = 0  # one of the kinds below
-MOVES = 1  # 1: the axis touches at its point nearest to the surface, 0: at its start
+MOVES = 1  # 1: the axis touches the surface at its nearest point; 0: at its start
 FIELD = 2  # height field: start of its coefficients in ShapeArrays.fields
 COUNT = 3  # 2: numbers of grid lines along x and y
 SHAPE_KIND_SIZE = 5
-# Surfaces; AS_POINT: a point on the quadric of ContactArrays
+# Kinds of surfaces; AS_POINT: the candidate is a point on the quadric of ContactArrays
 AS_POINT, PLANE, SPHERE, CYLINDER, BOX, HEIGHT_FIELD = 0, 1, 2, 3, 4, 5
 # ShapeArrays.data
 RADIUS = 0  # ρ [m]
@@ -32,20 +32,20 @@ SIZE = 16  # 3: radius, negative if the inside is free; half edges of a box with
 EDGE = 19  # radius of the edges of a box [m]
 SHAPE_SIZE = 20
 
-# Steps to the foot point on a height field; from a few grid spacings away three to five are enough.
+# Maximum number of steps to the foot point on a height field; from a few grid spacings away, three to five are enough.
 FOOT_STEPS = 40
-# A step below this number of spacings is the last one: convergence is quadratic.
+# A step shorter than this fraction of the grid spacing is the last one, because convergence is quadratic.
 FOOT_TOLERANCE = 1e-9
-# Steps along an axis over a box: Newton steps, mostly, or bisections.
+# Maximum number of steps along an axis over a box; most are Newton steps, the others bisections.
 AXIS_STEPS = 60
 
 
 class ShapeArrays(NamedTuple):
-    """Candidates with their shapes and surfaces."""
+    """Contact candidates with their shapes and surfaces."""
 
     kind: np.ndarray  # (c, SHAPE_KIND_SIZE) int
     data: np.ndarray  # (c, SHAPE_SIZE)
-    fields: np.ndarray  # coefficients of the B-splines of all height fields, (nx + 2) (ny + 2) each, x after x
+    fields: np.ndarray  # B-spline coefficients of all height fields, (nx + 2) (ny + 2) each, one x after the other
 
 
 @internal_kernel
@@ -60,7 +60,7 @@ def distance(shapes: ShapeArrays, k, x, y, z):
         return nx * x + ny * y + nz * z, nx, ny, nz, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     if kind == BOX:
         return box_distance(shapes, k, x, y, z)
-    # Sphere and cylinder: H = (1 − n nᵀ)/r, without the part along the axis of a cylinder.
+    # For a sphere or cylinder, H = (1 − n nᵀ)/r, without the part along the axis of a cylinder.
     if kind == CYLINDER:
         along = nx * x + ny * y + nz * z
         x, y, z = x - along * nx, y - along * ny, z - along * nz
@@ -77,11 +77,11 @@ def distance(shapes: ShapeArrays, k, x, y, z):
 
 @internal_kernel
 def box_distance(shapes: ShapeArrays, k, x, y, z):
-    """Do :func:`distance` for a box centred at the origin.
+    """Compute :func:`distance` for a box centred at the origin.
 
-    With p in its axes, half edges b without the rounding r, and o = max(|p| − b, 0): outside the core b, φ = |o| − r,
-    and n and H belong to a plane, a cylinder or a sphere if o has one, two or three components. Within the core: the
-    nearest face.
+    Let p be the point in the axes of the box, b the half edges without the rounding r, and o = max(|p| − b, 0). Outside
+    the core b, φ = |o| − r, and n and H belong to a plane, a cylinder or a sphere if o has one, two or three nonzero
+    components. Within the core, the nearest face is used.
     """
     data = shapes.data
     R = rotation(data, k, AXES)
@@ -95,7 +95,7 @@ def box_distance(shapes: ShapeArrays, k, x, y, z):
         ox, oy, oz = max(ox, 0.0), max(oy, 0.0), max(oz, 0.0)
         r = math.sqrt(ox * ox + oy * oy + oz * oz)
         far = r
-    # Axes along which φ is curved: axes with a component of o, if there are several.
+    # φ is curved along the axes in which o has a component, if there are several such axes.
     fx, fy, fz = 1.0 if ox > 0.0 else 0.0, 1.0 if oy > 0.0 else 0.0, 1.0 if oz > 0.0 else 0.0
     h = 1.0 / r if fx + fy + fz > 1.0 else 0.0
     ox, oy, oz = math.copysign(ox, px) / r, math.copysign(oy, py) / r, math.copysign(oz, pz) / r
@@ -113,14 +113,16 @@ def box_distance(shapes: ShapeArrays, k, x, y, z):
 
 @internal_kernel
 def field_distance(shapes: ShapeArrays, k, x, y, z):
-    """Do :func:`distance` for a height field, by the foot point c = (u, v, h(u, v)) at which the point lies along n.
+    """Compute :func:`distance` for a height field; the normal n at the foot point c = (u, v, h(u, v)) meets the point.
 
-    Newton's method on ½ |r − c|², from the point of the field straight below; with e = z − h, X = ∂c/∂(u, v), G = XᵀX
-    its second derivative is G − e ∂²h. Steps are halved if the distance grows. Then φ = n·(r − c) and
+    c is found by Newton's method on ½ |r − c|², starting from the point of the field straight below r. With e = z − h,
+    X = ∂c/∂(u, v) and G = XᵀX, the second derivative is G − e ∂²h. Steps are halved if the distance grows. Then
+    φ = n·(r − c) and
 
         H = X G⁻¹ B (G + φ B)⁻¹ Xᵀ,   B = −∂²h / √(1 + |∇h|²):
 
-    a step dr moves c by X (G + φ B)⁻¹ Xᵀ dr, and n by X G⁻¹ B times that. Valid within the radius of curvature.
+    a step dr moves c by X (G + φ B)⁻¹ Xᵀ dr, and n by X G⁻¹ B (G + φ B)⁻¹ Xᵀ dr. This is valid within the radius of
+    curvature.
     """
     data = shapes.data
     size = min(data[k, SIZE], data[k, SIZE + 1])
@@ -167,7 +169,7 @@ def field_distance(shapes: ShapeArrays, k, x, y, z):
 
 @internal_kernel
 def field_height(shapes: ShapeArrays, k, x, y):
-    """Return h and its derivatives x, y, xx, xy, yy at a point of the field; linear extrapolation beyond its grid."""
+    """Return h and its derivatives x, y, xx, xy, yy at a point of the field, extrapolated linearly beyond the grid."""
     fields, data, kind = shapes.fields, shapes.data, shapes.kind
     nx, ny = kind[k, COUNT], kind[k, COUNT + 1]
     i, u, du, ddu = spline_weights((x - data[k, POSITION]) / data[k, SIZE], 1.0 / data[k, SIZE], nx)
@@ -186,9 +188,9 @@ def field_height(shapes: ShapeArrays, k, x, y):
 
 @internal_kernel
 def spline_weights(x, per, count):
-    """Return the cell of x in grid units, and weights of its four uniform cubic B-splines with two derivatives.
+    """Return the cell that contains x, and the weights of its four uniform cubic B-splines with two derivatives.
 
-    ``per`` is 1 / spacing. Beyond the first and last of ``count`` grid points the weights are extrapolated linearly.
+    ``per`` is 1 / spacing. Beyond the first and last of ``count`` grid points, the weights are extrapolated linearly.
     """
     clamped = min(max(x, 0.0), count - 1.0)
     # NaN converts to an arbitrary integer.
@@ -206,10 +208,11 @@ def spline_weights(x, per, count):
 
 @internal_kernel
 def nearest(shapes: ShapeArrays, k, x, y, z, dx, dy, dz):
-    """Return u in [0, 1] at which x + u d is nearest to the surface of candidate k: sphere, cylinder, box from outside.
+    """Return u in [0, 1] at which x + u d is nearest to the surface of candidate k.
 
-    Closed form for sphere and cylinder. For a box, φ is convex, so n·d grows with u: Newton's method within brackets.
-    If the distance is constant over an interval, returns its middle.
+    The surface is a sphere, a cylinder or a box, seen from outside. Spheres and cylinders have a closed-form solution.
+    For a box, φ is convex, so n·d grows with u, and Newton's method within brackets finds the root. If the distance is
+    constant over an interval, the middle of the interval is returned.
     """
     kind, data = shapes.kind[k, SURFACE], shapes.data
     if kind == BOX:
@@ -228,11 +231,11 @@ def nearest(shapes: ShapeArrays, k, x, y, z, dx, dy, dz):
 
 @internal_kernel
 def nearest_to_box(shapes: ShapeArrays, k, x, y, z, dx, dy, dz):
-    """Do :func:`nearest` for a box."""
+    """Compute :func:`nearest` for a box."""
     low, high, u = 0.0, 1.0, 0.5
     length = math.sqrt(dx * dx + dy * dy + dz * dz)
     for step in range(AXIS_STEPS):
-        # Both ends first: most axes do not pass over an edge.
+        # Try both ends first, because most axes do not pass over an edge.
         at = 0.0 if step == 0 else 1.0 if step == 1 else u
         _, nx, ny, nz, hxx, hxy, hxz, hyy, hyz, hzz = distance(shapes, k, x + at * dx, y + at * dy, z + at * dz)
         slope = nx * dx + ny * dy + nz * dz
@@ -251,7 +254,7 @@ def nearest_to_box(shapes: ShapeArrays, k, x, y, z, dx, dy, dz):
                 high = u
             bend = dx * (hxx * dx + 2.0 * (hxy * dy + hxz * dz)) + dy * (hyy * dy + 2.0 * hyz * dz) + dz * hzz * dz
             trial = u - slope / bend if bend > 0.0 else low
-            # At the limit of rounding Newton's step moves nothing; along a flat face there is no step.
+            # At the limit of rounding, a Newton step does not change u; along a flat face, no Newton step exists.
             if bend > 0.0 and trial == u:
                 return u
             u = trial if low < trial < high else 0.5 * (low + high)

@@ -1,4 +1,4 @@
-"""The paper's dense system M* x = b, x = (vdot, f_n, di/dt) ([WM] eqs 31–35): readable reference and test oracle."""
+"""The paper's dense system M* x = b, x = (vdot, f_n, di/dt) ([WM] eqs 31–35), a readable reference for tests."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ from dynsim.jit.kernel import internal_kernel
 def solve_m_star(K, model: ModelArrays, drives: DriveArrays, unilateral: UnilateralArrays | None, ws: Workspace):
     """Fill M* and b and solve for vdot, contact forces and di/dt.
 
-    [M + J_m, −Fᵀ, 0; J, 0, 0; 0, 0, L] [vdot; f; di/dt] = [applied; target; u − R i − K_m v]. F (force directions)
-    differs from J (rows) under friction: the paper's −J_tᵀ f_t with f_t = μ f_n has moved to the left side. Call after
-    ``contact_rows``: the mass matrix overwrites velocities and wrenches of the sweep.
+    [M + J_m, −Fᵀ, 0; J, 0, 0; 0, 0, L] [vdot; f; di/dt] = [applied; target; u − R i − K_m v]. With friction, F (force
+    directions) differs from J (rows), because the paper's term −J_tᵀ f_t with f_t = μ f_n is on the left side here.
+    Call this function after ``contact_rows``, because the mass matrix overwrites the velocities and wrenches of the
+    sweep.
 
     Parameters
     ----------
@@ -53,8 +54,8 @@ def solve_m_star(K, model: ModelArrays, drives: DriveArrays, unilateral: Unilate
             v = joints[drives.table[a, ka.DRIVEN], ka.QD]
             K[row, size] = dc_balance(drives.motor, a, motors[a, ka.VOLTAGE], v, motors[a, ka.CURRENT])
             K[row, row] = drives.motor[a, ka.INDUCTANCE]
-    # Gaussian elimination. The positive definite mass block needs no pivoting; it leaves J (M + J_m)⁻¹ F of the
-    # constraint block, not symmetric and possibly rank-deficient.
+    # Gaussian elimination. The positive definite mass block needs no pivoting; eliminating it leaves J (M + J_m)⁻¹ F in
+    # the constraint block, which is not symmetric and may be rank-deficient.
     for k in range(n):
         inverse = 1.0 / K[k, k]
         for i in range(k + 1, n + p):

@@ -1,4 +1,4 @@
-"""Mobility of candidates along their normals in the present posture."""
+"""Mobility of contact candidates along their normals in the present posture."""
 
 from __future__ import annotations
 
@@ -9,21 +9,22 @@ from dynsim.dynamics.tables import ContactArrays, ModelArrays, Workspace
 from dynsim.dynamics.tree.spatial import ZERO_VECTOR, dot, dot_vector, six, vector, wrench_at
 from dynsim.jit.kernel import noinline_kernel
 
-# Limit of rounding for the rate of a point along its normal per rate of a joint, as a fraction of the terms that cancel
-# in it. Rounding is 1e-16 times some dozen operations; at the limit the forces have three digits left.
+# Rounding limit of a point's rate along its normal per joint rate, as a fraction of the terms that cancel in it. The
+# rounding error is 1e-16 times a few dozen operations; at the limit, forces still have three correct digits.
 IMMOBILE = 1e-12
-# A larger rate is not rounding for any robot [m/rad or m/m].
+# A larger rate is not a rounding error for any robot [m/rad or m/m].
 CLEARLY = 1e-9
-# A joint that would have to move further than this does not bring a point onto its surface [rad or m].
+# A joint that would have to move further than this to bring a point onto its surface does not count [rad or m].
 MAX_TRAVEL = 0.1
 
 
 @noinline_kernel
 def moves_along_normal(model: ModelArrays, contacts: ContactArrays, ws: Workspace, k, gap):
-    """True if a joint moves candidate k along its normal far enough to close ``gap`` [m]; call after a sweep.
+    """Return whether a joint moves candidate k along its normal far enough to close ``gap`` [m]; call after a sweep.
 
-    The rate by joint i is S_i · (p × n, n). Its terms are products of the distances of joint and point from the origin:
-    the largest of these, times the angular part of S, and its linear part are the scale of rounding.
+    The rate due to joint i is S_i · (p × n, n). Its terms are products of the distances of the joint and the point from
+    the origin. The scale of the rounding error is the largest of these distances times the angular part of S, plus the
+    linear part of S.
     """
     if contacts.link[k, ka.LEFT_OUT] == 1:
         return False

@@ -1,9 +1,9 @@
 """Constraint rows (couplings, dry friction, stops, contacts, ties): table, forces, errors, and geometry of contacts.
 
-A row is one scalar constraint J vdot = target with one force. It has a kind, an owner (the candidate, coupling, stop,
-joint or tie) and up to two bodies. The table is rebuilt only when a mode changes. Order: couplings, joints held by dry
-friction, closed joint stops, closed candidates, ties; after these active rows, one row without force for each open
-candidate.
+A row is one scalar constraint J vdot = target with one force. It has a kind, an owner (a candidate, coupling, stop,
+joint or tie) and up to two bodies. The table is rebuilt only when a mode changes. Its order is: couplings, joints held
+by dry friction, closed joint stops, closed candidates, ties. These active rows are followed by one row without a force
+for each open candidate.
 """
 
 from __future__ import annotations
@@ -45,9 +45,9 @@ def set_modes(
 
     The couplings are followed by joints held by dry friction, closed joint stops, candidates, and ties between bodies.
 
-    Call right after ``derivative`` at the state at which modes change, and call ``derivative`` again afterwards: a
-    candidate that begins to stick is held at its position in the last evaluation. Its slip should be zero: the next
-    projection removes any remaining slip, without an entry in the ledger.
+    Call this function right after ``derivative`` at the state at which modes change, and call ``derivative`` again
+    afterwards: a candidate that begins to stick is held at its position in the last evaluation. Its slip should be
+    zero, because the next projection removes any remaining slip without an entry in the energy ledger.
     """
     active, rows = ws.active, ws.rows
     p, sticking = couplings.joint.shape[0], 0
@@ -84,7 +84,7 @@ def set_modes(
             active[k, ka.FIRST_ROW] = p
             new_row(ws, p, ka.SLIDING_ROW, k, contacts.link[k, ka.LINK])
             p += 1
-    # Solves write the joints that a row involves, and read all other entries as zero.
+    # The solves write only the entries of joints that a row involves, and rely on zeros in all other entries.
     ws.column[:] = 0.0
 
 
@@ -136,7 +136,7 @@ def row_of_joint(ws: Workspace, r, owner, joint, side, offset):
 
 @internal_kernel
 def new_row(ws: Workspace, r, kind, owner, link):
-    """Initialise row r of one body, without friction."""
+    """Initialise row r, which belongs to one body and has no friction."""
     active = ws.active
     active[r, ka.ROW_KIND], active[r, ka.OWNER], active[r, ka.LAW] = kind, owner, ka.FRICTION_SIGNED
     active[r, ka.BODY_A], active[r, ka.BODY_B] = link, -1
@@ -146,7 +146,7 @@ def new_row(ws: Workspace, r, kind, owner, link):
 
 @internal_kernel
 def drop_anchor(ws: Workspace, k):
-    """Hold candidate k at the projection of its present position onto the surface, along n and two tangents there."""
+    """Anchor candidate k at the projection of its present position onto the surface, and set two tangents there."""
     state = ws.contacts
     for s in range(3):
         state[k, ka.ANCHOR + s] = state[k, ka.POSITION + s] - state[k, ka.GAP] * state[k, ka.NORMAL + s]
@@ -158,7 +158,7 @@ def tangents(ws: Workspace, k):
     """Compute two tangents at the present normal of candidate k, for the rows of a sticking point."""
     state = ws.contacts
     n = vector(state, k, ka.NORMAL)
-    # n × the coordinate axis furthest from n.
+    # The first tangent is n × the coordinate axis furthest from n.
     ax, ay, az = abs(n[0]), abs(n[1]), abs(n[2])
     if ax <= ay and ax <= az:
         t = 0.0, n[2], -n[1]
@@ -173,17 +173,17 @@ def tangents(ws: Workspace, k):
 
 @internal_kernel
 def point_row(rows, r, at, d):
-    """Write the motion of a body's point at ``at`` along d as row r."""
+    """Write row r: the motion along d of the body point at ``at``."""
     put_six(rows, r, ka.ROW, wrench_at(at, d, ZERO_VECTOR))
 
 
 @noinline_kernel
 def sticking_rows(model: ModelArrays, ws: Workspace, k, i):
-    """Write the rows of sticking candidate k on link i; the first one is there already.
+    """Write the tangential rows of sticking candidate k on link i; the first row is already written.
 
-    The first row is the row of the surface, as if the point slid, so that the gap remains the surface's gap. The others
-    are t · (r − anchor) = 0 with the tangents t of the anchor: constant, so that t · r̈ = 0 is exact on any surface for
-    any remaining velocity. At rest the three together are r̈ = 0.
+    The first row is the row of the surface, as for a sliding point, so that the gap remains the distance from the
+    surface. The other rows are t · (r − anchor) = 0 with the tangents t at the anchor. These are constant, so that
+    t · r̈ = 0 is exact on any surface for any remaining velocity. At rest, the three rows together give r̈ = 0.
     """
     state, rows, links, active = ws.contacts, ws.rows, ws.links, ws.active
     first = active[k, ka.FIRST_ROW]
@@ -206,7 +206,7 @@ def sticking_rows(model: ModelArrays, ws: Workspace, k, i):
 
 @internal_kernel
 def force_vectors(ws: Workspace):
-    """Write the whole force of every candidate in W, with friction, to ``ws.contacts``, after ``derivative``."""
+    """Write the force of every candidate, including friction, in W to ``ws.contacts``; call after ``derivative``."""
     state, rows, active = ws.contacts, ws.rows, ws.active
     for k in range(state.shape[0]):
         first = active[k, ka.FIRST_ROW]
@@ -220,9 +220,10 @@ def force_vectors(ws: Workspace):
 
 @internal_kernel
 def row_errors(ws: Workspace):
-    """Write the errors of positions and rates along each active row to ROW_GAP and ROW_RATE, after ``derivative``.
+    """Write the position and rate errors of each active row to ROW_GAP and ROW_RATE; call after ``derivative``.
 
-    For a coupling: q_follower − ratio q_leader − offset. Tangential rows of sticking points have their errors already.
+    The error of a coupling is q_follower − ratio q_leader − offset. Tangential rows of sticking points already have
+    their errors.
     """
     rows, active, joints = ws.rows, ws.active, ws.joints
     for r in range(ws.counts[ka.ROWS]):
@@ -267,11 +268,12 @@ def joint_rate(ws: Workspace, r):
 # Contact points on quadrics: geometry, slip direction, constraint rows, and the friction of the bilateral law.
 
 
-# Most solves, in addition to two per contact, in search of signs of dissipative contacts that agree with their forces.
+# Maximum number of solves, in addition to two per contact, in the search for signs of dissipative contacts that agree
+# with their forces.
 SIGN_PASSES = 64
-# With more contacts than this, not every choice of signs is tried.
+# If there are more contacts than this, not all choices of signs are tried.
 SIGNS_LIMIT = 8
-# A normal force below this fraction of the largest one is rounding.
+# A normal force below this fraction of the largest one is a rounding error.
 NO_FORCE = 1e-12
 
 
@@ -289,7 +291,7 @@ def surface_distance(value, slope, curvature):
 
 @internal_kernel
 def hessian_product(point, k, u):
-    """Return u·Q u of the surface of contact k; point: (c, POINT_SIZE)."""
+    """Return u·Q u for the surface of contact k; ``point`` has shape (c, POINT_SIZE)."""
     return (
         u[0] * (point[k, ka.QUADRIC] * u[0] + 2.0 * (point[k, ka.QUADRIC + 1] * u[1] + point[k, ka.QUADRIC + 2] * u[2]))
         + u[1] * (point[k, ka.QUADRIC + 3] * u[1] + 2.0 * point[k, ka.QUADRIC + 4] * u[2])
@@ -320,13 +322,15 @@ def quadric_gap(point, k, curved, at):
 def contact_rows(model: ModelArrays, contacts: ContactArrays, unilateral: UnilateralArrays | None, ws: Workspace):
     """Compute position, gap, slip, constraint row and force direction of every candidate, after ``forward_sweep``.
 
-    A candidate off its surface also has a row, after the active rows: this geometry has no branches.
+    A candidate off its surface also has a row, which comes after the active rows, so that this computation needs no
+    branches.
 
-    C(r) = r·Q r/2 + b·r + c, n = ∇C/|∇C| ([WM] eqs 3, 6, 8); a gap > 0 is off the surface. Row:
-    n·r̈ = −ṙᵀ(∂²C/∂r²)ṙ / |∇C| ([WM] eqs 15, 30). Force per unit f_n: n − σ μ t with the smoothed slip direction
-    t = v_t / √(|v_t|² + v_s²) ([WM] eqs 9, 14 and f_t = μ f_n); v_s is dynsim's assumption, the paper does not cover
-    zero slip. σ is 1 in the paper's law; for the dissipative law it is the sign of f_n, kept between calls. Under the
-    unilateral law t and μ come from :func:`~dynsim.dynamics.contact.unilateral.slide_direction`.
+    The surface is C(r) = r·Q r/2 + b·r + c with n = ∇C/|∇C| ([WM] eqs 3, 6, 8); a gap > 0 is off the surface. The row
+    is n·r̈ = −ṙᵀ(∂²C/∂r²)ṙ / |∇C| ([WM] eqs 15, 30). The force per unit f_n is n − σ μ t with the smoothed slip
+    direction t = v_t / √(|v_t|² + v_s²) ([WM] eqs 9, 14 and f_t = μ f_n). v_s is an assumption of dynsim, because the
+    paper does not cover zero slip. σ is 1 in the paper's law; in the dissipative law it is the sign of f_n, kept
+    between calls. Under the unilateral law, t and μ come from
+    :func:`~dynsim.dynamics.contact.unilateral.slide_direction`.
     """
     links, point, gravity = ws.links, contacts.point, model.gravity
     for k in range(contacts.link.shape[0]):
@@ -344,7 +348,7 @@ def contact_rows(model: ModelArrays, contacts: ContactArrays, unilateral: Unilat
         t, mu = slip_friction(unilateral, contacts, ws, k, slip, n, mu)
         target = -dot_vector(n, a)
         target = target - hessian_product(point, k, v) * inverse if curved else target
-        # Only stores follow: a store to one table makes the compiler reload values of the other.
+        # Only stores follow, because a store to one table makes the compiler reload values of the other.
         write_candidate(ws, k, at, gap, n, rate, slip, t, mu, target)
     if ws.counts[ka.STUCK] == 0:
         return
@@ -388,11 +392,11 @@ def signed_friction(ws: Workspace, m):
 def unit_force(rows, m, mu, at, n, t):
     """Write the wrench of a unit normal force with friction, n − σ μ t at the contact point, to DIRECTION of row m.
 
-    The result is bit-identical at first computation and after a change of sign, so that a right-hand side does not
-    depend on the signs of the preceding one.
+    The result is bit-identical whether it is computed for the first time or after a change of sign, so that a
+    right-hand side does not depend on the signs of the preceding evaluation.
     """
     x, y, z = n[0] - mu * t[0], n[1] - mu * t[1], n[2] - mu * t[2]
-    # Written out: in a separate function the compiler would contract the products.
+    # The cross product is written out, because in a separate function the compiler would contract its products.
     wrench = at[1] * z - at[2] * y, at[2] * x - at[0] * z, at[0] * y - at[1] * x, x, y, z
     put_six(rows, m, ka.DIRECTION, wrench)
 
@@ -407,13 +411,13 @@ def turn_direction(ws: Workspace, m):
 
 @internal_kernel
 def sign_changed(ws: Workspace, passes):
-    """True if solved forces of dissipative contacts contradict their assumed signs; reverses those directions.
+    """Reverse directions of dissipative contacts whose forces contradict their assumed signs; return whether any did.
 
-    All of them in the first passes, then only the first one (least-index pivoting, which cannot cycle while all choices
-    have determinants of one sign), finally every choice in turn. Without a consistent choice (Painlevé) the forces
-    become NaN, the count of CONTRADICTORY increases and the search ends. Forces that vanish to rounding have no sign
-    and count as +. The result thus does not depend on the initial signs of the search, unless several choices are
-    consistent (dynsim.dynamics.contact.delassus checks this).
+    The first passes reverse all of these directions. Later passes reverse only the first one (least-index pivoting,
+    which cannot cycle while all choices have determinants of one sign), and finally every choice is tried in turn. If
+    no choice is consistent (Painlevé), the forces become NaN, the count CONTRADICTORY increases and the search ends.
+    Forces that vanish up to rounding have no sign and count as +. The result thus does not depend on the initial signs
+    of the search, unless several choices are consistent (dynsim.dynamics.contact.delassus checks this).
     """
     rows, active, p = ws.rows, ws.active, ws.counts[ka.ROWS]
     limit = 2 * p + SIGN_PASSES
@@ -448,8 +452,8 @@ def sign_changed(ws: Workspace, passes):
 # Contact geometry of spheres and capsules, and of surfaces given by a signed distance.
 
 
-# sin² of the angle between an axis and the direction of constant distance. Below it u̇ = 0: the axis is parallel to the
-# axis of a cylinder, for example, and has no nearest point.
+# sin² of the angle between an axis and a direction of constant distance. Below this value u̇ = 0, because the axis has
+# no unique nearest point; for example, it is parallel to the axis of a cylinder.
 ALONG = 1e-8
 
 
@@ -457,9 +461,10 @@ ALONG = 1e-8
 def shaped_rows(
     shapes, unilateral: UnilateralArrays | None, model: ModelArrays, contacts: ContactArrays, ws: Workspace
 ):
-    """Overwrite the results of ``contact_rows`` for candidates other than points on quadrics; None: no such candidates.
+    """Overwrite the results of ``contact_rows`` for candidates that are not points on quadrics.
 
-    Position (the point of contact c), gap, slip, row, target and direction, and the rows of sticking candidates.
+    The results are the position (the point of contact c), gap, slip, row, target and direction, and the rows of
+    sticking candidates. If ``shapes`` is None, there are no such candidates.
     """
     if shapes is None:  # resolved at compile time; the default program then excludes shapes
         return
@@ -477,14 +482,16 @@ def shaped_row(
     ws: Workspace,
     k,
 ):
-    """Compute geometry and rows of one candidate.
+    """Compute the geometry and the rows of one candidate.
 
-    Friction acts at c, along the velocity of the body's point there. A sticking candidate rolls: its tangential rows
-    are t · v_c = 0 for the body point that is at c now, and is replaced by another one. With v_c = v_O + ω × c
+    Friction acts at c, along the velocity of the body point at c. A sticking candidate rolls: its tangential rows are
+    t · v_c = 0 for the body point that is at c now; as the body rolls, other points take its place. With
+    v_c = v_O + ω × c
 
         t · (v̇_O + ω̇ × c + ω × ċ) = 0,   ċ = ṡ − ρ H ṡ,   ṡ = v + u̇ d,
 
-    so that in comparison with a held point, ω × v_c becomes ω × ċ. There is no anchor to which it must return.
+    so that, compared with a held point, ω × v_c becomes ω × ċ. A rolling candidate has no anchor to which it must
+    return.
     """
     links, rows, point, data = ws.links, ws.rows, contacts.point, shapes.data
     i, m, radius = contacts.link[k, ka.LINK], ws.active[k, ka.FIRST_ROW], shapes.data[k, kd.RADIUS]
@@ -522,7 +529,7 @@ def shaped_row(
         return
     rolls = radius > 0.0 or shapes.kind[k, kd.MOVES] != 0
     if rolls:
-        # It rolls away from its anchor: any two tangents at its present point span the same rows.
+        # The candidate rolls away from its anchor; any two tangents at its present point span the same rows.
         tangents(ws, k)
     sticking_rows(model, ws, k, i)
     if rolls:

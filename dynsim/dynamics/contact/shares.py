@@ -1,13 +1,13 @@
 """Forces of dependent rows while contacts slide: the least change from the forces at the last change of modes.
 
-If rows depend on each other, the equations of motion determine only some sums of their forces. Without sliding contacts
-every split of these sums gives the same motion. The friction of a sliding contact is proportional to its normal force,
-so each split gives a different motion. The choice of modes has solved for forces s that agree with Coulomb's law, and
-the right-hand side continues from them:
+If rows depend on each other, the equations of motion determine only some sums of their forces. If no contact slides,
+every split of these sums gives the same motion. The friction of a sliding contact, however, is proportional to its
+normal force, so that each split gives a different motion. The choice of modes has found forces s that agree with
+Coulomb's law, and the right-hand side continues from them:
 
     f = s + Δ,   W Δ = b − W s, Δ of least norm.
 
-Forces are thus continuous at changes of modes. The split of least norm itself may pull at a contact that slides in the
+Forces are thus continuous when modes change. The split of least norm itself could pull at a contact that slides in the
 chosen modes.
 """
 
@@ -23,7 +23,7 @@ from dynsim.jit.kernel import internal_kernel, noinline_kernel
 
 @internal_kernel
 def solve_rows(unilateral: UnilateralArrays | None, ws: Workspace, p):
-    """Solve for the forces of the p active rows; return whether they are dependent, as :func:`solve_small`."""
+    """Solve for the forces of the p active rows; return whether the rows are dependent, as :func:`solve_small` does."""
     if unilateral is None:  # resolved at compile time
         return solve_small(ws.small, ws.rows, p)
     if unilateral.number[ku.SHARED] == 1.0:
@@ -64,7 +64,7 @@ def share_slot(unilateral: UnilateralArrays, ws: Workspace, r):
 
 @internal_kernel
 def keep_shares(unilateral: UnilateralArrays, ws: Workspace, modes):
-    """Save the present forces as shares, right before ``set_modes`` of ``modes``, (c,).
+    """Save the present forces as shares; call right before ``set_modes`` with ``modes``, (c,).
 
     Independent rows stay independent when some of them are removed.
     """
@@ -85,7 +85,7 @@ def write_shares(unilateral: UnilateralArrays, ws: Workspace):
 
 @internal_kernel
 def some_slide(modes):
-    """True if a candidate slides."""
+    """Return whether any candidate slides."""
     sliding = 0
     for k in range(modes.shape[0]):
         sliding += 1 if modes[k] == ka.SLIDING else 0
@@ -94,9 +94,9 @@ def some_slide(modes):
 
 @noinline_kernel
 def even_out(unilateral: UnilateralArrays, ws: Workspace):
-    """Remove the part that does not affect the motion from the shares of sticking points, right after ``derivative``.
+    """Remove the part of the shares of sticking points that does not affect the motion; call after ``derivative``.
 
-    Their split thus remains the split of least norm, even if other points slide.
+    The split among the sticking points thus remains the split of least norm, even if other points slide.
     """
     shares, N, row = unilateral.shares, unilateral.room[ku.NULL_SPACE], unilateral.index[1]
     _, count, p, ties = find_splits(unilateral, ws)

@@ -1,11 +1,12 @@
-"""Tables of contacts under the unilateral law, of joint stops, dry friction and ties; slip and friction coefficient.
+"""Tables for unilateral contacts, joint stops, dry friction and ties; slip direction and friction coefficient.
 
 0 ≤ f_n ⟂ gap ≥ 0. The force on a sliding point is f_n (n − μ(s) t), t = v_t/|v_t|, s = |v_t|; a point at rest sticks
 while |f_t| ≤ μ_s f_n. Modes (open, sliding, sticking) are constant within a step of the event-driven integrators;
-:mod:`dynsim.integrators.contacts.modes` chooses them. This file has the parts of the law that the right-hand side uses.
+:mod:`dynsim.integrators.contacts.modes` chooses them. This file contains the parts of the law that the right-hand side
+uses.
 
 A tie is a spring and damper between two bodies along or about an axis, with a bound on its force.
-``NAME = 0  # 3: …`` means three columns from column 0.
+``NAME = 0  # 3: …`` means three columns, starting at column 0.
 """
 
 from __future__ import annotations
@@ -21,37 +22,37 @@ from dynsim.dynamics.tables import ContactArrays, Workspace
 from dynsim.jit.kernel import internal_kernel
 
 # UnilateralArrays.slide
-REFERENCE = 0  # 3: direction of slip at the start of the step, or as last set while FROZEN; 0 before any slip
+REFERENCE = 0  # 3: slip direction at the start of the step, or the last direction set while FROZEN; 0 before any slip
 FROZEN = 3  # 1: slip is too slow to define a direction, so friction is near REFERENCE, see slide_direction
 SPEED = 4  # v_t · REFERENCE [m/s]
-NEXT = 5  # 3: direction at the end of the step
-NEXT_SPEED = 8  # |v_t| there [m/s]
+NEXT = 5  # 3: slip direction at the end of the step
+NEXT_SPEED = 8  # |v_t| at the end of the step [m/s]
 LANDS_AT = 9  # depth below its surface at which an open candidate has landed [m]
-HEADWAY = 10  # speed against REFERENCE at the start of slip; its reversal is counted from there [m/s]
+HEADWAY = 10  # speed against REFERENCE at the start of slip [m/s]; a reversal of slip is measured from this speed
 SLIDE_SIZE = 11
 # LANDS_AT is DEPTH until the candidate has been higher than −DEPTH, because projection leaves closed contacts within
-# ± DEPTH/2; after that it is AT_ROOT, practically gap = 0.
+# ± DEPTH/2; after that, LANDS_AT is AT_ROOT, which is practically gap = 0.
 DEPTH, AT_ROOT = 2e-10, 1e-13
 # UnilateralArrays.tally, for each candidate
-TIME_OPEN, TIME_SLIDING, TIME_STICKING = 0, 1, 2  # in the order of the modes [s]
+TIME_OPEN, TIME_SLIDING, TIME_STICKING = 0, 1, 2  # time spent in each mode, in the order of the modes [s]
 LIFT_OFFS, LANDINGS, SLIP_STARTS, BOUNCES = 3, 4, 5, 6
 LOSS = 7  # energy dissipated by impacts [J]
-# The next four are in the same order for stops.
+# Joint stops have the next four columns in the same order.
 SETTLE = 8  # speed along the normal below which a touching point counts as at rest [m/s]
 WINDOW_START, WINDOW_COUNT = 9, 10  # window and count of events for the detection of chatter
-CHATTERED = 11  # how often SETTLE was raised because of chatter
+CHATTERED = 11  # number of times that SETTLE was raised because of chatter
 DEEPEST = 12  # largest depth below the surface [m]
-UNPRESSED = 13  # time for which it stuck although nothing pressed it [s]
-# Impacts in which it left although another solution keeps it, and the time of the first such impact [s].
+UNPRESSED = 13  # time for which the candidate stuck although nothing pressed it [s]
+# Number of impacts in which the candidate left although another solution keeps it; time of the first such impact [s].
 OPEN_IMPACTS, OPEN_SINCE = 14, 15
 TALLY_SIZE = 16
 # UnilateralArrays.stop_table, int
 STOP_JOINT = 0  # link whose joint is stopped
 STOP_CLOSED = 1
-STOP_ROW = 2  # its row while closed
+STOP_ROW = 2  # row of the stop while it is closed
 STOP_BEFORE = 3  # scratch of the choice of modes
 STOP_TOUCHED = 4  # scratch: STOP_CLOSED before the choice of modes
-STOP_STRUCK = 5  # 1: its joint has just hit it
+STOP_STRUCK = 5  # 1: the joint has just hit the stop
 STOP_TABLE_SIZE = 6
 # UnilateralArrays.stop
 SIDE = 0  # 1 for a lower limit, −1 for an upper one
@@ -62,58 +63,58 @@ STOP_LOSS = 4  # [J]
 CLOSED_TIME = 5  # [s]
 HIT_AT = 6  # depth beyond the limit at which the joint hits the stop: DEPTH, or more if it left from there [rad or m]
 STOP_GAP_THEN, STOP_RATE_THEN = 7, 8  # at the start of the step [rad, rad/s; m, m/s]
-STOP_SETTLE = 9  # rate below which a joint driven off its stop by an impact stays on it [rad/s or m/s]
+STOP_SETTLE = 9  # a joint that leaves its stop after an impact at less than this rate stays on it [rad/s or m/s]
 STOP_WINDOW_START, STOP_WINDOW_COUNT, STOP_CHATTERED = 10, 11, 12  # as for a candidate
 STOP_SIZE = 13
 # UnilateralArrays.dry_table, int
 DRY_JOINT = 0  # link whose joint has dry friction
 DRY_ROW = 1
-DRY_DRIVE = 2  # drive whose gear has dry friction, -1 for none
-DRY_HOLDS = 3  # 1: it has a row, bounded in time stepping; 0: its force is constant (event-driven methods)
+DRY_DRIVE = 2  # drive whose gear has dry friction, -1 if none
+DRY_HOLDS = 3  # 1: the friction has a row, bounded in time stepping; 0: its force is constant (event-driven methods)
 DRY_NEXT = 4  # scratch of the choice of modes
-DRY_TOLD = 5  # 1, 0: held or sliding, as last reported to the log; -1: nothing reported yet
+DRY_TOLD = 5  # state last reported to the log: 1 held, 0 sliding, -1 nothing reported yet
 DRY_BRAKE = 6  # brake of the joint: NEVER_CLOSED, CLOSED, or OPENED again; may be written between steps
 DRY_OVERLOADED = 7  # scratch of the choice of modes, as OVERLOADED
 DRY_TABLE_SIZE = 8
 NEVER_CLOSED, CLOSED, OPENED = 0, 1, 2
-# UnilateralArrays.dry: at rest the force is at most the sum of both; in motion it is the sum against it [N m or N]
+# UnilateralArrays.dry: dry friction of gear and joint [N m or N]; the sum bounds the force at rest and opposes motion
 OF_GEAR, OF_JOINT = 0, 1
 DRY_FORCE = 2  # on the joint [N m or N]
-DRY_SIDE = 3  # sign of the rate at which it slides; between −1 and 1 at rest, where the force is that part of the bound
-DRY_AT = 4  # position at which it is held [rad or m]
-DRY_HEADWAY = 5  # speed against its side at the start of slip, which the rows could not remove
+DRY_SIDE = 3  # in motion: sign of the rate; at rest: force as a fraction of the bound, between −1 and 1
+DRY_AT = 4  # position at which the joint is held [rad or m]
+DRY_HEADWAY = 5  # speed against DRY_SIDE at the start of slip, which the rows could not remove
 DRY_LEFT = 6  # acceleration_left() of rows that depended on each other at the last choice of modes [rad/s² or m/s²]
 DRY_RATE_THEN, DRY_ACCELERATION_THEN = 7, 8  # at the start of the step [rad/s, rad/s²; m/s, m/s²]
 DRY_SIZE = 9
 # UnilateralArrays.tie_table, int
 TIE_A, TIE_B = 0, 1  # links
-TIE_TURNS = 2  # 1: about its axis, 0: along it
-TIE_KIND = 3  # BOX, ONE_WAY (A is pushed along the axis), or -1 if it is inactive; may be written between steps
-TIE_HOLDS = 4  # 1: it has a row
+TIE_TURNS = 2  # 1: the tie acts about its axis, 0: along it
+TIE_KIND = 3  # BOX, ONE_WAY (A is pushed along the axis), or -1 if inactive; may be written between steps
+TIE_HOLDS = 4  # 1: the tie has a row
 TIE_ROW = 5
 TIE_TABLE_SIZE = 6
 # UnilateralArrays.tie; its parameters may also be written between steps
 TIE_STIFFNESS, TIE_DAMPING = 0, 1  # [N/m, N s/m; N m/rad, N m s/rad]
 TIE_BOUND = 2  # bound of a BOX [N or N m]
-TIE_AXIS = 3  # 3: in the axes of A
+TIE_AXIS = 3  # 3: axis of the tie in the frame of A
 TIE_POINT, TIE_OTHER_POINT = 6, 9  # 3 each: on A, on B [m]
 TIE_ATTITUDE = 12  # 9: rotation of B in the axes of A without deflection
 TIE_REST = 21  # deflection without force [m or rad]; NaN: the deflection at which the tie begins
 TIE_FORCE = 22  # on A along or about the axis [N or N m]
 TIE_STORED = 23  # energy in its spring [J]
-TIE_GIVEN = 24  # total movement of its rest since it began, in both directions [m or rad]
+TIE_GIVEN = 24  # total movement of the rest value since the tie began, in both directions [m or rad]
 TIE_REST_NOW, TIE_STORED_NOW, TIE_AT, TIE_IMPLICIT = 25, 26, 27, 28  # values for the step being tried
-TIE_TURNED = 29  # torsion: its rotation vector along the axis at the last step [rad]
+TIE_TURNED = 29  # torsion: component of the rotation vector along the axis at the last step [rad]
 TIE_SIZE = 30
 # UnilateralArrays.mode, int: columns
 WANTED, BEFORE, TOUCHING, STRUCK = 0, 1, 2, 3
-KINETIC_ONLY = 4  # 1: it has reached its static cone, and the kinetic coefficient applies from now on
-LEAVES = 5  # 1: nothing presses it, and the next choice of modes excludes it
+KINETIC_ONLY = 4  # 1: the candidate has reached its static cone, and the kinetic coefficient applies from now on
+LEAVES = 5  # 1: nothing presses the candidate, and the next choice of modes excludes it
 TOUCHED = 6  # TOUCHING before a choice of modes
-OVERLOADED = 7  # 1: at rest it would exceed its friction, however small its acceleration
-BEGINS = 8  # scratch of the choice of modes; 1: its friction is along REFERENCE now, see contacts.modes.aim
+OVERLOADED = 7  # 1: at rest the candidate would exceed its friction, however small its acceleration
+BEGINS = 8  # scratch of the choice of modes; 1: friction acts along REFERENCE now, see contacts.modes.aim
 MODE_SIZE = 9
-# UnilateralArrays.vector: three for the splits of forces, then five for the problem that chooses modes
+# UnilateralArrays.vector: three vectors for the splits of forces, then five for the problem that chooses modes
 OFFSET, SOLUTION, CONE_FRICTION, FIRST_PART, SECOND_PART = 3, 4, 5, 6, 7
 VECTORS = 8
 # UnilateralArrays.index, int: three for the splits of forces; kinds of the problem's rows, and their rows in the table
@@ -128,16 +129,16 @@ BEST_MARGIN = 1  # worst margin of the best split of their forces [N], if the le
 SPLIT = 2  # 1: BEST_MARGIN is valid at this evaluation
 SLOW = 3  # slip along REFERENCE below this speed does not define a direction [m/s]
 LAST_CHANGE, CHANGES = 4, 5  # time of the last change of modes, and number of changes at that time
-HOLDING = 6  # factor on friction at rest while modes are chosen; 1 otherwise
-WIDTH = 7  # number of independent splits of the last evaluation with dependent rows, columns of room[NULL_SPACE]
+HOLDING = 6  # factor applied to friction at rest while modes are chosen; otherwise 1
+WIDTH = 7  # number of independent splits (columns of room[NULL_SPACE]) at the last evaluation with dependent rows
 SHARED = 8  # 1: a contact slides and rows depend on each other, so that forces continue from ``shares``
 SPLIT_ROWS = 9  # number of rows of the last splits, without couplings
 SEARCH = 10  # start of the choice of modes: FROM_ZERO, NEAR or LAST
 CORNER = 11  # 1: that choice ended in a corner of the admissible forces and was rejected
 CREEP = 12  # a joint with dry friction below this rate may be at rest [rad/s or m/s]
-LEFT = 13  # residual of projection after the last choice of modes, as a share of its tolerances, see contacts.events
+LEFT = 13  # projection residual after the last choice of modes, relative to its tolerance; see contacts.events
 NUMBERS = 14
-# Start of the search for forces: zero; near the forces before; zero, accepting any solution.
+# Start of the search for forces: zero; near the previous forces; zero, and any solution is accepted.
 FROM_ZERO, NEAR, LAST = 0.0, 1.0, 2.0
 
 
@@ -155,11 +156,11 @@ class UnilateralArrays(NamedTuple):
     tie: np.ndarray  # (e, TIE_SIZE)
     index: np.ndarray  # (INDICES, p or c + 2) int
     vector: np.ndarray  # (VECTORS, p)
-    room: np.ndarray  # (ROOM, p, p) two matrices of the splits, the matrix of the problem that chooses modes, scratch
+    room: np.ndarray  # (ROOM, p, p): two matrices for the splits, the matrix of the problem that chooses modes, scratch
     split_room: np.ndarray  # scratch of the splits
     number: np.ndarray  # (NUMBERS,)
     shares: np.ndarray  # forces at the last change of modes, see dynsim.dynamics.contact.shares
-    kept: np.ndarray  # copy of the tables above that a choice of modes writes, from before the choice
+    kept: np.ndarray  # copy, made before a choice of modes, of the above tables that the choice overwrites
 
 
 def share_count(couplings: int, contacts: int, stops: int, joints: int) -> int:
@@ -210,7 +211,7 @@ def slide_direction(unilateral: UnilateralArrays, contacts: ContactArrays, k, sl
 
 @internal_kernel
 def stop_gap(unilateral: UnilateralArrays, ws: Workspace, k):
-    """Return the distance of the joint from joint stop k, ≥ 0 [rad or m]."""
+    """Return the distance of a joint from its stop k, ≥ 0 [rad or m]."""
     stop = unilateral.stop
     return stop[k, SIDE] * ws.joints[unilateral.stop_table[k, STOP_JOINT], ka.Q] - stop[k, LIMIT]
 
@@ -223,7 +224,7 @@ def stop_rate(unilateral: UnilateralArrays, ws: Workspace, k):
 
 @internal_kernel
 def note_stop_forces(unilateral: UnilateralArrays, ws: Workspace):
-    """Record the forces of joint stops from their rows; zero for open stops."""
+    """Record the forces of the joint stops from their rows; open stops have zero force."""
     table = unilateral.stop_table
     for k in range(table.shape[0]):
         closed = table[k, STOP_CLOSED] == 1
@@ -232,19 +233,19 @@ def note_stop_forces(unilateral: UnilateralArrays, ws: Workspace):
 
 @internal_kernel
 def dry_bound(unilateral: UnilateralArrays, k):
-    """Return the dry friction of the k-th joint with dry friction, gear and bearing together [N m or N]."""
+    """Return the total dry friction, of gear and bearing, of the k-th joint with dry friction [N m or N]."""
     return unilateral.dry[k, OF_GEAR] + unilateral.dry[k, OF_JOINT]
 
 
 @internal_kernel
 def holding_bound(unilateral: UnilateralArrays, k):
-    """Return the dry friction that may hold the k-th such joint, slightly reduced while modes are chosen [N m or N]."""
+    """Return the dry friction [N m or N] that can hold the k-th joint; slightly reduced while modes are chosen."""
     return unilateral.number[HOLDING] * dry_bound(unilateral, k)
 
 
 @internal_kernel
 def rows_of_couplings(unilateral: UnilateralArrays, ws: Workspace):
-    """Return the number of coupling rows: the first in the table, before held joints and closed stops."""
+    """Return the number of coupling rows, which come first in the table, before held joints and closed stops."""
     rows = ws.counts[ka.COUPLED] - dry_rows_held(unilateral)
     for k in range(unilateral.stop_table.shape[0]):
         rows -= unilateral.stop_table[k, STOP_CLOSED]
@@ -262,7 +263,7 @@ def dry_rows_held(unilateral: UnilateralArrays):
 
 @internal_kernel
 def dry_rests(unilateral: UnilateralArrays, k):
-    """True if dry friction keeps the joint at rest, by a row or, if contacts hold it, by a constant force."""
+    """Return whether dry friction keeps a joint at rest, by a row or, if contacts hold it, by a constant force."""
     return unilateral.dry_table[k, DRY_HOLDS] == 1 or abs(unilateral.dry[k, DRY_SIDE]) < 1.0
 
 
@@ -279,7 +280,7 @@ def apply_dry_friction(unilateral: UnilateralArrays | None, ws: Workspace):
 
 @internal_kernel
 def note_dry_forces(unilateral: UnilateralArrays, ws: Workspace):
-    """Record the dry friction of all joints that have it, and the drag of gears on their shafts."""
+    """Record the friction forces of all joints with dry friction, and the drag of the gears on their shafts."""
     table, dry = unilateral.dry_table, unilateral.dry
     for k in range(table.shape[0]):
         force, a = -dry[k, DRY_SIDE] * dry_bound(unilateral, k), table[k, DRY_DRIVE]
@@ -292,7 +293,7 @@ def note_dry_forces(unilateral: UnilateralArrays, ws: Workspace):
 
 @internal_kernel
 def sliding_friction(law, k, speed):
-    """Return the friction coefficient of candidate k that slides at this speed; law: (c, CONTACT_LAW_SIZE)."""
+    """Return the friction coefficient of candidate k at a sliding speed; ``law`` has shape (c, CONTACT_LAW_SIZE)."""
     mu = law[k, ka.MU]
     if law[k, ka.STRIBECK] > 0.0:
         ratio = speed / law[k, ka.STRIBECK]

@@ -1,1 +1,1 @@
-"""Drives of joints: DC motor, position servo, open torque."""
+"""Drives of joints: DC motor, position servo, open-loop torque."""

@@ -1,6 +1,6 @@
-"""Drive laws of all motors by kind: references, commands, torques, and linear blocks of implicit methods.
+"""Drive laws of all kinds of motors: references, commands, torques, and linear blocks for implicit methods.
 
-The laws of a kind are plain scalar functions of (table of parameters, row, reference, state), compiled unchanged.
+The laws of each kind are plain scalar functions of (parameter table, row, reference, state), compiled unchanged.
 Virtual servos call them without numba; tests call them with complex numbers (complex-step derivatives). Their
 comparisons therefore use real parts. A drive kind is a constant in dynsim.dynamics.tables, a group of such functions, a
 branch in each function below that depends on the kind, and one in ``dynsim.compile.tables.compile_drives``.
@@ -13,7 +13,7 @@ from dynsim.dynamics.state import StateLayout
 from dynsim.dynamics.tables import DriveArrays, ReferenceArrays, Workspace
 from dynsim.jit.kernel import inline_kernel, internal_kernel, kernel, noinline_kernel
 
-# Clipping of a value to ±limit, for every kind of drive.
+# Clipping of values to ±limit, for every kind of drive.
 
 
 def clipped(x, limit):
@@ -25,7 +25,7 @@ def clipped(x, limit):
     return x
 
 
-# DC motor with its circuit, and the voltage PD on its terminals ([WM] eqs 16–26, 56).
+# DC motor with its circuit, and PD control of its terminal voltage ([WM] eqs 16–26, 56).
 
 
 def dc_command(motor, a, q_ref, v_ref, q, v):
@@ -43,7 +43,7 @@ def within_current(u, v, k_m, drop):
 
 
 def dc_torque(motor, a, i):
-    """Return K_m i [N m] ([WM] eq 19); the losses of rotor and gear belong to the joint."""
+    """Return K_m i [N m] ([WM] eq 19); the losses of the rotor and the gear are counted at the joint."""
     return motor[a, ka.K_M] * i
 
 
@@ -76,7 +76,7 @@ def servo_command(motor, a, mode, q_ref, v_ref, q, v):
 
 
 def servo_segment(motor, a, mode, command, v):
-    """Return the active limit at a command and a rate: 0 none, ±1 voltage, ±2 current."""
+    """Return the limit that is active for a command and a rate: 0 none, ±1 voltage, ±2 current."""
     if mode == ka.OFF:
         return 0
     u = clipped(command, motor[a, ka.U_MAX])
@@ -91,7 +91,7 @@ def servo_segment(motor, a, mode, command, v):
 
 
 def servo_circuit_on(motor, a, mode, segment, command, v):
-    """Return :func:`servo_circuit` at the limit ``segment``, see :func:`servo_segment`, regardless of the state."""
+    """Return the result of :func:`servo_circuit` as if the limit ``segment`` of :func:`servo_segment` were active."""
     if mode == ka.OFF:
         return motor[a, ka.K_M] * v, 0.0 * v
     if segment == 2 or segment == -2:
@@ -102,12 +102,12 @@ def servo_circuit_on(motor, a, mode, segment, command, v):
 
 
 def servo_circuit(motor, a, mode, command, v):
-    """Return terminal voltage u [V] and current i [A] of a command, both within their limits."""
+    """Return the terminal voltage u [V] and the current i [A] for a command, both within their limits."""
     return servo_circuit_on(motor, a, mode, servo_segment(motor, a, mode, command, v), command, v)
 
 
 def servo_drag(motor, a, mode, v):
-    """Return the gear friction against v [N m]: Coulomb, smoothed below v_s; while off also viscous."""
+    """Return the gear friction that opposes v [N m]: Coulomb friction smoothed below v_s, plus viscous drag if off."""
     drag = motor[a, ka.COULOMB] * v / (v * v + motor[a, ka.COULOMB_SPEED] ** 2) ** 0.5
     if mode == ka.OFF:
         drag += motor[a, ka.FREE_DRAG] * v
@@ -143,7 +143,7 @@ def servo_block(motor, a, mode, sampled, command, v):
     return servo_block_on(motor, a, mode, servo_segment(motor, a, mode, command, v), sampled, v)
 
 
-# Ideal torque source: the reference is the torque itself, within its limit.
+# Ideal torque source, whose reference is the torque itself, clipped to its limit.
 
 
 def open_torque(motor, a, command):
@@ -155,13 +155,14 @@ _DC_LAWS = clipped, dc_balance, dc_block, dc_command, dc_torque, open_torque
 _SERVO_LAWS = servo_segment, servo_circuit_on, servo_circuit, servo_block_on, servo_block
 for _law in (*_DC_LAWS, *_SERVO_LAWS, servo_command, servo_drag, servo_torque):
     internal_kernel(_law)
-# Not inlined: few motors use it, and its product K_m v would be shared with the balance, whose last bits would change.
+# Do not inline this function: few motors use it, and the compiler would share its product K_m v with the balance, whose
+# last bits would then change.
 noinline_kernel(within_current)
 
 
 @internal_kernel
 def evaluate_reference(drives: DriveArrays, reference: ReferenceArrays, t, ws: Workspace):
-    """Write references q_d and rates v_d of all drives at time t to ``ws.motors`` [rad, rad/s; N m: open torque]."""
+    """Write references q_d and rates v_d of all drives at time t to ``ws.motors`` [rad, rad/s; torque sources: N m]."""
     motors, c, line = ws.motors, reference.coefficients, drives.input
     spacing = reference.grid[1]
     x = t - reference.grid[0]
@@ -210,7 +211,7 @@ def fed_forward(voltage, grid, t, a, asked):
     return asked + total
 
 
-# Inlined: a call for each motor would take a fourteenth of an explicit step.
+# Inlined, because a call for each motor would take a fourteenth of an explicit step.
 @inline_kernel
 def drive_dc(drives: DriveArrays, asked, i, ws: Workspace, a):
     """Evaluate DC motor a at a command [V] and a current [A]."""
@@ -227,12 +228,12 @@ def drive_dc(drives: DriveArrays, asked, i, ws: Workspace, a):
 def drive(drives: DriveArrays, reference: ReferenceArrays, t, y, layout: StateLayout, ws: Workspace):
     """Write currents, voltages and current rates of all drives to ``ws.motors``; add their torques to ``ws.joints``.
 
-    ``ws.joints`` must have the positions and rates of the joints and the other applied forces.
+    ``ws.joints`` must already contain the joint positions and rates and the other applied forces.
     """
     table, motor, motors, joints = drives.table, drives.motor, ws.motors, ws.joints
     na = motors.shape[0]
     evaluate_reference(drives, reference, t, ws)
-    if layout.circuits == na:  # every drive has its circuit: the loop for most robots
+    if layout.circuits == na:  # every drive has a circuit, as in most robots
         for a in range(na):
             j = table[a, ka.DRIVEN]
             asked = dc_command(motor, a, motors[a, ka.Q_REF], motors[a, ka.V_REF], joints[j, ka.Q], joints[j, ka.QD])
@@ -316,12 +317,12 @@ def segment_of(drives: DriveArrays, reference: ReferenceArrays, t, ws: Workspace
 def drive_on_segments(
     drives: DriveArrays, reference: ReferenceArrays, t, y, layout: StateLayout, segment, ws: Workspace, linear
 ):
-    """Do :func:`drive` and :func:`drive_block` with given active limits ``segment``, (na,), regardless of the state.
+    """Evaluate :func:`drive` and :func:`drive_block` as if the limits ``segment``, (na,), were active.
 
     Parameters
     ----------
     linear : (na, BLOCK_SIZE) ndarray
-        Receives the linear blocks.
+        Overwritten with the linear blocks.
     """
     table, motor, motors, joints = drives.table, drives.motor, ws.motors, ws.joints
     evaluate_reference(drives, reference, t, ws)

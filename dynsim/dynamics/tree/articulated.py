@@ -1,7 +1,7 @@
-"""The articulated solver: O(n) elimination for accelerations and the matrix of constraint rows; M is never formed.
+"""Articulated-body solver: O(n) elimination for accelerations and the matrix of constraint rows; M is never formed.
 
-Eliminating the joints from the tips to the root factors M + J_m; D_i is the pivot of joint i. For a right-hand side b
-let column(b) be the eliminated b; then a·(M + J_m)⁻¹ b = Σ_i column(a)_i column(b)_i / D_i. The p×p matrix of the
+Eliminating the joints from the tips to the root factors M + J_m; D_i is the pivot of joint i. For a right-hand side b,
+let column(b) be b after elimination; then a·(M + J_m)⁻¹ b = Σ_i column(a)_i column(b)_i / D_i. The p×p matrix of the
 constraints thus needs only dot products of columns, and one forward sweep gives vdot.
 """
 
@@ -33,11 +33,11 @@ from dynsim.jit.kernel import inline_kernel, internal_kernel, kernel, noinline_k
 
 @internal_kernel
 def factor(model: ModelArrays, ws: Workspace):
-    """Compute articulated inertias and eliminated applied forces, tips to root, after ``forward_sweep``.
+    """Compute articulated inertias and eliminated applied forces, from the tips to the root, after ``forward_sweep``.
 
-    I^A_i = I_i + Σ_children (I^A − U Uᵀ/D), U = I^A S, D = S·U + J_m (Featherstone, world frame, one origin).
-    F^A_i = F_i + Σ_children (F^A + U w/D), w = applied − S·F^A, into ``ws.column[:, 0]``. The inertial wrenches F come
-    from the sweep: velocity products and weight enter here, so the bias forces need no separate pass.
+    I^A_i = I_i + Σ_children (I^A − U Uᵀ/D), U = I^A S, D = S·U + J_m (Featherstone; world frame with one origin).
+    F^A_i = F_i + Σ_children (F^A + U w/D), with w = applied − S·F^A in ``ws.column[:, 0]``. The inertial wrenches F of
+    the sweep include velocity products and weight, so the bias forces need no separate pass.
     """
     tree, body, links, joints, column = model.tree, model.body, ws.links, ws.joints, ws.column
     n = tree.shape[0]
@@ -47,8 +47,8 @@ def factor(model: ModelArrays, ws: Workspace):
                 links[i, ka.IA + k] = 0.0
             for k in range(6):
                 links[i, ka.F + k] = 0.0
-    # Contribution of link i + 1, kept in registers while the chain is serial; only links with further children
-    # accumulate in memory.
+    # I and F are the contribution of link i + 1, kept in registers while the chain is serial; contributions of other
+    # children accumulate in memory.
     I, F = ZERO_INERTIA, ZERO_SIX
     for i in range(n - 1, -1, -1):
         m, c, I_c = body_inertia(model, ws, i)
@@ -81,9 +81,9 @@ def factor(model: ModelArrays, ws: Workspace):
 def row_system(model: ModelArrays, ws: Workspace):
     """Write the p×p system J M⁻¹ F f = target − J M⁻¹ applied to ``ws.small[0]`` and the RHS column, after `factor`.
 
-    Row k and its force direction leave the columns ``ws.column[:, 1 + 2 k]`` and ``ws.column[:, 2 + 2 k]``. A row
-    involves only joints between its links and the world; the rest of a column is zero from the start. Entry (k, m) is
-    Σ column_k column_m / D over the joints that both rows involve.
+    The eliminated row k and its force direction are left in the columns ``ws.column[:, 1 + 2 k]`` and
+    ``ws.column[:, 2 + 2 k]``. A row involves only joints between its links and the world; the rest of a column is zero
+    from the start. Entry (k, m) is Σ column_k column_m / D over the joints that both rows involve.
     """
     tree, links, small, state = model.tree, ws.links, ws.small, ws.rows
     for k in range(ws.counts[ka.ROWS]):
@@ -95,7 +95,7 @@ def row_system(model: ModelArrays, ws: Workspace):
                 if k == ws.active[ws.active[k, ka.OWNER], ka.FIRST_ROW]:
                     sticking_columns(model, ws, k)
                 continue
-        # Row and force direction after the elimination so far.
+        # Current values of the row and its force direction during the elimination.
         row, direction = six(state, k, ka.ROW), six(state, k, ka.DIRECTION)
         for m in range(k):
             small[0, k, m] = 0.0
@@ -114,9 +114,9 @@ def row_system(model: ModelArrays, ws: Workspace):
 
 @internal_kernel
 def enter_column(ws: Workspace, i, k, r, w, own, total):
-    """Write row and direction of row k at joint i to its columns and to the system.
+    """Write row k and its direction at joint i to the columns and to the system.
 
-    Returns its own entry and right-hand side so far.
+    Returns the partial sums of the diagonal entry and of the right-hand side of the row.
     """
     column, small = ws.column, ws.small
     column[i, 1 + 2 * k] = r
@@ -131,10 +131,10 @@ def enter_column(ws: Workspace, i, k, r, w, own, total):
 
 @noinline_kernel
 def sticking_columns(model: ModelArrays, ws: Workspace, k):
-    """Do :func:`row_system` for the three rows of a sticking point, k and the next two, with their own directions.
+    """Compute :func:`row_system` for the three rows of a sticking point, k and the next two, in one pass.
 
-    One pass for all of them. Their products with earlier rows are symmetric about the diagonal unless the other row
-    slides.
+    Each row is its own force direction. The products with earlier rows are symmetric about the diagonal unless the
+    earlier row slides.
     """
     tree, links, column, small, state = model.tree, ws.links, ws.column, ws.small[0], ws.rows
     b, c = k + 1, k + 2
@@ -181,7 +181,7 @@ def sticking_columns(model: ModelArrays, ws: Workspace, k):
 
 @noinline_kernel
 def two_ended_row(model: ModelArrays, ws: Workspace, k):
-    """Compute column, own entry and right-hand side of a row with two ends, as :func:`row_system` does for one end.
+    """Compute the column, diagonal entry and right-hand side of a row between two bodies, as :func:`row_system` does.
 
     Two accumulators climb from the two ends, the larger index first, so that both meet in the first common ancestor
     and continue as one. A joint row has no wrench: its coefficients enter at its two joints.
@@ -189,7 +189,7 @@ def two_ended_row(model: ModelArrays, ws: Workspace, k):
     tree, links, small, state = model.tree, ws.links, ws.small, ws.rows
     first, last = ws.active[k, ka.BODY_A], ws.active[k, ka.BODY_B]
     jointed = ws.active[k, ka.ROW_KIND] == ka.JOINT_ROW
-    # Sides A and B: row and direction after the elimination so far.
+    # Current values of the row and its direction on sides A and B during the elimination.
     row_a, direction_a = ZERO_SIX, ZERO_SIX
     if not jointed:
         row_a, direction_a = six(state, k, ka.ROW), six(state, k, ka.DIRECTION)
@@ -198,7 +198,7 @@ def two_ended_row(model: ModelArrays, ws: Workspace, k):
         small[0, k, m] = 0.0
         small[0, m, k] = 0.0
     own, total = 0.0, state[k, ka.TARGET]
-    # i is the end that moves next, j the other one.
+    # i is the end that moves next, and j is the other end.
     i, j = first, last
     while i >= 0 or j >= 0:
         if j > i:
@@ -250,9 +250,10 @@ def row_mobilities(ws: Workspace, W):
 
 @inline_kernel
 def sweep_accelerations(model: ModelArrays, ws: Workspace, onto):
-    """Compute vdot = (M + J_m)⁻¹ b from the eliminated b in ``ws.column[:, 0]``, in a forward sweep. F is scratch.
+    """Compute vdot = (M + J_m)⁻¹ b from the eliminated b in ``ws.column[:, 0]`` by a forward sweep. F is scratch.
 
-    vdot_i = column_i / D − (U/D)·a_p, a_i = a_p + S vdot_i. If ``onto`` is True, it is added to the present vdot.
+    vdot_i = column_i / D − (U/D)·a_p, a_i = a_p + S vdot_i. If ``onto`` is True, the result is added to the present
+    vdot.
     """
     tree, links, joints, column = model.tree, ws.links, ws.joints, ws.column
     # The acceleration of link i − 1 stays in registers; it is read back only where the tree branches.
@@ -292,7 +293,7 @@ def accelerate_by_impulses(model: ModelArrays, ws: Workspace, f):
 
 @kernel
 def forward_dynamics(model: ModelArrays, ws: Workspace):
-    """Compute vdot = (M + J_m)⁻¹ (applied − h − g) without contacts, in ``ws.joints``: sweep, factor, accelerate."""
+    """Compute vdot = (M + J_m)⁻¹ (applied − h − g) in ``ws.joints``, without contacts, by sweep, factor, accelerate."""
     forward_sweep(model, ws, 1.0, 0.0, 1.0)
     factor(model, ws)
     accelerate(model, ws)

@@ -1,13 +1,13 @@
 """Joints with several rates (ball, rolling base, wheeled base), sines and cosines, and positions of body-fixed points.
 
-Every joint is a sequence of one-velocity rows. A row is a link of the tree with a motion axis S and one velocity; all
-rows of a joint but the last are massless. The axes of a joint with several rows are fixed in the body that it carries,
-so with V_J = Σ S_k v_k and V the velocity of that body, d/dt(S_k) = V × S_k, and the bias of the joint is
-V × V_J = V_P × V_J: each row has the bias V_P × S_k v_k, where V_P is the velocity of the body on which the *joint* is
-mounted (``BASE``), not of the preceding row. The sweeps need nothing else.
+Every joint is a sequence of rows with one velocity each. A row is a link of the tree with a motion axis S; all rows of
+a joint but the last are massless. The axes of a joint with several rows are fixed in the body that it carries. With
+V_J = Σ S_k v_k and the velocity V of that body, d/dt(S_k) = V × S_k, and the bias of the joint is V × V_J = V_P × V_J.
+Each row thus has the bias V_P × S_k v_k, where V_P is the velocity of the body on which the *joint* is mounted
+(``BASE``), not the velocity of the preceding row. The sweeps need nothing else.
 
-Positions are not integrals of such velocities: q̇ = N(q) v, and there may be more positions than velocities. The first
-row computes its pose from the coordinates of the whole joint; the others copy it.
+Positions are not integrals of these velocities: q̇ = N(q) v, and a joint may have more positions than velocities. The
+first row computes its pose from the coordinates of the whole joint; the other rows copy it.
 
 =====================  ===============================  ==================================================
 joint                  coordinates                      rows
@@ -20,7 +20,7 @@ wheeled base           angles of its left and right     rates of the wheels: eac
 
 The heading of a wheeled base is (r/T)(right − left): r/T is the parameter of its first row, r/2 of its second.
 
-A free body is three prismatic rows and a ball; a planar joint two prismatic rows and a revolute one.
+A free body has three prismatic rows and a ball joint; a planar joint has two prismatic rows and a revolute one.
 """
 
 from __future__ import annotations
@@ -67,9 +67,9 @@ COS10, COS12, COS14 = -2.75573143513906633035e-07, 2.08757232129817482790e-09, -
 
 @internal_kernel
 def sine_cosine_of(q):
-    """Return sine and cosine of one q; within one unit in the last place of libm.
+    """Return the sine and cosine of one q, within one unit in the last place of libm's results.
 
-    Contains no calls, which would push all values of a sweep out of their registers, and no branches:
+    The function contains no calls, which would push all values of a sweep out of their registers, and no branches:
     r = q − k π/2 with π/2 in three parts, then the polynomials of FreeBSD's msun (k_sin.c, k_cos.c) on |r| ≤ π/4.
     Infinite q gives NaN.
     """
@@ -87,7 +87,7 @@ def sine_cosine_of(q):
 
 @internal_kernel
 def sine_cosine(joints, trig):
-    """Write sine and cosine of every q to trig, (3, ≥ n), in vectors of several q."""
+    """Write the sine and cosine of every q to ``trig``, (3, ≥ n), several joints at a time by SIMD."""
     for i in range(joints.shape[0]):
         trig[2, i] = joints[i, ka.Q]
     for i in range(trig.shape[1]):
@@ -96,7 +96,7 @@ def sine_cosine(joints, trig):
 
 @internal_kernel
 def row_motion(model: ModelArrays, ws: Workspace, i, B, p):
-    """Return pose and motion axis of row i of a joint with several rows.
+    """Return the pose and motion axis of row i of a joint with several rows.
 
     Parameters
     ----------
@@ -140,7 +140,7 @@ def row_motion(model: ModelArrays, ws: Workspace, i, B, p):
 
 @internal_kernel
 def turned(w, x, y, z):
-    """Return the rotation of a quaternion of any length, because it drifts between normalisations."""
+    """Return the rotation of a quaternion, which need not have unit length: it drifts between normalisations."""
     s = 2.0 / (w * w + x * x + y * y + z * z)
     return (
         1.0 - s * (y * y + z * z), s * (x * y - w * z), s * (x * z + w * y),
@@ -153,7 +153,8 @@ def turned(w, x, y, z):
 def row_rates(model: ModelArrays, ws: Workspace, i, v, vdot, gx, gy, gz):
     """Return V and A of link i from its axis S, for every kind of joint: V = V_p + S v, A = A_p + V_b × S v + S vdot.
 
-    p is the parent, b the body on which the joint is mounted. ``forward_sweep`` inlines this for joints of one row.
+    p is the parent, and b is the body on which the joint is mounted. ``forward_sweep`` inlines this computation for
+    joints with one row.
     """
     links, j, m = ws.links, model.tree[i, ka.PARENT], model.tree[i, ka.BASE]
     bias = cross_motion(six(links, m, ka.V), six(links, i, ka.S)) if m >= 0 else ZERO_SIX
@@ -168,7 +169,7 @@ def row_rates(model: ModelArrays, ws: Workspace, i, v, vdot, gx, gy, gz):
 def sweep_row(model: ModelArrays, ws: Workspace, i, v, vdot, gx, gy, gz):
     """Write R, p, S, V and A of row i to ``ws.links``, as ``forward_sweep`` does for a link.
 
-    ``v``, ``vdot`` and gravity g include the factors of the sweep.
+    ``v``, ``vdot`` and the gravity components already include the factors of the sweep.
     """
     body, links, j = model.body, ws.links, model.tree[i, ka.PARENT]
     B, p = rotation(body, i, ka.R_PJ), vector(body, i, ka.P_PJ)
@@ -204,13 +205,13 @@ def quaternion_rate(w, x, y, z, a, b, c):
 
 @internal_kernel
 def quaternion_turn(w, x, y, z, dw, dx, dy, dz):
-    """Return vec(q̄ ∘ δq) of q = (w, x, y, z): half the rotation in the body that changes a unit quaternion q by δq."""
+    """Return vec(q̄ ∘ δq) of q = (w, x, y, z): half the body rotation that changes the unit quaternion q by δq."""
     return w * dx - x * dw - y * dz + z * dy, w * dy - y * dw - z * dx + x * dz, w * dz - z * dw - x * dy + y * dx
 
 
 @internal_kernel
 def displace(model: ModelArrays, ws: Workspace, y, start):
-    """Move the positions y[start:] by the small displacement in the QDD column, taken as velocities for a unit time."""
+    """Move the positions y[start:] by the small displacement in the QDD column: velocities that act for a unit time."""
     tree, joints = model.tree, ws.joints
     for i in range(tree.shape[0]):
         k, kind = start + tree[i, ka.POSITION_INDEX], tree[i, ka.KIND]
@@ -224,7 +225,7 @@ def displace(model: ModelArrays, ws: Workspace, y, start):
             y[k + 1] += joints[i, ka.QDD] * ws.trig[0, i + 1]
         elif kind == ka.LEFT_WHEEL:
             left, right = joints[i, ka.QDD], joints[i + 1, ka.QDD]
-            # Heading at half the displacement: the error is then of third order, not second.
+            # Use the heading at half the displacement, so that the error is of third order instead of second.
             heading = model.body[i, ka.PARAMETER] * (y[k + 1] - y[k] + 0.5 * (right - left))
             shift = model.body[i + 1, ka.PARAMETER] * (left + right)
             y[k] += left
@@ -238,7 +239,7 @@ def displace(model: ModelArrays, ws: Workspace, y, start):
 
 @internal_kernel
 def normalise(model: ModelArrays, y, start):
-    """Give every quaternion in y[start:] unit length."""
+    """Scale every quaternion in y[start:] to unit length."""
     tree = model.tree
     for i in range(tree.shape[0]):
         if tree[i, ka.KIND] == ka.BALL_X:
@@ -250,10 +251,10 @@ def normalise(model: ModelArrays, y, start):
 
 @internal_kernel
 def position_error(model: ModelArrays, y, y_new, error, start, rtol, atol):
-    """Return the sum of squares of the position errors relative to their tolerances, and their number.
+    """Return the sum of squares of the position errors relative to their tolerances, and the number of errors.
 
-    The error of a quaternion counts as the three angles 2 vec(q̄ ∘ δq) of the rotation that undoes it, against
-    atol + rtol [rad]: the same as for a revolute joint one radian from zero.
+    The error of a quaternion counts as the three angles 2 vec(q̄ ∘ δq) of the rotation that corrects it. Their
+    tolerance is atol + rtol [rad], as for a revolute joint one radian from zero.
     """
     tree, total, count = model.tree, 0.0, 0
     for i in range(tree.shape[0]):
@@ -305,7 +306,7 @@ def positions_along(model: ModelArrays, y, start, u, out):
 
 @internal_kernel
 def rates_across(model: ModelArrays, y, start, d, out):
-    """Write N⁺ d to out, (n,): rates whose positions change as d[start:], as closely as possible; may be complex."""
+    """Write N⁺ d to out, (n,): the rates that change positions by d[start:] as closely as possible; may be complex."""
     tree = model.tree
     for i in range(tree.shape[0]):
         k, kind = start + tree[i, ka.POSITION_INDEX], tree[i, ka.KIND]
@@ -325,7 +326,7 @@ def rates_across(model: ModelArrays, y, start, d, out):
 
 @kernel
 def point_position(ws: Workspace, link, point, out):
-    """Write p_WB + R_WB point to out, (3,) [m]: world position of a body-fixed point, after ``forward_sweep``."""
+    """Write the world position p_WB + R_WB point of a body-fixed point to out, (3,) [m], after ``forward_sweep``."""
     if link < 0:
         out[0], out[1], out[2] = point[0], point[1], point[2]
         return

@@ -1,4 +1,4 @@
-"""External wrenches on points of bodies: constant, by splines over time, or rewritten between steps."""
+"""External wrenches on points of bodies: constant, given by splines over time, or rewritten between steps."""
 
 from __future__ import annotations
 
@@ -14,32 +14,33 @@ from dynsim.jit.kernel import internal_kernel, noinline_kernel
 # LoadArrays.table, int
 LINK, IN_BODY, HOLDS, DATA, SEGMENTS = 0, 1, 2, 3, 4
 TABLE_SIZE = 5
-# LoadArrays.data, from table[l, DATA] on: point in the body's frame [m], wrench that is added to the segments' wrench:
-# force [N] and moment [N m]. Then the segments: first time [s], then ascending powers of t − that time, four for each
-# component of force and moment. Finally the end time of the last segment.
+# LoadArrays.data, from index table[l, DATA] on: point in the body's frame [m]; constant wrench (force [N] and moment
+# [N m]) that is added to the wrench of the segments; then the segments. Each segment has its start time [s] and
+# ascending powers of the time since then, four for each component of force and moment. The end time of the last segment
+# follows.
 POINT, WRENCH, FIRST_SEGMENT = 0, 3, 9
 SEGMENT_SIZE = 25
 
 
 class LoadArrays(NamedTuple):
-    """External wrenches."""
+    """Tables of external wrenches."""
 
-    table: np.ndarray  # (l, TABLE_SIZE) int: link, axes of the wrench, held beyond its times, start in data, segments
+    table: np.ndarray  # (l, TABLE_SIZE) int, see LINK and the following constants
     data: np.ndarray  # (…,) see POINT, WRENCH, FIRST_SEGMENT
 
 
 @internal_kernel
 def segment_start(loads: LoadArrays, k, t):
-    """Return the start in ``loads.data`` of the segment of load k at t, and the time of evaluation; −1 for none.
+    """Return the index in ``loads.data`` of the segment of load k at time t (−1 if none), and the evaluation time.
 
-    Depends on time only, so it is the same for all states that are evaluated together.
+    The result depends only on time, so it is the same for all states that are evaluated together.
     """
     count = loads.table[k, SEGMENTS]
     first = loads.table[k, DATA] + FIRST_SEGMENT
     if count == 0:
         return -1, t
     end = loads.data[first + count * SEGMENT_SIZE]
-    # Both ends belong to the right: the steps end there (Run.breaks).
+    # At both end times, use the value that applies just after them, because integration steps end there (Run.breaks).
     if t < loads.data[first] or t >= end:
         if loads.table[k, HOLDS] == 0:
             return -1, t
@@ -56,7 +57,7 @@ def segment_start(loads: LoadArrays, k, t):
 
 @internal_kernel
 def load_wrench(loads: LoadArrays, k, t, ws: Workspace):
-    """Return moment about the world origin and force of load k at time t in W [N m, N], after ``forward_sweep``."""
+    """Return the moment about the world origin and the force of load k at t in W [N m, N], after ``forward_sweep``."""
     links, table, data = ws.links, loads.table, loads.data
     i, start = table[k, LINK], table[k, DATA]
     force, moment = segment_vector(data, start + WRENCH), segment_vector(data, start + WRENCH + 3)
@@ -72,7 +73,7 @@ def load_wrench(loads: LoadArrays, k, t, ws: Workspace):
 
 @internal_kernel
 def segment_vector(data, c):
-    """Return three numbers of the data from index c on."""
+    """Return three consecutive numbers of the data, starting at index c."""
     return data[c], data[c + 1], data[c + 2]
 
 
@@ -84,7 +85,7 @@ def cubics(data, c, x):
 
 @internal_kernel
 def cubic(data, c, x):
-    """Evaluate the cubic polynomial in x with ascending coefficients from index c on."""
+    """Evaluate the cubic polynomial in x with ascending coefficients that start at index c."""
     return data[c] + x * (data[c + 1] + x * (data[c + 2] + x * data[c + 3]))
 
 
@@ -92,7 +93,7 @@ def cubic(data, c, x):
 def add_loads(model: ModelArrays, loads: LoadArrays, t, ws: Workspace, power, start):
     """Add S·W of every external wrench W to the applied forces of the joints that carry it, after ``forward_sweep``.
 
-    Its power W·V goes to power[start:] [W].
+    The power W·V of each wrench is written to power[start:] [W].
     """
     links, joints, table = ws.links, ws.joints, loads.table
     for k in range(table.shape[0]):

@@ -1,8 +1,8 @@
-"""Spatial algebra on tuples of numbers or of vectors (SIMD): 3-vectors, rotations, six-vectors, articulated inertias.
+"""Spatial algebra on tuples of numbers or SIMD vectors: 3-vectors, rotations, six-vectors, articulated inertias.
 
 Motions are (angular, linear) and wrenches (moment, force), both about the world origin in the axes of W (Featherstone,
 Rigid Body Dynamics Algorithms, 2008). A rotation is nine numbers, row by row. Tuples live in registers; ``six`` and
-similar functions read them from row i of a table, from column c on, and ``put_six`` etc. write them there.
+similar functions read them from row i of a table, starting at column c, and ``put_six`` etc. write them there.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ ZERO_INERTIA = (0.0,) * 21
 
 @internal_kernel
 def vector(table, i, c):
-    """3-vector in row i from column c on."""
+    """Return the 3-vector in row i, starting at column c."""
     return table[i, c], table[i, c + 1], table[i, c + 2]
 
 
 @internal_kernel
 def put_vector(table, i, c, a):
-    """Write a 3-vector."""
+    """Write a 3-vector to row i, starting at column c."""
     table[i, c], table[i, c + 1], table[i, c + 2] = a[0], a[1], a[2]
 
 
 @internal_kernel
 def rotation(table, i, c):
-    """Rotation in row i from column c on."""
+    """Return the rotation in row i, starting at column c."""
     return (
         table[i, c], table[i, c + 1], table[i, c + 2],
         table[i, c + 3], table[i, c + 4], table[i, c + 5],
@@ -38,7 +38,7 @@ def rotation(table, i, c):
 
 @internal_kernel
 def put_rotation(table, i, c, R):
-    """Write a rotation."""
+    """Write a rotation to row i, starting at column c."""
     table[i, c], table[i, c + 1], table[i, c + 2] = R[0], R[1], R[2]
     table[i, c + 3], table[i, c + 4], table[i, c + 5] = R[3], R[4], R[5]
     table[i, c + 6], table[i, c + 7], table[i, c + 8] = R[6], R[7], R[8]
@@ -46,62 +46,62 @@ def put_rotation(table, i, c, R):
 
 @internal_kernel
 def six(table, i, c):
-    """Six-vector in row i from column c on."""
+    """Return the six-vector in row i, starting at column c."""
     return table[i, c], table[i, c + 1], table[i, c + 2], table[i, c + 3], table[i, c + 4], table[i, c + 5]
 
 
 @internal_kernel
 def put_six(table, i, c, a):
-    """Write a six-vector."""
+    """Write a six-vector to row i, starting at column c."""
     table[i, c], table[i, c + 1], table[i, c + 2] = a[0], a[1], a[2]
     table[i, c + 3], table[i, c + 4], table[i, c + 5] = a[3], a[4], a[5]
 
 
 @internal_kernel
 def cross(a, b):
-    """a × b of 3-vectors."""
+    """Return a × b for 3-vectors."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 @internal_kernel
 def dot_vector(a, b):
-    """a · b of 3-vectors."""
+    """Return a · b for 3-vectors."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @internal_kernel
 def times_number(a, x):
-    """a x of a 3-vector."""
+    """Return a x for a 3-vector a and a number x."""
     return a[0] * x, a[1] * x, a[2] * x
 
 
 @internal_kernel
 def along(a, b, x):
-    """a + b x of 3-vectors."""
+    """Return a + b x for 3-vectors a, b and a number x."""
     return a[0] + b[0] * x, a[1] + b[1] * x, a[2] + b[2] * x
 
 
 @internal_kernel
 def first_axis(R):
-    """R e_x: first column of a rotation."""
+    """Return R e_x, the first column of a rotation."""
     return R[0], R[3], R[6]
 
 
 @internal_kernel
 def second_axis(R):
-    """R e_y: second column of a rotation."""
+    """Return R e_y, the second column of a rotation."""
     return R[1], R[4], R[7]
 
 
 @internal_kernel
 def third_axis(R):
-    """R e_z: third column of a rotation."""
+    """Return R e_z, the third column of a rotation."""
     return R[2], R[5], R[8]
 
 
 @internal_kernel
 def rotate(R, u):
-    """R u."""
+    """Return R u, the vector u rotated by R."""
     return (
         R[0] * u[0] + R[1] * u[1] + R[2] * u[2],
         R[3] * u[0] + R[4] * u[1] + R[5] * u[2],
@@ -111,7 +111,7 @@ def rotate(R, u):
 
 @internal_kernel
 def rotate_back(R, u):
-    """Rᵀ u."""
+    """Return Rᵀ u, the vector u rotated by the inverse of R."""
     return (
         R[0] * u[0] + R[3] * u[1] + R[6] * u[2],
         R[1] * u[0] + R[4] * u[1] + R[7] * u[2],
@@ -121,7 +121,7 @@ def rotate_back(R, u):
 
 @internal_kernel
 def transform(p, R, u):
-    """p + R u: the point u of a frame at p."""
+    """Return p + R u, the point u of a frame with origin p and rotation R."""
     return (
         p[0] + R[0] * u[0] + R[1] * u[1] + R[2] * u[2],
         p[1] + R[3] * u[0] + R[4] * u[1] + R[5] * u[2],
@@ -131,7 +131,7 @@ def transform(p, R, u):
 
 @internal_kernel
 def times_inertia(I, u):
-    """I u of a symmetric matrix (xx xy xz yy yz zz)."""
+    """Return I u for a symmetric matrix I (xx xy xz yy yz zz)."""
     return (
         I[0] * u[0] + I[1] * u[1] + I[2] * u[2],
         I[1] * u[0] + I[3] * u[1] + I[4] * u[2],
@@ -141,7 +141,7 @@ def times_inertia(I, u):
 
 @internal_kernel
 def point_velocity(V, c):
-    """v + ω × c: velocity of the point c of a body with motion V = (ω, v)."""
+    """Return v + ω × c, the velocity of the point c of a body with motion V = (ω, v)."""
     return (
         V[3] + V[1] * c[2] - V[2] * c[1],
         V[4] + V[2] * c[0] - V[0] * c[2],
@@ -151,7 +151,7 @@ def point_velocity(V, c):
 
 @internal_kernel
 def compose(A, B):
-    """A B of rotations."""
+    """Return A B, the product of two rotations."""
     return (
         A[0] * B[0] + A[1] * B[3] + A[2] * B[6],
         A[0] * B[1] + A[1] * B[4] + A[2] * B[7],
@@ -167,7 +167,7 @@ def compose(A, B):
 
 @internal_kernel
 def turn(B, u, z, s, c):
-    """B R(u, angle) by Rodrigues, c B + s B [u]× + (1 − c) z uᵀ, with z = B u and sine s, cosine c of the angle."""
+    """Return B R(u, angle) by Rodrigues' formula, c B + s B [u]× + (1 − c) z uᵀ, with z = B u, sine s and cosine c."""
     d = 1.0 - c
     return (
         c * B[0] + s * (B[1] * u[2] - B[2] * u[1]) + d * z[0] * u[0],
@@ -184,7 +184,7 @@ def turn(B, u, z, s, c):
 
 @internal_kernel
 def turn_x(B, s, c):
-    """B R(x, angle) with sine s and cosine c of the angle."""
+    """Return B R(x, angle), given the sine s and cosine c of the angle."""
     return (
         B[0], c * B[1] + s * B[2], c * B[2] - s * B[1],
         B[3], c * B[4] + s * B[5], c * B[5] - s * B[4],
@@ -194,7 +194,7 @@ def turn_x(B, s, c):
 
 @internal_kernel
 def turn_y(B, s, c):
-    """B R(y, angle) with sine s and cosine c of the angle."""
+    """Return B R(y, angle), given the sine s and cosine c of the angle."""
     return (
         c * B[0] - s * B[2], B[1], c * B[2] + s * B[0],
         c * B[3] - s * B[5], B[4], c * B[5] + s * B[3],
@@ -204,7 +204,7 @@ def turn_y(B, s, c):
 
 @internal_kernel
 def turn_z(B, s, c):
-    """B R(z, angle) with sine s and cosine c of the angle."""
+    """Return B R(z, angle), given the sine s and cosine c of the angle."""
     return (
         c * B[0] + s * B[1], c * B[1] - s * B[0], B[2],
         c * B[3] + s * B[4], c * B[4] - s * B[3], B[5],
@@ -214,7 +214,7 @@ def turn_z(B, s, c):
 
 @internal_kernel
 def cross_motion(V, S):
-    """V × S of motions: rate of change of S as seen from the world when it moves with V."""
+    """Return V × S of motions, the rate of change of S in the world frame if S moves with V."""
     return (
         V[1] * S[2] - V[2] * S[1],
         V[2] * S[0] - V[0] * S[2],
@@ -227,7 +227,7 @@ def cross_motion(V, S):
 
 @internal_kernel
 def point_acceleration(A, V, c):
-    """a + ε × c + ω × (v + ω × c): acceleration of the point c of a body with V = (ω, v) and A = (ε, a)."""
+    """Return a + ε × c + ω × (v + ω × c), the acceleration of point c of a body with V = (ω, v) and A = (ε, a)."""
     v = point_velocity(V, c)
     return (
         A[3] + A[1] * c[2] - A[2] * c[1] + V[1] * v[2] - V[2] * v[1],
@@ -238,7 +238,7 @@ def point_acceleration(A, V, c):
 
 @internal_kernel
 def wrench_at(r, force, moment):
-    """Wrench about the world origin of a force at r and a moment."""
+    """Return the wrench about the world origin of a force at r and a moment."""
     return (
         moment[0] + r[1] * force[2] - r[2] * force[1],
         moment[1] + r[2] * force[0] - r[0] * force[2],
@@ -251,37 +251,40 @@ def wrench_at(r, force, moment):
 
 @internal_kernel
 def dot(a, b):
-    """a · b of six-vectors: power of a wrench on a motion. Sums in pairs shorten the chain of dependent additions."""
+    """Return a · b for six-vectors: the power of a wrench on a motion.
+
+    The terms are summed in pairs, which shortens the chain of dependent additions.
+    """
     return ((a[0] * b[0] + a[1] * b[1]) + (a[2] * b[2] + a[3] * b[3])) + (a[4] * b[4] + a[5] * b[5])
 
 
 @internal_kernel
 def dot_plus(a, b, x):
-    """a · b + x, summed as :func:`dot` is."""
+    """Return a · b + x, summed in the same order as in :func:`dot`."""
     return ((a[0] * b[0] + a[1] * b[1]) + (a[2] * b[2] + a[3] * b[3])) + ((a[4] * b[4] + a[5] * b[5]) + x)
 
 
 @internal_kernel
 def plus(a, b):
-    """a + b of six-vectors."""
+    """Return a + b for six-vectors."""
     return a[0] + b[0], a[1] + b[1], a[2] + b[2], a[3] + b[3], a[4] + b[4], a[5] + b[5]
 
 
 @internal_kernel
 def negative(a):
-    """−a of a six-vector."""
+    """Return −a for a six-vector."""
     return -a[0], -a[1], -a[2], -a[3], -a[4], -a[5]
 
 
 @internal_kernel
 def scaled(a, x):
-    """a x of a six-vector."""
+    """Return a x for a six-vector a and a number x."""
     return a[0] * x, a[1] * x, a[2] * x, a[3] * x, a[4] * x, a[5] * x
 
 
 @internal_kernel
 def plus_scaled(a, b, x):
-    """a + b x of six-vectors."""
+    """Return a + b x for six-vectors a, b and a number x."""
     return (
         a[0] + b[0] * x, a[1] + b[1] * x, a[2] + b[2] * x, a[3] + b[3] * x, a[4] + b[4] * x, a[5] + b[5] * x
     )  # fmt: skip
@@ -289,7 +292,7 @@ def plus_scaled(a, b, x):
 
 @internal_kernel
 def minus_scaled(a, b, x):
-    """a − b x of six-vectors."""
+    """Return a − b x for six-vectors a, b and a number x."""
     return (
         a[0] - b[0] * x, a[1] - b[1] * x, a[2] - b[2] * x, a[3] - b[3] * x, a[4] - b[4] * x, a[5] - b[5] * x
     )  # fmt: skip
@@ -297,9 +300,10 @@ def minus_scaled(a, b, x):
 
 @internal_kernel
 def body_in_world(m, c, I):
-    """Spatial inertia about the world origin of mass m at c with I_c = (xx xy xz yy yz zz), as 21 numbers.
+    """Return the spatial inertia about the world origin, as 21 numbers, of a mass m at c with I_c about c.
 
-    Blocks [[A, H], [Hᵀ, M]]: A and M symmetric, six numbers each, H row by row; A = I_c + m (c² 1 − c cᵀ), H = m [c]×.
+    I_c is (xx xy xz yy yz zz). The blocks are [[A, H], [Hᵀ, M]]: A and M are symmetric, with six numbers each; H is
+    stored row by row. A = I_c + m (c² 1 − c cᵀ), H = m [c]×.
     """
     x, y, z = m * c[0], m * c[1], m * c[2]
     return (
@@ -312,7 +316,7 @@ def body_in_world(m, c, I):
 
 @internal_kernel
 def inertia(table, i, c):
-    """Articulated inertia in row i from column c on."""
+    """Return the articulated inertia in row i, starting at column c."""
     return (
         table[i, c], table[i, c + 1], table[i, c + 2], table[i, c + 3], table[i, c + 4], table[i, c + 5],
         table[i, c + 6], table[i, c + 7], table[i, c + 8], table[i, c + 9], table[i, c + 10], table[i, c + 11],
@@ -323,7 +327,7 @@ def inertia(table, i, c):
 
 @internal_kernel
 def plus_inertia(a, b):
-    """a + b of articulated inertias."""
+    """Return a + b for articulated inertias."""
     return (
         a[0] + b[0], a[1] + b[1], a[2] + b[2], a[3] + b[3], a[4] + b[4], a[5] + b[5], a[6] + b[6],
         a[7] + b[7], a[8] + b[8], a[9] + b[9], a[10] + b[10], a[11] + b[11], a[12] + b[12], a[13] + b[13],
@@ -333,7 +337,7 @@ def plus_inertia(a, b):
 
 @internal_kernel
 def times(a, s):
-    """Wrench a s of an articulated inertia on a motion."""
+    """Return the wrench a s of an articulated inertia a and a motion s."""
     return (
         ((a[0] * s[0] + a[1] * s[1]) + (a[2] * s[2] + a[6] * s[3])) + (a[7] * s[4] + a[8] * s[5]),
         ((a[1] * s[0] + a[3] * s[1]) + (a[4] * s[2] + a[9] * s[3])) + (a[10] * s[4] + a[11] * s[5]),
@@ -346,7 +350,7 @@ def times(a, s):
 
 @internal_kernel
 def minus_outer(a, d, u):
-    """Return a − d uᵀ, symmetric: the articulated inertia passed down by a joint, with d = u / D."""
+    """Return the symmetric a − d uᵀ with d = u / D, the articulated inertia that a joint passes down."""
     return (
         a[0] - d[0] * u[0], a[1] - d[0] * u[1], a[2] - d[0] * u[2],
         a[3] - d[1] * u[1], a[4] - d[1] * u[2], a[5] - d[2] * u[2],

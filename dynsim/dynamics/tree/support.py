@@ -1,12 +1,12 @@
 """Ground reactions of a mobile base: wheel and caster loads, centre of pressure, tip margin, traction.
 
 The base stands on the contact points of its left wheel l = (0, T/2), its right wheel r = (0, −T/2) and its caster
-c = (c_x, c_y), in the plane z = 0 of its frame, whose z is the normal of the ground. Three normal forces N balance the
-force along z and the moments about x and y, so they are determined; the constraints against side slip and of rolling
-give the forces along y and x. The base is assumed to stay on the ground: N < 0 is a pull.
+c = (c_x, c_y), in the plane z = 0 of its frame, whose z axis is normal to the ground. Three normal forces N balance the
+force along z and the moments about x and y, so they are determined; the no-side-slip and rolling constraints give the
+forces along y and x. The base is assumed to stay on the ground: N < 0 means that the ground pulls.
 
-It carries its own tree of bodies. Separate objects are supported by their hinges and contacts; connections between
-them and the tree act on the base from outside, as contacts do.
+The base carries its own tree of bodies. Separate objects are supported by their hinges and contacts; connections
+between them and the tree act on the base from outside, as contacts do.
 """
 
 from __future__ import annotations
@@ -42,16 +42,17 @@ BODY, LEFT, RIGHT = 0, 1, 2
 INDEX_SIZE = 3
 # SupportArrays.base
 TRACK, CASTER_X, CASTER_Y, SPIN_INERTIA, FRICTION = 0, 1, 2, 3, 4
-# Perimeter of the support triangle divided by the side opposite to l, r and c: the largest margins there.
+# Perimeter of the support triangle divided by the side opposite to l, r and c, which is the largest margin at each
+# point.
 SHARE = 5
 BASE_SIZE = 8
 # SupportArrays.state: recorded values
 LOADS = 0  # 3: left wheel, right wheel, caster [N]
-PRESSURE = 3  # 2: centre of pressure in W [m], NaN for no load
+PRESSURE = 3  # 2: centre of pressure in W [m], NaN without load
 MARGIN = 5
 TRACTION = 6  # 2: |F| / (μ N) of left and right wheel, NaN for N <= 0
 OUTPUTS = 8
-# and their causes: forces of the wheels along x, total force along y [N]
+# Forces behind the traction: forces of the wheels along x, total force along y [N]
 LONGITUDINAL, LATERAL = 8, 10
 STATE_SIZE = 11
 # SupportArrays.least: loads as in state, then the margin
@@ -60,7 +61,7 @@ LEAST_SIZE = 4
 
 
 class SupportArrays(NamedTuple):
-    """Ground support of a mobile base; tables of size zero for a robot without one."""
+    """Ground support of a mobile base; for a robot without a base, the tables have size zero."""
 
     index: np.ndarray  # (INDEX_SIZE,) int
     carried: np.ndarray  # (n,) int: 1 for the rows of its tree, 0 for separate objects
@@ -116,7 +117,7 @@ def ground_reaction(model: ModelArrays, loads: LoadArrays, t, ws: Workspace, sup
     rate = base[SPIN_INERTIA] * (joints[left, ka.QDD] + joints[right, ka.QDD])
     turning, force = cross(w, axle), (W[3], W[4], W[5])
     at_base = cross(p, force)
-    # About the base, in its frame.
+    # Moments about the origin of the base, in its frame.
     moment = along(along(along((W[0], W[1], W[2]), axle, rate), turning, spin), at_base, -1.0)
     mx, my, mz = rotate_back(R, moment)
     fx, fy, fz = rotate_back(R, force)
@@ -159,7 +160,7 @@ def tip_margin(model: ModelArrays, loads: LoadArrays, t, ws: Workspace, support:
 
 @internal_kernel
 def watch_support(support: SupportArrays):
-    """Update the smallest loads and margin, after :func:`ground_reaction` at the end of an accepted step."""
+    """Update the smallest loads and margin; call after :func:`ground_reaction` at the end of an accepted step."""
     if support.index.shape[0] == 0:
         return
     state, least = support.state, support.least

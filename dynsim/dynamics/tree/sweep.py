@@ -33,16 +33,16 @@ from dynsim.jit.kernel import internal_kernel, kernel
 
 @internal_kernel
 def forward_sweep(model: ModelArrays, ws: Workspace, velocity, acceleration, gravity):
-    """Compute pose, axis, velocity and acceleration of every link, root to tips ([WM] eqs 36–41).
+    """Compute the pose, axis, velocity and acceleration of every link, from root to tips ([WM] eqs 36–41).
 
-    X_WB = X_WP X_PJ X_J(q). A revolute axis a through p is S = (a, p × a), a prismatic one S = (0, a).
+    X_WB = X_WP X_PJ X_J(q). A revolute axis a through p has S = (a, p × a), and a prismatic axis a has S = (0, a).
     V = V_p + S v and A = A_p + V_p × S v + S vdot with A_world = −gravity, so that every inertial wrench includes the
     weight.
 
     Parameters
     ----------
     velocity, acceleration, gravity : float
-        Factors on v, vdot (both from ``ws.joints``) and gravity: (1, 0, 1) gives the bias forces ([WM] eq 54),
+        Factors of v, vdot (both from ``ws.joints``) and gravity: (1, 0, 1) gives the bias forces ([WM] eq 54),
         (0, 1, 0) the product M vdot ([WM] eq 55), (1, 1, 1) the inverse dynamics.
     """
     tree, body, links, joints, trig = model.tree, model.body, ws.links, ws.joints, ws.trig
@@ -51,7 +51,7 @@ def forward_sweep(model: ModelArrays, ws: Workspace, velocity, acceleration, gra
     for i in range(tree.shape[0]):
         j = tree[i, ka.PARENT]
         qi, vi, ai = joints[i, ka.Q], velocity * joints[i, ka.QD], acceleration * joints[i, ka.QDD]
-        # Joint frame at q = 0: B = R_WP R_PJ, origin p.
+        # The joint frame at q = 0 has the rotation B = R_WP R_PJ and the origin p.
         B, p = rotation(body, i, ka.R_PJ), vector(body, i, ka.P_PJ)
         if j >= 0:
             A = rotation(links, j, ka.R)
@@ -100,7 +100,7 @@ def forward_sweep(model: ModelArrays, ws: Workspace, velocity, acceleration, gra
             put_six(links, i, ka.V, J)
             put_six(links, i, ka.A, (S[0] * ai, S[1] * ai, S[2] * ai, S[3] * ai - gx, S[4] * ai - gy, S[5] * ai - gz))
         if k > ka.PRISMATIC:
-            # In a separate function, so that the other values stay in registers.
+            # This is a separate function, so that the other values stay in registers.
             sweep_row(model, ws, i, vi, ai, gx, gy, gz)
 
 
@@ -125,7 +125,7 @@ def body_inertia(model: ModelArrays, ws: Workspace, i):
 
 @internal_kernel
 def inertial_wrench(ws: Workspace, i, m, c, I):
-    """Return the wrench about the world origin for the motion of body i: (I_c α + ω × I_c ω + c × m a_c, m a_c)."""
+    """Return the inertial wrench of body i about the world origin: (I_c α + ω × I_c ω + c × m a_c, m a_c)."""
     w, A = vector(ws.links, i, ka.V), six(ws.links, i, ka.A)
     a = point_acceleration(A, six(ws.links, i, ka.V), c)
     fx, fy, fz = m * a[0], m * a[1], m * a[2]
@@ -150,8 +150,8 @@ def kinematics(model: ModelArrays, ws: Workspace):
 def newton_euler(model: ModelArrays, ws: Workspace, velocity, acceleration, gravity):
     """Write tau = M vdot + h + g to the BIAS column of ``ws.joints`` [N m or N] ([WM] eqs 42–44, 52).
 
-    Forward sweep, then tips to root: F_i += Σ_children F, tau_i = S·F_i. For the factors see
-    :func:`forward_sweep`. Reflected motor inertia and joint losses are not in tau.
+    After a forward sweep, a sweep from the tips to the root computes F_i += Σ_children F and tau_i = S·F_i. For the
+    factors, see :func:`forward_sweep`. Reflected motor inertia and joint losses are not in tau.
     """
     forward_sweep(model, ws, velocity, acceleration, gravity)
     tree, links, joints = model.tree, ws.links, ws.joints

@@ -1,1 +1,1 @@
-"""The servo bus: interface, packets, control tables, clocks, scan, and the bus on a serial port."""
+"""The servo bus: its interface, packets, control tables, clocks, port scan, and implementation on a serial port."""

@@ -1,8 +1,8 @@
-"""Control tables and specifications of MX(2.0), XL430, XM430 and XH540 servos, Protocol 2.0.
+"""Control tables and specifications of MX(2.0), XL430, XM430 and XH540 servos with Protocol 2.0.
 
-Source: ROBOTIS e-Manual, the page of each model, chapters Specifications and Control Table. The limits stored in a
-servo depend on its firmware version: the replay reads them from the servo; the defaults in this module are used by the
-virtual servos only.
+Source: ROBOTIS e-Manual, chapters "Specifications" and "Control Table" on the page of each model. The limits stored in
+a servo depend on its firmware version. Therefore the replay reads them from the servo; only the virtual servos use the
+defaults in this module.
 """
 
 from __future__ import annotations
@@ -13,22 +13,22 @@ from enum import IntEnum
 
 TICKS_PER_TURN = 4096
 RAD_PER_TICK = 2 * math.pi / TICKS_PER_TURN
-RAD_S_PER_UNIT = 0.229 * 2 * math.pi / 60  # 0.229 rpm, present, goal and profile velocity
-RAD_S2_PER_UNIT = 214.577 / 60**2 * 2 * math.pi  # 214.577 rev/min², profile acceleration
+RAD_S_PER_UNIT = 0.229 * 2 * math.pi / 60  # unit 0.229 rpm of present, goal and profile velocity
+RAD_S2_PER_UNIT = 214.577 / 60**2 * 2 * math.pi  # unit 214.577 rev/min² of the profile acceleration
 VOLT_PER_UNIT = 0.1
 WATCHDOG_SECONDS_PER_UNIT = 0.020
 RETURN_DELAY_SECONDS_PER_UNIT = 2e-6
 BROADCAST_ID = 254
 MAX_ID = 252
 EEPROM_END = 64
-"""Registers below this address keep their values without power."""
+"""Registers below this address keep their values when the power is off."""
 
 BAUD_RATES = (9_600, 57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000)
 """Bit rates [bit/s], indexed by the code stored at address 8. The Python client library rejects 4.5 Mbit/s."""
 
 
 class OperatingMode(IntEnum):
-    """Operating modes: values of address 11."""
+    """Operating modes: values of the register at address 11."""
 
     CURRENT = 0
     VELOCITY = 1
@@ -39,27 +39,27 @@ class OperatingMode(IntEnum):
 
 
 HARDWARE_ERRORS = {0: "input voltage", 2: "overheating", 3: "encoder", 4: "electrical shock", 5: "overload"}
-"""Meaning of the bits of address 70."""
+"""Meaning of the bits in the register at address 70."""
 
 
 def describe_hardware_error(register: int) -> str:
-    """Return the names of the bits that are set in the hardware error register (address 70)."""
+    """Return the names of the errors whose bits are set in the hardware error register (address 70)."""
     names = [name for bit, name in HARDWARE_ERRORS.items() if register >> bit & 1]
     return ", ".join(names) or f"no known bit (0x{register:02x})"
 
 
 @dataclass(frozen=True)
 class Field:
-    """One item of a control table.
+    """One register in a control table.
 
     Attributes
     ----------
     address, size : int
-        Byte address and number of bytes.
+        Address of the first byte, and number of bytes.
     default : int
-        Value after power-on (RAM) or as delivered (EEPROM).
+        Value after power-on (RAM) or at delivery (EEPROM).
     low, high : int | None
-        Range of values that may be written; None if only the range of the type applies.
+        Range of values that may be written; None if it is limited only by the number of bytes.
     writable, signed : bool
     """
 
@@ -73,15 +73,15 @@ class Field:
 
     @property
     def in_eeprom(self) -> bool:
-        """True if the value is kept without power and can be written only with torque off."""
+        """True if the value is kept when the power is off, and can be written only while the torque is off."""
         return self.address < EEPROM_END
 
     def decode(self, data: bytes) -> int:
-        """Return the integer in ``data``, signed if the field is (getData of the client library is always unsigned)."""
+        """Decode the bytes ``data`` to an integer; it may be negative, unlike the result of getData of the library."""
         return int.from_bytes(data, "little", signed=self.signed)
 
     def encode(self, value: int) -> bytes:
-        """Return the bytes of ``value``; raises OverflowError for a negative value of an unsigned field."""
+        """Encode ``value`` to bytes; raise OverflowError if it is negative and the field is unsigned."""
         return int(value).to_bytes(self.size, "little", signed=self.signed)
 
 
@@ -94,13 +94,13 @@ class ServoModel:
     number : int
         Model number at address 0.
     no_load_speed : float
-        Speed without load at 12 V [rad/s].
+        Maximum speed without load at 12 V [rad/s].
     stall_torque, stall_current : float
         Torque [N·m] and current [A] of the stalled servo at 12 V.
     ampere_per_unit : float
-        Unit of the registers of present and goal current, if the model has them [A].
+        Unit of the registers for the present current and the goal current, if the model has these registers [A].
     fields : dict[str, Field]
-        Control table; the keys are names of registers.
+        Control table; the keys are the names of the registers.
     """
 
     name: str
@@ -113,11 +113,11 @@ class ServoModel:
 
     @property
     def measures_current(self) -> bool:
-        """True if address 126 is a current, False if it is a load in 0.1 % of the stall torque."""
+        """True if address 126 contains a current, False if it contains a load in units of 0.1 % of the stall torque."""
         return "present_current" in self.fields
 
     def registers_in(self, start: int, data: bytes) -> dict[str, int]:
-        """Decode the registers whose bytes are all in ``data``, which starts at address ``start`` of the table."""
+        """Decode all registers that are completely contained in ``data``; its first byte has the address ``start``."""
         return {
             name: item.decode(data[item.address - start : item.address - start + item.size])
             for name, item in self.fields.items()
@@ -126,11 +126,11 @@ class ServoModel:
 
     @property
     def torque_constant(self) -> float:
-        """Output torque per ampere [N·m/A], from the stall point (unverified for other loads)."""
+        """Output torque per ampere [N·m/A], computed for the stalled servo (unverified for other loads)."""
         return self.stall_torque / self.stall_current
 
     def torque(self, effort: int) -> float:
-        """Return the estimated output torque [N·m] for the signed register at address 126."""
+        """Return the output torque [N·m] that is estimated from ``effort``, the signed register at address 126."""
         if self.measures_current:
             return effort * self.ampere_per_unit * self.torque_constant
         return effort * 1e-3 * self.stall_torque
@@ -201,7 +201,7 @@ _EXTERNAL_PORTS = {f"external_port_mode_{k}": Field(55 + k, 1, 3, 0, 3) for k in
 
 
 def _current(limit: int) -> dict[str, Field]:
-    """Return the registers of a servo with a current sensor; ``limit`` is the default and maximum current limit."""
+    """Return the extra registers for a current sensor; ``limit`` is the default and maximum current limit."""
     return {
         "current_limit": Field(38, 2, limit, 0, limit),
         "goal_current": Field(102, 2, 0, signed=True),
@@ -210,7 +210,7 @@ def _current(limit: int) -> dict[str, Field]:
 
 
 def _delivered(fields: dict[str, Field], **defaults: int) -> dict[str, Field]:
-    """Return the same registers with other factory defaults for some."""
+    """Return the same registers with different factory defaults for some of them."""
     return fields | {name: replace(fields[name], default=value) for name, value in defaults.items()}
 
 
@@ -251,9 +251,10 @@ MX_106, MX_28 = MODELS["MX-106"], MODELS["MX-28"]
 MODEL_BY_NUMBER = {model.number: model for model in MODELS.values()}
 
 INDIRECT_BLOCKS = ((168, 224, 28), (578, 634, 28))
-"""Blocks of indirect addresses: address of the first two-byte pointer, address of the first data byte, pointers."""
+"""Blocks of indirect addresses: address of the first two-byte pointer, address of the first data byte, and number of
+pointers."""
 TABLE_SIZE = 662
 STATE_BLOCK = (126, 10)
 """Address and length of the block read from every servo in each cycle: effort (2), velocity (4) and position (4)."""
 HEALTH_BLOCK = (64, 83)
-"""Address and length of the block read from one servo per cycle in turn: torque enable to temperature."""
+"""Address and length of the block that is read from the servos in turn: registers from torque enable to temperature."""

@@ -1,21 +1,23 @@
-"""Dynamixel servos through the unmodified client library (dynamixel-sdk 4.1.0), on real and virtual ports.
+"""Servo bus that uses the unmodified Dynamixel client library (dynamixel-sdk 4.1.0), on real and virtual ports.
 
-Defects of the library and workarounds in this module (tests/hardware/test_sdk_defects.py reproduces the defects; if one
-of its tests fails, the library has been repaired and the workaround can be removed):
+The library has the following defects, which this module works around. tests/hardware/test_sdk_defects.py reproduces the
+defects; if one of its tests fails, the library has been repaired and the workaround can be removed.
 
-- An interrupted read leaves ``port.is_using`` set, and every later write is dropped: the flag is cleared before each
-  transaction, and signal handlers only set a flag.
-- One lost status packet costs a time-out and the answers of all later servos: the sync read of this module receives the
-  bytes, decodes all packets, and assigns them by ID. The library also drops the packet after a truncated packet.
-- Group reads drop the error byte: the decoder keeps it.
-- Byte stuffing of requests is lost, and some stuffed answers are mangled: this module rejects a request whose body
-  contains FF FF FD, treats an answer of a wrong length as garbled, and never uses Fast Sync Read.
-- Reads of one servo accept any status of that servo as the answer, whatever its length, and reads and writes of one
-  servo wait 34 ms for an answer, whatever the adapter needs: this module receives and checks these answers, too.
-- ``getData`` never returns a negative number: fields are decoded here.
-- A dead port raises termios.error or OSError in addition to SerialException; a stalled port blocks: all become
-  PortError, and this module waits for writes. The write time-out of pyserial includes time in which this process was
-  suspended.
+- After an interrupted read, ``port.is_using`` remains set, and every later write is dropped. Therefore this flag is
+  cleared before each transaction, and signal handlers only set a flag.
+- If one status packet is lost, the library waits for the time-out and loses the answers of all later servos; it also
+  drops the packet after a truncated packet. Therefore the sync read of this module receives the bytes, decodes all
+  packets, and assigns them by ID.
+- Group reads drop the error byte. The decoder of this module keeps it.
+- The byte stuffing of requests is lost, and some stuffed answers are mangled. Therefore this module rejects a request
+  whose body contains FF FF FD, treats an answer with a wrong length as garbled, and never uses Fast Sync Read.
+- When the library reads from one servo, it accepts any status of this servo as the answer, whatever its length. When it
+  reads from or writes to one servo, it waits 34 ms for the answer, even if the adapter needs more time. Therefore this
+  module receives and checks these answers, too.
+- ``getData`` never returns a negative number. Therefore fields are decoded in this module.
+- A dead port raises termios.error or OSError in addition to SerialException, and a stalled port blocks. This module
+  converts these errors to PortError and waits for writes itself, because the write time-out of pyserial includes time
+  in which this process was suspended.
 """
 
 from __future__ import annotations
@@ -38,33 +40,34 @@ from dynsim.hardware.bus.protocol import BlockRead, NoAnswer, RequestRefused, Se
 from dynsim.hardware.errors import PortError
 
 WRITE_TIMEOUT = 0.25
-"""Maximum wait for a port that does not accept bytes [s]."""
+"""Maximum time to wait for a port that does not accept bytes [s]."""
 READ_WAIT = 5e-4
-"""Maximum wait for a byte before time-outs are checked [s]."""
+"""Maximum time to wait for a byte before time-outs are checked [s]."""
 NOTHING_TO_READ = "returned no data"
-"""Part of the message of pyserial if a port was ready but a read returned nothing."""
+"""Part of pyserial's error message if a port was ready but a read returned nothing."""
 LATE_READS = 16
-"""Number of reads after which a missed answer is no longer expected."""
+"""Number of reads after which the late answer to an earlier read is no longer expected."""
 RETRIES = 2
-"""Further attempts of a single read or write; the timed loop does not use these requests."""
+"""Number of retries after a failed read or write of a single servo; the timed loop does not use such requests."""
 SINGLE_LATENCY = 0.034
-"""Minimum latency allowed for a single read or write, as in the library [s]."""
+"""Minimum time allowed for the answer of a single servo, as in the library [s]."""
 STATUS_BYTES = 11
-"""Number of bytes of an answer without its parameters."""
+"""Number of bytes of an answer, not including its parameters."""
 TORQUE_ENABLE = 64
 
 
 Answers = tuple[dict[int, Packet], dict[int, Packet], int]
-"""Packets as requested and others, by ID, and number of bytes outside packets; see :meth:`DynamixelBus._receive`."""
+"""Packets with the requested length by ID, other packets by ID, and number of bytes outside packets; see
+:meth:`DynamixelBus._receive`."""
 
 
 class SerialPort(PortHandler):
-    """Port of the client library, with a write time-out and (by default) exclusive to this process.
+    """Port for the client library that has a write time-out and, by default, cannot be opened by other processes.
 
     Attributes
     ----------
     longest_pause : float
-        Longest delay by the operating system in a wait for a byte [s].
+        Longest time for which the operating system delayed this process while it waited for a byte [s].
     """
 
     def __init__(self, name: str, *, exclusive: bool = True) -> None:
@@ -89,20 +92,21 @@ class SerialPort(PortHandler):
         return True
 
     def readPort(self, length: int) -> bytes:
-        # A short wait instead of the busy loop of the library leaves the processor to other processes.
+        # Wait instead of polling in a busy loop as the library does, to leave the processor to other processes.
         began = time.monotonic()
         select.select([self.ser.fileno()], [], [], READ_WAIT)
         self.longest_pause = max(self.longest_pause, time.monotonic() - began - READ_WAIT)
         try:
             return self.ser.read(length)
         except serial.SerialException as error:
-            # On a shared port another process may have read the bytes; on an exclusive port the adapter is gone.
+            # On a shared port, another process may have read the bytes; on an exclusive port, the adapter is gone.
             if self.exclusive or NOTHING_TO_READ not in str(error):
                 raise
             return b""
 
     def writePort(self, packet: Iterable[int]) -> int:
-        # The time-out of pyserial includes time in which this process was suspended: a finished write could time out.
+        # Do not use pyserial's time-out: it includes time in which this process was suspended, so that a write could
+        # time out although it was finished.
         left = data = bytes(packet)
         while left:
             try:
@@ -128,8 +132,8 @@ def open_serial_port(name: str, baud: int, *, exclusive: bool = True) -> SerialP
     Raises
     ------
     PortError
-        If the port does not exist, needs permission, or is in use by another process, the library does not support the
-        bit rate, or the system is not POSIX.
+        If the port does not exist, requires a permission that is missing, or is in use by another process, if the
+        library does not support the bit rate, or if the system is not POSIX.
     """
     require_posix(name)
     port = SerialPort(name, exclusive=exclusive)
@@ -146,7 +150,7 @@ def _why_not_opened(error: Exception) -> str:
     text = str(error).lower()
     number = getattr(error, "errno", None)
     if "exclusively lock" in text or number == errno.EAGAIN:
-        return "in use by another process (a replay? `dynsim hw stop` works even then)"
+        return "in use by another process, perhaps a replay (`dynsim hw stop` works even then)"
     if number == errno.ENOENT or "no such file" in text:
         return "no such port; is the adapter plugged in?"
     if number == errno.EACCES or "permission denied" in text:
@@ -155,7 +159,7 @@ def _why_not_opened(error: Exception) -> str:
 
 
 def latency_timer(port_name: str) -> int | None:
-    """Return the latency timer of a USB serial adapter [ms]; None if it is unknown (Linux FTDI driver only)."""
+    """Return the latency timer of a USB serial adapter [ms]; None if unknown (only the Linux FTDI driver shows it)."""
     entry = Path("/sys/bus/usb-serial/devices") / Path(port_name).resolve().name / "latency_timer"
     try:
         return int(entry.read_text())
@@ -164,19 +168,20 @@ def latency_timer(port_name: str) -> int | None:
 
 
 class RequestLengths:
-    """Choose the number of bytes of each read so that a late answer to an earlier read can be recognised.
+    """Chooser of the number of bytes for each read, so that a late answer to an earlier read can be recognised.
 
-    A status packet has the ID of its servo but not of its request, so the answer of a servo that is two periods late
-    would look current. If a servo misses a request, the next ``LATE_READS - 1`` requests avoid the length of that
-    request and ask for more bytes than needed. If all servos answer, no request is longer.
+    A status packet contains the ID of the servo but not of the request, so the answer of a servo that is two periods
+    late would look like the answer to the current request. If a servo does not answer a request, the next
+    ``LATE_READS - 1`` requests use a different length, that is, they read more bytes than needed. As long as all servos
+    answer, no extra bytes are read.
     """
 
     def __init__(self) -> None:
         self._number = 0
-        self._missed: dict[int, int] = {}  # number of the request by its length
+        self._missed: dict[int, int] = {}  # length of each request that was missed → number of the request
 
     def choose(self, length: int) -> int:
-        """Return the number of bytes to request now if ``length`` bytes are needed."""
+        """Return the number of bytes to read with the next request if ``length`` bytes are needed."""
         self._number += 1
         if not self._missed:
             return length
@@ -184,19 +189,19 @@ class RequestLengths:
         return next(asked for asked in range(length, length + LATE_READS) if asked not in self._missed)
 
     def miss(self, asked: int) -> None:
-        """Report that a servo did not answer the last request, which was for ``asked`` bytes."""
+        """Record that a servo did not answer the last request, which asked for ``asked`` bytes."""
         self._missed[asked] = self._number
 
 
 class DynamixelBus:
-    """Servos on one port.
+    """Bus with the servos on one port.
 
     Parameters
     ----------
     port : dynamixel_sdk.PortHandler
         Open port: a :class:`SerialPort` or a virtual port.
     latency : float
-        Maximum delay of an answer by adapter and operating system [s].
+        Maximum delay of an answer that is caused by the adapter and the operating system [s].
     return_delay : float
         Maximum return delay time of a servo [s].
     """
@@ -206,7 +211,7 @@ class DynamixelBus:
         self.latency = latency
         self.return_delay = return_delay
         self._library = Protocol2PacketHandler()
-        # For sync reads by address, for single reads by ID.
+        # The keys are ("address", address of the registers) for sync reads and ("id", ID) for reads from one servo.
         self._lengths: dict[tuple[str, int], RequestLengths] = {}
 
     @property
@@ -286,20 +291,20 @@ class DynamixelBus:
             raise PortError(f"{self.name}: {self._library.getTxRxResult(result)}")
 
     def _wait_at_most(self, servos: int, length: int, latency: float) -> None:
-        """Set the time-out for the answers of ``servos`` servos with ``length`` bytes of parameters each."""
+        """Set the time-out for answers from ``servos`` servos, each with ``length`` bytes of parameters."""
         milliseconds = self.port.tx_time_per_byte * (servos * (STATUS_BYTES + length) + 14 + servos)
         milliseconds += 1e3 * (servos * (self.return_delay + 50e-6) + latency)
         self.port.setPacketTimeoutMillis(milliseconds)
 
     def _receive(self, ids: Sequence[int], asked: int) -> Answers:
-        """Receive until all servos have answered or the time-out.
+        """Receive answers until all servos have answered or the time-out has passed.
 
         Returns
         -------
         answers : dict
             Status packets with ``asked`` bytes of parameters, by ID.
         others : dict
-            Last status packet with another number of bytes, by ID.
+            Last status packet with a different number of bytes, by ID.
         garbage : int
             Number of bytes outside packets.
         """
@@ -338,7 +343,7 @@ class DynamixelBus:
         try:
             yield
         except (serial.SerialException, OSError, TerminalError, TypeError) as error:
-            # pyserial raises TypeError if its descriptor was closed meanwhile.
+            # pyserial raises TypeError if its descriptor was closed in the meantime.
             raise PortError(f"{self.name}: the port died ({error})") from error
         finally:
             self.port.is_using = False
@@ -352,5 +357,5 @@ class DynamixelBus:
     def _reject_header(body: bytes) -> None:
         if HEADER in body:
             raise ValueError(
-                f"a request must not contain FF FF FD (not stuffed by the client library), got {body.hex(' ')}"
+                f"a request must not contain FF FF FD, which the client library does not stuff, got {body.hex(' ')}"
             )

@@ -1,7 +1,8 @@
-"""Dynamixel Protocol 2.0 packets: checksum, byte stuffing, encoder, and a decoder that resynchronises after noise.
+"""Packets of Dynamixel Protocol 2.0: checksum, byte stuffing, encoder, and a decoder that resynchronises after noise.
 
-A packet is FF FF FD 00 | ID | length (2) | instruction | parameters | CRC-16 (2). The length counts instruction,
-parameters and checksum. If FF FF FD occurs between length and checksum, the sender inserts another FD after it.
+A packet is FF FF FD 00 | ID | length (2) | instruction | parameters | CRC-16 (2). The length is the number of bytes of
+instruction, parameters and checksum. If FF FF FD occurs between the length and the checksum, the sender inserts another
+FD after it.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from dynsim.hardware.bus.control_table import BROADCAST_ID
 HEADER = b"\xff\xff\xfd"
 STATUS = 0x55
 MAX_LENGTH = 1024
-"""Largest length field that is accepted; a larger value is noise."""
+"""Maximum value of the length field that is accepted; a larger value is treated as noise."""
 
 
 class Instruction(IntEnum):
@@ -58,7 +59,7 @@ ALERT = 0x80
 
 
 def _crc_table() -> array[int]:
-    """Return the checksums of all pairs of bytes."""
+    """Return the checksum of each possible pair of bytes."""
     value = np.arange(0x10000, dtype=np.uint16)
     for _ in range(16):
         top = value >> 15
@@ -71,7 +72,7 @@ _CRC_TABLE = _crc_table()
 
 
 def crc16(data: bytes | bytearray) -> int:
-    """Return the CRC-16 with polynomial 0x8005, initial value 0, no reflection."""
+    """Return the CRC-16 with polynomial 0x8005 and initial value 0, without reflection."""
     crc = 0
     # A leading zero does not change the checksum and makes the number of bytes even.
     even = b"\0" + data if len(data) % 2 else data
@@ -81,14 +82,15 @@ def crc16(data: bytes | bytearray) -> int:
 
 
 def stuff(body: bytes) -> bytes:
-    """Insert FD after every FF FF FD of an instruction-and-parameters body."""
+    """Insert FD after every FF FF FD in the body of a packet, which consists of instruction and parameters."""
     return body.replace(HEADER, HEADER + b"\xfd")
 
 
 def contains_bare_header(stuffed: bytes) -> bool:
     """Return True if FF FF FD occurs without a following FD, which no sender produces.
 
-    This detects a cut packet merged with the next packet, which the checksum alone would miss once in 65536 times.
+    This detects a truncated packet that is merged with the next packet; the checksum alone would miss 1 in 65536 of
+    these cases.
     """
     return HEADER in stuffed and HEADER in stuffed.replace(HEADER + b"\xfd", b"\0")
 
@@ -119,7 +121,7 @@ class Packet(NamedTuple):
 
 
 def encode(packet: Packet) -> bytes:
-    """Return the bytes of a packet on the wire."""
+    """Return a packet as the bytes to be sent on the line."""
     first = bytes([packet.instruction, packet.error]) if packet.instruction == STATUS else bytes([packet.instruction])
     body = stuff(first + packet.parameters)
     frame = HEADER + b"\0" + bytes([packet.id]) + (len(body) + 2).to_bytes(2, "little") + body
@@ -127,10 +129,10 @@ def encode(packet: Packet) -> bytes:
 
 
 def encode_fast(replies: Sequence[Packet], sizes: Sequence[int]) -> list[bytes]:
-    """Return the bytes that each servo sends in answer to a fast read; together they are one broadcast status packet.
+    """Return the bytes that each servo sends in answer to a fast read; together they form one broadcast status packet.
 
-    Each part is error, ID, data and the checksum of all bytes so far; the first part starts with header and length.
-    The length counts the requested bytes of all servos (``sizes``). There is no byte stuffing.
+    Each part consists of error, ID, data and the checksum of all bytes so far; the first part starts with the header
+    and the length. The length includes the requested bytes of all servos (``sizes``). There is no byte stuffing.
     """
     bodies = [bytes([reply.error, reply.id]) + reply.parameters for reply in replies]
     length = 1 + sum(size + 4 for size in sizes)
@@ -145,10 +147,10 @@ def encode_fast(replies: Sequence[Packet], sizes: Sequence[int]) -> list[bytes]:
 
 
 class Decoder:
-    """Extract packets from a stream of bytes that may contain noise, cut packets and wrong checksums.
+    """Decoder that extracts packets from a stream of bytes with possible noise, truncated packets and wrong checksums.
 
-    After a wrong checksum the search continues one byte later, so that a good packet inside a candidate of wrong length
-    is still detected. Call :meth:`flush` after the last bytes.
+    After a wrong checksum the search continues one byte later, so that a valid packet is detected even inside an
+    apparent packet with a wrong length. Call :meth:`flush` after the last bytes.
 
     Attributes
     ----------
@@ -166,7 +168,7 @@ class Decoder:
         return self._packets(final=False)
 
     def flush(self) -> Iterator[Packet]:
-        """Yield the packets after an incomplete candidate, then discard all bytes."""
+        """Give up waiting for the rest of an incomplete packet: yield the packets after it, and discard all bytes."""
         return self._packets(final=True)
 
     def _packets(self, *, final: bool) -> Iterator[Packet]:
@@ -186,7 +188,7 @@ class Decoder:
             if not possible or len(frame) < end or contains_bare_header(frame[7:-2]) or not _checksum_matches(frame):
                 self._skip(1)
                 continue
-            # Unstuff the body only: FF FF FD may also occur across length field and instruction.
+            # Unstuff the body only, because FF FF FD may also span the length field and the instruction.
             body = unstuff(frame[7:-2])
             del buffer[:end]
             if body[0] == STATUS:
@@ -207,7 +209,7 @@ def _checksum_matches(frame: bytes) -> bool:
 
 
 def _header_prefix(buffer: bytearray) -> int:
-    """Return the length of the longest end of ``buffer`` that could be the start of a header."""
+    """Return the number of bytes at the end of ``buffer`` that could be the start of a header."""
     for length in (2, 1):
         if buffer.endswith(HEADER[:length]):
             return length

@@ -1,4 +1,4 @@
-"""Interface of a servo bus and its answers, clocks of a replay, and the POSIX modules for serial ports."""
+"""Interface of a servo bus and of its answers, clocks for a replay, and the POSIX modules for serial ports."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ class BlockRead:
     replies : dict[int, ServoReply]
         Answers by servo ID; a servo that did not answer in time is absent.
     stray_bytes : int
-        Number of bytes received before the request, plus garbage between the answers.
+        Number of bytes that were received before the request or do not belong to a valid answer.
     outdated : frozenset of int
-        IDs of servos that answered an earlier request while this one was pending.
+        IDs of servos whose answer to an earlier request arrived while this request was pending.
     """
 
     replies: dict[int, ServoReply]
@@ -51,7 +51,7 @@ class NoAnswer(Exception):
     ----------
     id : int
     garbled : bool
-        True if bytes arrived but no valid packet; two servos with the same ID cause this.
+        True if bytes arrived but did not form a valid packet, for example because two servos have the same ID.
     """
 
     def __init__(self, id_: int, *, garbled: bool) -> None:
@@ -61,11 +61,11 @@ class NoAnswer(Exception):
 
 
 BUSY = 0.02
-"""Delay of this process by the operating system above which the computer counts as too busy [s]."""
+"""The computer counts as too busy if the operating system delays this process by more than this time [s]."""
 
 
 def too_busy(bus: Bus) -> str:
-    """Return a message if a busy computer may be the cause of a missing answer, otherwise an empty string."""
+    """Return a message if an answer may be missing because the computer is too busy, otherwise an empty string."""
     if bus.longest_pause < BUSY:
         return ""
     return (
@@ -75,7 +75,7 @@ def too_busy(bus: Bus) -> str:
 
 
 class RequestRefused(Exception):
-    """A servo answered with an error code (:class:`dynsim.hardware.bus.packet.StatusError`)."""
+    """A servo answered a request with an error code (:class:`dynsim.hardware.bus.packet.StatusError`)."""
 
     def __init__(self, id_: int, code: int, text: str) -> None:
         super().__init__(f"ID {id_}: {text}")
@@ -84,19 +84,19 @@ class RequestRefused(Exception):
 
 
 class Bus(Protocol):
-    """Interface of a bus with servos. Every method may raise PortError if the port fails.
+    """Interface of a servo bus. Every method may raise PortError if the port fails.
 
     Attributes
     ----------
     longest_pause : float
-        Longest delay of this process by the operating system while it waited for answers [s].
+        Longest time for which the operating system delayed this process while it waited for answers [s].
     """
 
     @property
     def longest_pause(self) -> float: ...
 
     def ping_all(self) -> dict[int, tuple[int, int]]:
-        """Return model number and firmware version of all servos that answer a broadcast ping, by ID."""
+        """Return the model number and firmware version of each servo that answers a broadcast ping, by ID."""
 
     def read(self, id_: int, field: Field) -> int:
         """Read one register. Raises NoAnswer or RequestRefused."""
@@ -108,13 +108,13 @@ class Bus(Protocol):
         """Write one register and wait for the acknowledgement. Raises NoAnswer or RequestRefused."""
 
     def sync_write(self, field: Field, values: dict[int, int]) -> None:
-        """Write one register of many servos at once; the servos do not acknowledge it."""
+        """Write one register of many servos at once; the servos do not acknowledge the write."""
 
     def sync_read(self, ids: Sequence[int], address: int, length: int) -> BlockRead:
-        """Read the same bytes of many servos; a servo that does not answer this request in time is absent."""
+        """Read the same bytes from many servos; the result omits servos that do not answer this request in time."""
 
     def torque_off_all(self) -> None:
-        """Broadcast torque off three times, whatever the state of the port."""
+        """Broadcast the command "torque off" three times, whatever the state of the port."""
 
     def close(self) -> None: ...
 
@@ -123,7 +123,7 @@ class Bus(Protocol):
 
 
 class Clock:
-    """Monotonic clock of the computer, relative to ``origin`` [s]."""
+    """Monotonic clock of the computer; it reads zero at the monotonic time ``origin`` [s]."""
 
     def __init__(self, origin: float = 0.0) -> None:
         self._origin = origin
@@ -133,14 +133,14 @@ class Clock:
         return time.monotonic() - self._origin
 
     def sleep_until(self, deadline: float) -> None:
-        """Return at ``deadline`` [s], or immediately if it has passed."""
+        """Wait until the time ``deadline`` [s]; return immediately if it has passed."""
         remaining = deadline - self.now()
         if remaining > 0:
             time.sleep(remaining)
 
 
 class VirtualClock(Clock):
-    """Clock that advances only in `sleep_until`, so a replay is deterministic and runs as fast as possible."""
+    """Clock that advances only in ``sleep_until``, so that a replay is deterministic and runs as fast as possible."""
 
     _time = 0.0
 
@@ -171,7 +171,7 @@ def require_posix(user: str) -> None:
     Parameters
     ----------
     user : str
-        Operation that needs POSIX, for the message.
+        Operation that requires POSIX, to be named in the message.
 
     Raises
     ------
@@ -179,4 +179,4 @@ def require_posix(user: str) -> None:
         If this is not a POSIX system.
     """
     if termios is None:
-        raise PortError(f"{user}: needs a POSIX system, such as Linux or macOS")
+        raise PortError(f"{user}: this requires a POSIX system, such as Linux or macOS")

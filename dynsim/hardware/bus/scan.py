@@ -1,4 +1,4 @@
-"""Scan a port for servos at all bit rates, and switch the torque of all servos off."""
+"""Scan a port for servos at all bit rates, and switch off the torque of all servos."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from dynsim.hardware.errors import PortError
 
 SCAN_BAUD_RATES = (57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000)
 STOP_BAUD_RATES = (3_000_000, 1_000_000, 57_600, 115_200, 2_000_000, 4_000_000)
-"""Bit rates at which torque off is sent; the most common rates come first."""
+"""Bit rates at which the command "torque off" is sent; the most common rates come first."""
 
 
 SCANNED_REGISTERS = (
@@ -34,7 +34,7 @@ class ScannedServo:
     ----------
     id, model, firmware, baud : int
     registers : dict
-        Values of ``SCANNED_REGISTERS``; -1 if the servo did not return the register.
+        Values of the ``SCANNED_REGISTERS`` by name; -1 if the servo did not return the register.
     """
 
     id: int
@@ -49,7 +49,7 @@ class ScannedServo:
 
 
 def scan(port: str, bauds: tuple[int, ...] = SCAN_BAUD_RATES) -> list[ScannedServo]:
-    """Return all servos that answer a broadcast ping at one of the bit rates [bit/s]. Does not write to servos.
+    """Return all servos that answer a broadcast ping at one of the bit rates [bit/s], without writing to servos.
 
     Raises
     ------
@@ -74,14 +74,14 @@ def _register(bus: DynamixelBus, id_: int, name: str) -> int:
 
 @dataclass(frozen=True)
 class StopResult:
-    """Torque of the servos after a broadcast torque off.
+    """Torque state of the servos after a broadcast "torque off".
 
     Attributes
     ----------
     torque : dict
-        True for each ID whose torque is still on or that does not answer.
+        For each ID, True if the torque is still on or the servo does not answer.
     trouble : tuple of str
-        Errors of the port; if there are any, some servos may not have received the command or not have been read.
+        Errors of the port; if there are any, some servos may not have received the command, or may not have been read.
     """
 
     torque: dict[int, bool]
@@ -89,9 +89,10 @@ class StopResult:
 
 
 def stop_all(port: str, bauds: tuple[int, ...] = STOP_BAUD_RATES, ids: tuple[int, ...] = ()) -> StopResult:
-    """Broadcast torque off at every bit rate, then read the torque of the servos.
+    """Broadcast "torque off" at every bit rate, then read whether the torque of each servo is off.
 
-    Works during a running replay, because the port is not locked. Once torque off was sent, no error is raised.
+    This works even during a replay, because the port is opened without a lock. Once the command has been sent at one of
+    the bit rates, no error is raised.
 
     Parameters
     ----------
@@ -100,12 +101,12 @@ def stop_all(port: str, bauds: tuple[int, ...] = STOP_BAUD_RATES, ids: tuple[int
     bauds : tuple of int
         Bit rates [bit/s].
     ids : tuple of int
-        IDs to read; if empty, all servos that answer a ping.
+        IDs of the servos to read; if empty, all servos that answer a ping are read.
 
     Raises
     ------
     PortError
-        If the port cannot be opened or fails before torque off was sent.
+        If the command could not be sent at any bit rate.
     """
     trouble: list[PortError] = []
     for baud in bauds:

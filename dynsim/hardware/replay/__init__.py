@@ -1,1 +1,1 @@
-"""Replay of a record on servos, and live drive: check, verification, motion, end, measured record, comparison."""
+"""Replay of records on servos, and live drives: check, verification, motion, end state, measured record, comparison."""

@@ -60,13 +60,13 @@ from dynsim.snake.lifting import (
 
 BITS_PER_BYTE = 10
 TURNAROUND = 50e-6
-"""Planned time per status in addition to its bytes and return delay [s] (unverified; from servos and adapter)."""
+"""Planned time per status packet that servos and adapter add to its bytes and the return delay [s] (unverified)."""
 USB_TRANSACTION = 1e-3
-"""Planned wait for an answer through a USB adapter with a latency timer of 1 ms [s]."""
+"""Planned delay of an answer in a USB adapter with a latency timer of 1 ms [s]."""
 WATCHDOG_CYCLES = 3
-"""Minimum time of the servo watchdogs, in cycles."""
+"""Minimum time-out of the servo watchdogs [cycles]."""
 BUS_SHARE = 0.97
-"""Maximum fraction of the period in which the bus may be busy."""
+"""Maximum fraction of the period for which the bus may be busy."""
 
 Quantity = Literal["position", "velocity", "acceleration", "jerk", "shaking", "torque"]
 UNITS: dict[Quantity, str] = {
@@ -78,31 +78,31 @@ UNITS: dict[Quantity, str] = {
     "torque": "N m",
 }
 SLOWED: dict[Quantity, int] = {"velocity": 1, "acceleration": 2, "jerk": 2, "shaking": 1}
-"""Exponent n: at path speed s the quantity is proportional to s^n or decreases faster (the time windows of jerk and
-shaking cover less of a slower path)."""
+"""Exponent n of each quantity: at path speed s, the quantity is proportional to s^n, or it decreases even faster if the
+path is slowed down (the time windows for jerk and shaking contain a shorter part of a slower path)."""
 
 SLOWEST, FASTEST = 0.01, 10.0
-"""Range of speeds of the path, in path seconds per second."""
+"""Range of path speeds, in seconds of the path per second."""
 LONGEST = 24 * 3600.0
 """Maximum duration of a motion [s]; a longer duration is rejected as a mistake."""
 STILL = 1e-6
-"""A joint of a record that turns less than this [rad] counts as stationary."""
+"""A joint that turns by less than this angle [rad] in a record counts as stationary."""
 ROUNDING = 1e-9
-"""Tolerance for rounding errors of a joint that rests at its limit; a tick is 1.5e-3 rad."""
+"""Tolerance for the rounding errors of a joint that rests at its limit; for comparison, a tick is 1.5e-3 rad."""
 
 
 @dataclass(frozen=True)
 class Margin:
-    """Smallest margin of one joint to one limit.
+    """Smallest margin between a quantity of one joint and its limit.
 
     Attributes
     ----------
     joint : str
     quantity : "position", "velocity", "acceleration", "jerk", "shaking" or "torque"
     value, limit, margin : float
-        Values in SI units; a negative margin is a violation.
+        Value, limit and margin in SI units; a negative margin means that the limit is violated.
     time : float
-        Time of the value [s of record time].
+        Time at which the value occurs [s of record time].
     """
 
     joint: str
@@ -118,7 +118,7 @@ class Margin:
 
     @property
     def holds(self) -> bool:
-        # False for NaN, the result of an overflow.
+        # This is False for NaN, which results from an overflow.
         return self.margin >= -ROUNDING
 
     def __str__(self) -> str:
@@ -131,7 +131,7 @@ class Margin:
 
 @dataclass(frozen=True, kw_only=True)
 class CheckedMotion:
-    """Motion that passed the offline check; input of the replay.
+    """Motion that has passed the offline check and can be replayed.
 
     Attributes
     ----------
@@ -157,7 +157,7 @@ class CheckedMotion:
     warnings: tuple[str, ...] = ()
 
     def tightest(self, servo_map: ServoMap) -> tuple[Margin, float] | None:
-        """Return the smallest relative margin and its value; position margins are relative to half of the range."""
+        """Return the margin that is smallest relative to its limit (or half the position range), and the ratio."""
         ranges = {servo.joint: servo.position_limits[1] - servo.position_limits[0] for servo in servo_map.servos}
 
         def part(margin: Margin) -> float:
@@ -192,7 +192,7 @@ class CheckedMotion:
 def check_motion(
     record: Record, servo_map: ServoMap, *, rate: float | None = None, speed: float = 1.0
 ) -> CheckedMotion:
-    """Check a whole record against the limits of the map, the data sheets of the servos, and the bus.
+    """Check a whole record against the limits in the map, the data sheets of the servos, and the bus.
 
     Parameters
     ----------
@@ -206,7 +206,7 @@ def check_motion(
     Raises
     ------
     CheckRefused
-        If a limit is violated; the message lists all violations with joint, value, time and margin.
+        If a limit is violated; the message lists the joint, value, time and margin of each violation.
     """
     if not SLOWEST <= speed <= FASTEST:
         raise CheckRefused(f"--speed must be from {SLOWEST:g} to {FASTEST:g}, got {speed:g}")
@@ -222,14 +222,14 @@ def check_motion(
                 (entry.limit / abs(entry.value)) ** (1 / SLOWED[entry.quantity]) for entry in violations
             )
             if slower >= SLOWEST:
-                lines.append(f"  --speed {math.floor(100 * slower) / 100:g} would pass")
+                lines.append(f"  with --speed {math.floor(100 * slower) / 100:g}, the check would pass")
         raise CheckRefused("\n".join(lines))
-    warnings = [] if record.complete else ["the record is marked incomplete: it ends before its scenario"]
+    warnings = [] if record.complete else ["the record is marked incomplete: it ends before its scenario does"]
     if limp := uncovered_joints(record, servo_map):
-        warnings.append(f"joints of the record without a servo, limp on the robot: {'; '.join(limp)}")
+        warnings.append(f"joints in the record that have no servo and are limp on the robot: {'; '.join(limp)}")
     if missing := long_steps(record, LONG_FACTOR, LONG_QUANTILE):
         warnings.append(
-            f"{len(missing)} of {len(record) - 1} time steps are long, samples may be missing: {missing[0]}"
+            f"{len(missing)} of {len(record) - 1} time steps are too long, samples may be missing: {missing[0]}"
         )
     return CheckedMotion(
         path=path,
@@ -243,9 +243,10 @@ def check_motion(
 
 
 def uncovered_joints(record: Record, servo_map: ServoMap) -> list[str]:
-    """Return the joints of the record that no servo of the map follows, each with its range of motion.
+    """Return the joints in the record that no servo in the map follows, each with its range of motion.
 
-    Only columns with both position and rate count as joints, so the pose of a mobile base in the plane is ignored.
+    Only columns for which the record contains both position and rate count as joints. Therefore the planar pose of a
+    mobile base is ignored.
     """
     follows = dict.fromkeys((servo.kind.follows.position, servo.kind.follows.velocity) for servo in servo_map.servos)
     served = {(servo.kind.follows.position, servo.label) for servo in servo_map.servos}
@@ -265,7 +266,7 @@ def uncovered_joints(record: Record, servo_map: ServoMap) -> list[str]:
 def _check_duration(record: Record, speed: float) -> None:
     with np.errstate(over="ignore", invalid="ignore"):
         duration = np.ptp(record.time) / speed if len(record) else 0.0
-    # Times that are not finite are rejected later, with the number of the sample.
+    # Times that are not finite are rejected later, with a message that states the sample.
     if LONGEST < duration < math.inf:
         raise CheckRefused(
             f"the motion would take {duration:.3g} s at --speed {speed:g} (limit {LONGEST / 3600:g} h); "
@@ -285,7 +286,8 @@ def plan_cycle(servo_map: ServoMap, rate: float) -> CyclePlan:
         raise CheckRefused(f"--rate must be positive, got {rate}")
     if rate * servo_map.safety.watchdog < WATCHDOG_CYCLES:
         raise CheckRefused(
-            f"--rate {rate:g} is too low: safety.watchdog = {servo_map.safety.watchdog:g} s would trip within "
+            f"--rate {rate:g} is too low: with safety.watchdog = {servo_map.safety.watchdog:g} s, "
+            "the watchdogs would trip within "
             f"{WATCHDOG_CYCLES} cycles; use {math.ceil(WATCHDOG_CYCLES / servo_map.safety.watchdog)} or more"
         )
     count = len(servo_map.servos)
@@ -307,7 +309,7 @@ def plan_cycle(servo_map: ServoMap, rate: float) -> CyclePlan:
 
 
 class MotionLimits:
-    """Motion limits of the joints of a map, checked for whole paths or single intervals."""
+    """Motion limits of the joints in a map, against which whole paths or single intervals are checked."""
 
     def __init__(self, servo_map: ServoMap) -> None:
         self._servos = servo_map.servos
@@ -324,7 +326,7 @@ class MotionLimits:
     def margins(
         self, path: Path, speed: float = 1.0, since: float = -math.inf, *, broken: bool = False
     ) -> Iterator[Margin]:
-        """Yield the smallest margin of each joint to each motion limit.
+        """Yield the smallest margin between each joint and each of its motion limits.
 
         Parameters
         ----------
@@ -332,12 +334,12 @@ class MotionLimits:
         speed : float
             Playback speed.
         since : float
-            Only intervals and windows that end after this path time [s] are checked.
+            Check only intervals and windows that end after this path time [s].
         broken : bool
             If True, yield only violated limits.
         """
         extremes = path.extremes(since)
-        # The windows are in robot time: `speed` seconds of the path pass in one second.
+        # The windows are specified in robot time, in which `speed` seconds of the path pass in one second.
         jerk, jerk_time = path.jerk(JERK_WINDOW * speed, since)
         shaking, shaking_time = path.shaking(SHAKING_WINDOW * speed, since)
         with np.errstate(over="ignore"):
@@ -372,14 +374,14 @@ class MotionLimits:
 
 
 def _extreme(key: Callable[[Array], Array], values: Array, times: Array) -> tuple[Array, Array]:
-    """Return the value of each joint with the largest ``key``, and the time of that value; shape (N,)."""
+    """Return the value with the largest ``key`` for each joint, and the time of this value; shape (N,)."""
     values, times = (part.reshape(-1, values.shape[-1]) for part in (values, times))
     largest = key(values).argmax(axis=0), np.arange(values.shape[1])
     return values[largest], times[largest]
 
 
 def position_bounds(servo: MappedServo) -> tuple[float, float]:
-    """Return the position limits of the map, restricted to the single turn of position mode [rad]."""
+    """Return the position limits in the map [rad], restricted to the single turn that position mode allows."""
     turn = sorted((servo.to_angle(0), servo.to_angle(TICKS_PER_TURN - 1)))
     return max(servo.position_limits[0], turn[0]), min(servo.position_limits[1], turn[1])
 

@@ -1,4 +1,4 @@
-"""Compare a measured run with the simulated run: delay, errors with and without delay, gate and figure."""
+"""Comparison of a measured run with the simulated run: delay, errors with and without delay, gate and figure."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from dynsim.snake.lifting import Lifts, lifted
 
 Array = NDArray[np.float64]
 MAX_DELAY = 0.5
-"""Maximum delay that is considered [s]."""
+"""Maximum delay that is searched for [s]."""
 MOVING = 3 * RAD_PER_TICK
-"""Minimum motion of a joint for an estimate of its delay [rad]: three steps of the servo encoder."""
+"""Minimum motion of a joint from which its delay is estimated [rad]: three steps of the servo encoder."""
 WHEEL_ANGLE, WHEEL_RATE = "rho", "rho_dot"
-"""Signals of wheels. Wheels turn without limit, so rates and angles turned since the start are compared."""
+"""Signals of wheels. A wheel can turn without limit, so its rate and the angle turned since the start are compared."""
 
 
 class Gate(StrictConfig):
-    """Error bounds of a comparison.
+    """Error bounds for a comparison.
 
     Attributes
     ----------
@@ -42,8 +42,8 @@ class Gate(StrictConfig):
     delay_s : float or None
         Common delay [s].
     wheel_rate_rms_rad_s, wheel_angle_max_rad : float or None
-        Errors of the rate [rad/s] and of the angle turned since the start [rad] of the worst wheel; a comparison
-        without wheels fails.
+        Error in the rate [rad/s] and in the angle turned since the start [rad] of the worst wheel; if one of these
+        bounds is set, a comparison without wheels fails.
     """
 
     rms_rad: Positive | None = None
@@ -66,7 +66,7 @@ class JointError:
     time_of_max : float
         Time of ``max`` [s of record time].
     rms_delay_removed : float
-        Rms error with the common delay removed [rad]; equal to ``rms`` without a common delay.
+        Rms error with the common delay removed [rad]; equal to ``rms`` if there is no common delay.
     delay : float
         Delay of this joint [s]; NaN if no delay explains the error.
     """
@@ -81,19 +81,19 @@ class JointError:
 
 @dataclass(frozen=True)
 class WheelError:
-    """Measured minus simulated motion of one wheel.
+    """Error of one wheel: measured minus simulated motion.
 
     Attributes
     ----------
     wheel : str
     rate_rms, rate_max : float
-        Rms and maximum error of the rate [rad/s].
+        Rms and maximum error in the rate [rad/s].
     time_of_max : float
         Time of ``rate_max`` [s of record time].
     turned : float
         Angle turned in the simulation between the first and the last compared sample [rad].
     angle_max, angle_end : float
-        Error of the angle turned since the start: maximum magnitude, and signed error at the end [rad].
+        Error in the angle turned since the start: maximum magnitude, and signed error at the end [rad].
     """
 
     wheel: str
@@ -107,12 +107,12 @@ class WheelError:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Simulated and measured angles at the times of the measured run.
+    """Comparison of simulated and measured angles at the times of the measured run.
 
     Attributes
     ----------
     delay : float
-        Common delay of all joints of the measured run [s]; NaN if no delay explains half of the error.
+        Common delay of all joints in the measured run [s]; NaN if no delay explains half of the mean square error.
     joints : tuple of JointError
     wheels : tuple of WheelError
         Empty if the records have no wheels in common.
@@ -139,7 +139,7 @@ class Comparison:
 
     @property
     def delay_text(self) -> str:
-        """Text with the common delay."""
+        """Text that states the common delay."""
         return "no common delay" if np.isnan(self.delay) else f"common delay {self.delay * 1e3:.1f} ms"
 
     def summary(self) -> dict[str, Any]:
@@ -172,21 +172,21 @@ def _with_units(error: JointError | WheelError, units: dict[str, str]) -> dict[s
 def compare_records(simulated: Record, measured: Record) -> Comparison:
     """Compare all joint angles that two records have in common.
 
-    Joints that lift wheels are compared with the angles required by the lifted wheel pairs of the simulated record. For
-    wheels, the rates and the angles turned since the start of the motion are compared.
+    Joints that lift wheels are compared with the angles that the lifted wheel pairs in the simulated record require.
+    For wheels, the rates and the angles turned since the start of the motion are compared.
 
     Parameters
     ----------
     simulated : Record
         Simulated run.
     measured : Record
-        Measured run, which is aligned with the simulation by its ``record_time``, or any other record.
+        Measured run, whose signal ``record_time`` aligns it with the simulation. It may also be any other record.
 
     Raises
     ------
     RecordError
-        If there are no common angles or no samples of the replayed motion, or the measured run is not the result of a
-        replay.
+        If there are no common angles, if there are no samples of the replayed motion, or if the measured run is not the
+        result of a replay.
     CheckRefused
         If the measured run lifted wheels but the lifting cannot be computed for the simulated record.
     """
@@ -239,12 +239,12 @@ def compare_records(simulated: Record, measured: Record) -> Comparison:
 
 
 def _rms(error: Array) -> float:
-    """Return the rms of an error that is NaN at missed answers."""
+    """Return the rms value of an error; samples without an answer are NaN and are ignored."""
     return float(np.sqrt(np.nanmean(error**2)))
 
 
 def _largest(error: Array, time: Array) -> tuple[float, float]:
-    """Return magnitude and time of the largest error; the errors are NaN at missed answers."""
+    """Return the magnitude and time of the largest error; samples without an answer are NaN and are ignored."""
     worst = int(np.nanargmax(np.abs(error)))
     return float(abs(error[worst])), float(time[worst])
 
@@ -252,7 +252,7 @@ def _largest(error: Array, time: Array) -> tuple[float, float]:
 def _wheel_errors(
     simulated: Record, measured: Record, rows: NDArray[np.bool_], time: Array, speed: float
 ) -> tuple[tuple[WheelError, ...], Array]:
-    """Return the errors of the wheels, and their rates as in :class:`Comparison`."""
+    """Return the errors of the wheels, and the wheel rates as in :class:`Comparison`."""
     angles = {label: (ours, theirs) for label, ours, theirs in _columns(simulated, measured, WHEEL_ANGLE)}
     own_time = simulated.time - simulated.time[0]
     errors, rates = [], np.zeros((2, len(time), 0))
@@ -264,7 +264,7 @@ def _wheel_errors(
         rate = pair[1] - pair[0]
         asked = np.interp(time, own_time, angles[label][0])
         turned = angles[label][1][rows]
-        seen = np.flatnonzero(np.isfinite(turned))  # without missed answers
+        seen = np.flatnonzero(np.isfinite(turned))  # samples for which the servo answered
         angle = (turned - turned[seen[0]]) - (asked - asked[seen[0]])
         rate_max, time_of_max = _largest(rate, time)
         errors.append(
@@ -282,7 +282,7 @@ def _wheel_errors(
 
 
 def _columns(simulated: Record, measured: Record, name: str) -> list[tuple[str, Array, Array]]:
-    """Return label, simulated column and measured column for each column of a signal that both records have."""
+    """Return the label, simulated column and measured column for each column of a signal that is in both records."""
     if name not in simulated or name not in measured or simulated[name].ndim != 2 or measured[name].ndim != 2:
         return []
     ours, theirs = simulated.labels[name], measured.labels[name]
@@ -295,9 +295,9 @@ def _columns(simulated: Record, measured: Record, name: str) -> list[tuple[str, 
 
 
 def _common_angles(simulated: Record, measured: Record) -> list[tuple[str, Array, Array]]:
-    """Return all common angles except wheel angles.
+    """Return all angles, except wheel angles, that both records have in common.
 
-    A joint that lifts wheels follows the sum of the record and the lifting, or the lifting alone.
+    The reference for a joint that lifts wheels is the lifting angle, added to the angle in the record if there is one.
     """
     offsets = _lifting(simulated, measured)
     pairs = []
@@ -314,7 +314,7 @@ def _common_angles(simulated: Record, measured: Record) -> list[tuple[str, Array
 
 
 def _lifting(simulated: Record, measured: Record) -> dict[str, Array]:
-    """Return the angles that the servo map of the measured run added to lift wheels, by column [rad]."""
+    """Return the angles [rad] that the servo map of the measured run added to lift wheels, by column label."""
     entry = measured.provenance.get("lifts")
     if entry is None:
         return {}
@@ -326,16 +326,17 @@ def _lifting(simulated: Record, measured: Record) -> dict[str, Array]:
 
 
 def _delay(at: Any, time: Array, actual: Array, columns: NDArray[np.bool_]) -> float:
-    """Return the shift of the simulated angles that best fits the measured angles [s of record time].
+    """Return the time shift [s of record time] with which the simulated angles fit the measured angles best.
 
-    NaN if no shift in the range explains half of the mean square error: then the error is sag or backlash, not delay.
+    Return NaN if no shift in the range explains half of the mean square error, because then sag or backlash, not delay,
+    causes the error.
     """
     if not columns.any():
         return float("nan")
 
     def misfit(delay: float) -> float:
         error = (actual - at(time - delay))[:, columns]
-        # Remove the mean: a joint that sags under its load has a constant error, which is not a delay.
+        # Remove the mean: a joint that sags under its load has a constant error, which a delay does not explain.
         return float(np.nanmean((error - np.nanmean(error, axis=0)) ** 2))
 
     grid = np.linspace(-0.1, MAX_DELAY, 61)
@@ -353,7 +354,7 @@ def load_gate(path: str | Path) -> Gate:
     Raises
     ------
     ServoMapError
-        If the file is missing, is not YAML or has an invalid entry; the message has file and line.
+        If the file is missing, is not YAML or has an invalid entry; the message states the file and the line.
     """
     return read_yaml(Path(path), Gate)
 
@@ -364,12 +365,12 @@ def check_gate(comparison: Comparison, gate: Gate) -> None:
     Raises
     ------
     ComparisonGateFailed
-        If a bound is exceeded; the message lists all of them.
+        If a bound is exceeded; the message lists all bounds that are exceeded.
     """
     summary = comparison.summary()
     bounds = {name: bound for name, bound in gate.model_dump().items() if bound is not None}
     if summary["delay_s"] is None:
-        # Without a common delay the other bounds apply.
+        # If there is no common delay, only the other bounds apply.
         bounds.pop("delay_s", None)
     exceeded = [f"{name}: no wheels to compare" for name in bounds if summary[name] is None]
     exceeded += [
@@ -382,7 +383,7 @@ def check_gate(comparison: Comparison, gate: Gate) -> None:
 
 
 def draw_comparison(comparison: Comparison, path: Path, joints: Sequence[str] = ()) -> Path:
-    """Draw measured and simulated angles of some joints, and the errors of all joints over time; likewise for wheels.
+    """Draw measured and simulated angles of some joints, and the errors of all joints; draw the same for wheels.
 
     Parameters
     ----------
@@ -390,7 +391,7 @@ def draw_comparison(comparison: Comparison, path: Path, joints: Sequence[str] = 
     path : Path
         Output file.
     joints : sequence of str
-        Joints and wheels to draw in colour; default: the worst of each.
+        Joints and wheels to draw in colour; default: the joint and the wheel with the largest errors.
 
     Raises
     ------

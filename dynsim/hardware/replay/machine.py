@@ -1,8 +1,8 @@
-"""State machine of a replay, with its control loop and the commands at its end: servos execute a checked motion.
+"""State machine of a replay, in which servos execute a checked motion; its control loop, and the commands at its end.
 
-CONNECT → VERIFY → ARM → MOVE_TO_START → SETTLE → REPLAY → SETTLE → DISARM, and from each state → FAULT. A motion must
-have passed the offline check (:mod:`dynsim.hardware.replay.check`). After a fault only the commands of the fault policy
-are sent.
+The states are CONNECT → VERIFY → ARM → MOVE_TO_START → SETTLE → REPLAY → SETTLE → DISARM; each state may change to
+FAULT. A motion must have passed the offline check (:mod:`dynsim.hardware.replay.check`). After a fault, only the
+commands of the fault policy are sent.
 """
 
 from __future__ import annotations
@@ -72,19 +72,19 @@ from dynsim.hardware.replay.trajectory import QUINTIC_PEAK, Approach, CyclePlan,
 from dynsim.hardware.servo_map import FaultPolicy, MappedServo, ServoMap
 from dynsim.system.files import write_json
 
-# Control loop of a replay: at each deadline it writes goals, reads states, records and checks them.
+# Control loop of a replay: at each deadline, it writes goals, reads states, and records and checks them.
 
 
 Array = NDArray[np.float64]
 
 FIELDS = MX_106.fields
-"""Registers that all models have in common have the same address in all models."""
+"""Control table of one model; registers that all models have in common have the same address in all models."""
 STATE = struct.Struct("<hii")
-"""Effort, velocity and position in a block of :data:`~dynsim.hardware.bus.control_table.STATE_BLOCK`."""
+"""Layout of effort, velocity and position in a :data:`~dynsim.hardware.bus.control_table.STATE_BLOCK`."""
 
 
 GoalRegisters = dict[str, dict[int, int]]
-"""Goals by the name of the register and the ID of the servo."""
+"""Values of the goal registers, by name of the register and by servo ID."""
 
 
 def goal_registers(
@@ -102,7 +102,7 @@ def goal_registers(
 
 @dataclass(eq=False)
 class Loop:
-    """Control loop: write goals and read measurements in each cycle.
+    """Control loop that writes goals and reads measurements in each cycle.
 
     Attributes
     ----------
@@ -117,7 +117,7 @@ class Loop:
     period : float
         Cycle time [s].
     goal, goal_rate : array, shape (N,)
-        Last commands [rad], [rad/s].
+        Last commanded angles [rad] and rates [rad/s].
     measured : array, shape (N,)
         Last measured joint angles [rad].
     origin : float
@@ -128,7 +128,7 @@ class Loop:
         Current or last course.
     in_position_mode : bool array, shape (N,)
     path_started : float or None
-        Clock time of path time 0 [s]; None before the replay of the path.
+        Clock time of path time 0 [s]; None before the replay of the path starts.
     policy_goals : list
         (clock time, ID, register value) of each goal that was sent after a fault.
     """
@@ -153,7 +153,8 @@ class Loop:
         self.goal, self.goal_rate, self.measured = np.zeros((3, len(servos)))
         self.begin()
         self.in_position_mode = np.array([servo.in_position_mode for servo in servos])
-        # Limits of goals: lowest and highest tick and maximum step from goal to goal, or maximum speed.
+        # Limits for goals: in position mode, the lowest and highest tick and the maximum step from goal to goal; in
+        # velocity mode, the maximum speed.
         self._tick_bounds = [
             (*servo.tick_limits, velocity_limit(servo) * servo.gear * 2 * self.period / RAD_PER_TICK + 2)
             for servo in servos
@@ -162,16 +163,16 @@ class Loop:
         self._sent: dict[int, int] = {}
 
     def servo_armed(self, index: int, register: int, angle: float) -> None:
-        """Set goal and measurement of a servo that was armed at the goal ``register`` and joint angle [rad]."""
+        """Set the goal and measurement of a servo that was armed with the goal ``register`` at a joint angle [rad]."""
         self._sent[self.map.servos[index].id] = register
         self.goal[index] = self.measured[index] = angle
 
     def all_armed(self) -> None:
-        """Start to measure the time without packets, because the watchdogs are switched on from now on."""
+        """Start to measure the time without packets, because the watchdogs are active from now on."""
         self._last_contact = self.clock.now()
 
     def stall(self) -> Fault | None:
-        """Return a fault if no packet was sent for longer than the watchdog time of the servos, otherwise None."""
+        """Return a fault if no packet has been sent for longer than the watchdog time of the servos, otherwise None."""
         return self.rules.stall(self.clock.now() - self._last_contact)
 
     def begin(self) -> None:
@@ -182,13 +183,13 @@ class Loop:
         return self.origin + tick * self.period
 
     def next_cycle(self) -> tuple[float, int]:
-        """Wait for the next deadline as :meth:`wait_for_deadline`; raise Stopped if the user has requested a stop."""
+        """Wait for the next deadline, see :meth:`wait_for_deadline`; raise Stopped if the user has requested a stop."""
         lateness, skipped = self.wait_for_deadline()
         self.stop.check()
         return lateness, skipped
 
     def wait_for_deadline(self) -> tuple[float, int]:
-        """Sleep until the next cycle is due; return its lateness [s] and the number of skipped cycles."""
+        """Wait until the next cycle is due; return its lateness [s] and the number of skipped cycles."""
         self.tick += 1
         behind = math.floor((self.clock.now() - self.deadline_of(self.tick)) / self.period)
         skipped = max(0, behind)
@@ -199,8 +200,8 @@ class Loop:
     def follow(self, course: GoalCourse) -> None:
         """Follow a course to its end.
 
-        The course advances by one period per goal even if cycles were skipped, because making up for them at once would
-        be one large step.
+        The course advances by one period per goal even if cycles were skipped, because making up for all skipped cycles
+        at once would require a large step.
         """
         self.course = course
         while not course.over:
@@ -208,12 +209,12 @@ class Loop:
             self._cycle(*course.advance(self.period), *due)
 
     def stay(self, position: Array) -> Cycle:
-        """Execute one cycle at rest."""
+        """Execute one cycle in which the robot stays at a position."""
         return self._cycle(position, np.zeros_like(position), *self.next_cycle())
 
     def _cycle(self, position: Array, velocity: Array, lateness: float, skipped: int) -> Cycle:
         if stall := self.stall():
-            # Servos that were stopped by their watchdogs must not jump to the current goal.
+            # Servos that have been stopped by their watchdogs must not jump to the current goal.
             raise Stopped(stall)
         self.goal, self.goal_rate = position, velocity
         cycle = self.exchange(lateness, skipped, write=True)
@@ -222,7 +223,7 @@ class Loop:
         return cycle
 
     def exchange(self, lateness: float, skipped: int, *, write: bool) -> Cycle:
-        """Write all goals, read all states and the health of one servo in turn, and record them."""
+        """Write all goals, read all states, sometimes also read the health of one servo, and record all of them."""
         began = self.clock.now()
         if write:
             self._send(self.goal, self.goal_rate)
@@ -255,7 +256,7 @@ class Loop:
         self._cycles += 1
         if self._cycles % self.plan.health_every == 0:
             servo = servos[self._cycles // self.plan.health_every % count]
-            # A sync read of one servo: a silent servo costs one time-out and no retry.
+            # Use a sync read for this servo: if it is silent, this costs one time-out, but no retries.
             answer = self.bus.sync_read((servo.id,), *HEALTH_BLOCK).replies.get(servo.id)
             if answer is not None:
                 cycle.health[servo.id] = servo.model.registers_in(HEALTH_BLOCK[0], answer.data)
@@ -271,7 +272,7 @@ class Loop:
         return cycle
 
     def _send(self, position: Array, velocity: Array) -> None:
-        """Send the goals of a motion; raise Stopped for a goal that no checked motion can contain."""
+        """Send the goals of a motion; raise Stopped if a checked motion cannot contain such a goal."""
         servos = self.map.servos
         goals = goal_registers(servos, position, velocity)
         for servo, (low, high, step), fastest in zip(servos, self._tick_bounds, self._unit_bounds, strict=True):
@@ -282,11 +283,11 @@ class Loop:
                 goal = goals["goal_velocity"][servo.id]
                 allowed = abs(goal) <= fastest
             if not allowed:
-                raise Stopped(Fault(Cause.GOAL_GUARD, f"{servo.joint}: goal {goal} was not sent", (servo.id,)))
+                raise Stopped(Fault(Cause.GOAL_GUARD, f"{servo.joint}: unsafe goal {goal} was not sent", (servo.id,)))
         self.write_goals(goals)
 
     def write_goals(self, goals: GoalRegisters) -> None:
-        """Write goal registers without a check."""
+        """Write goal registers without checking the goals."""
         for name, values in goals.items():
             if not values:
                 continue
@@ -297,25 +298,26 @@ class Loop:
                 self.policy_goals += [(now, id_, value) for id_, value in values.items()]
 
 
-# End of a replay: stop the robot, leave torque on or switch it off, and read the state of the servos.
+# End of a replay: stop the robot, leave the torque on or switch it off, and read the states of the servos.
 
 
 REST_TIME = 1.0
-"""Maximum wait until the servos are at rest and silent servos answer again (a restart takes 0.3 s) [s]."""
+"""Maximum time to wait until the servos are at rest and silent servos answer again [s]; a restart takes 0.3 s."""
 REST_CYCLES = 10
 AT_REST = 0.1
-"""Speed below which joints and wheels are at rest [rad/s]; a few units of the velocity register."""
+"""Speed below which a joint or wheel counts as at rest [rad/s]: a few units of the velocity register."""
 
 
 @dataclass(eq=False)
 class Ending:
-    """Bring the robot to one of the end states.
+    """Procedures that bring the robot to one of the end states.
 
     Parameters
     ----------
     loop : Loop
     result : ReplayResult
-        Receives further faults, the end state of each servo, and the IDs that did not confirm torque off.
+        Result to which further faults, the end state of each servo, and the IDs of servos that did not confirm torque
+        off are added.
     policy : "hold", "decelerate" or "off"
     """
 
@@ -332,14 +334,14 @@ class Ending:
         return self.loop.map.servos
 
     def regular(self) -> None:
-        """End a motion as ``safety.at_end`` of the map specifies. Raises PortError."""
+        """End a successful motion as ``safety.at_end`` in the map specifies. Raises PortError."""
         if self.loop.map.safety.at_end == "hold":
             self._leave_holding()
         else:
             self._release()
 
     def after_fault(self, struck: ReplayState, *, found_holding: bool) -> None:
-        """Apply the fault policy to the faults of the result; never raises.
+        """Apply the fault policy to the faults in the result. This never raises an exception.
 
         Parameters
         ----------
@@ -357,20 +359,20 @@ class Ending:
         elif struck == ReplayState.DISARM:
             self._try(self.regular)
         elif struck == ReplayState.ARM:
-            # Nothing has moved yet: restore the initial torque, unless another program has switched it off meanwhile.
+            # Nothing has moved yet: restore the initial torque state, unless another program has since switched it off.
             taken = any(fault.cause == Cause.TORQUE_LOST for fault in self.result.faults)
             self._try(self._leave_holding if found_holding and not taken else self._release)
         elif self.policy == "off" and not interrupted:
             self._try(self._release)
         else:
-            # With a dead port this has no effect, but the attempt shows whether the port is really dead.
+            # If the port is dead, this has no effect, but the attempt shows whether the port is really dead.
             if not self._try(self._freeze if self.policy == "hold" and not interrupted else self._decelerate):
                 self._try(self._freeze)
             self._try(self._come_to_rest)
             self._try(self._release if self.policy == "off" else self._leave_holding)
 
     def release_at_last(self) -> bool:
-        """Switch torque off if the user has requested it since the policy was applied; never raises."""
+        """Switch the torque off if the user has requested it since the policy was applied. Never raises errors."""
         if self._released or not self.loop.stop.for_release:
             return False
         self._try(self._release)
@@ -378,7 +380,7 @@ class Ending:
         return True
 
     def read_back(self, *, armed: bool) -> None:
-        """Read the state of all servos and derive the end state of the robot; never raises."""
+        """Read the state of all servos and derive the end state of the robot. Never raises an exception."""
         self.result.servos = tuple(ServoEnd(servo.joint, servo.id) for servo in self._servos)
 
         def read() -> None:
@@ -390,16 +392,16 @@ class Ending:
     # -- faults during the policy -------------------------------------------------------------------------------------
 
     def _try(self, step: Callable[[], None]) -> bool:
-        """Execute a step and return True if it succeeded; an error becomes a fault of the result."""
+        """Execute a step and return True if it succeeded; if it failed, add the error to the result as a fault."""
         try:
             step()
         except PortError as error:
             if all(fault.cause != Cause.PORT for fault in self.result.faults):
-                self._declare(Fault(Cause.PORT, f"{error}; armed servos stop by their bus watchdog"))
+                self._declare(Fault(Cause.PORT, f"{error}; the bus watchdogs stop armed servos"))
         except Exception as error:
             self._declare(Fault(Cause.PROGRAM, repr(error)))
         except BaseException as error:
-            # A request to exit, which is delayed until the robot has been stopped.
+            # This is a request to exit, which is delayed until the robot has been stopped.
             self.loop.stop()
             self._declare(Fault(Cause.PROGRAM, repr(error)))
         else:
@@ -411,10 +413,10 @@ class Ending:
         self.loop.journal.add_line(f"{fault.cause}: {fault.text}")
 
     def _watch(self, lateness: float, skipped: int) -> Cycle:
-        """Read and apply the abort rules; a servo with a new fault stops at its present position."""
+        """Read all states and apply the abort rules; a servo with a new fault stops at its present position."""
         loop = self.loop
         cycle = loop.exchange(lateness, skipped, write=False)
-        # Late cycles do not matter, because the remaining goals do not depend on the time at which they are sent.
+        # Ignore late cycles, because the remaining goals do not depend on the time at which they are sent.
         for fault in loop.rules.examine(cycle):
             if fault.cause != Cause.DEADLINE:
                 self._declare(fault)
@@ -430,7 +432,7 @@ class Ending:
             self._hold_measured(self._newly_faulty(fault.ids))
 
     def _newly_faulty(self, ids: Collection[int]) -> list[int]:
-        """Mark servos as faulty and return the map indices of newly faulty servos."""
+        """Mark servos as faulty; return the indices in the map of the servos that were not marked before."""
         indices = [index for index, servo in enumerate(self._servos) if servo.id in ids and index not in self._faulty]
         self._faulty.update(indices)
         return indices
@@ -441,7 +443,7 @@ class Ending:
         """Set the goals of all servos to their present positions."""
         self._frozen = True
         if any(fault.cause == Cause.STALL for fault in self.result.faults):
-            # The last measurement is from before the stall.
+            # The last measurement was taken before the stall, so measure again.
             self.loop.exchange(0.0, 0, write=False)
         self._hold_measured(range(len(self._servos)))
 
@@ -454,7 +456,7 @@ class Ending:
             loop.goal_rate[index] = 0.0
             low, high = servo.tick_limits
             if servo.in_position_mode and not low <= servo.to_ticks(float(loop.measured[index])) <= high:
-                # A measurement outside the limits of the joint is unreliable: the servo keeps its last goal.
+                # A measurement outside the limits of the joint is unreliable, so the servo keeps its last goal.
                 continue
             reliable.append(index)
             if servo.in_position_mode:
@@ -462,10 +464,10 @@ class Ending:
         self._write(reliable)
 
     def _decelerate(self) -> None:
-        """Slow down along the path to rest, all joints synchronously; faulty servos stop at their present positions."""
+        """Slow all joints down to rest synchronously along the path; stop faulty servos at their present positions."""
         loop, faults = self.loop, self.result.faults
         if any(fault.cause == Cause.STALL for fault in faults):
-            # The servos were stopped by their watchdogs and do not accept goals.
+            # The watchdogs have stopped the servos, so that these do not accept goals.
             return self._freeze()
         self._hold_measured(self._newly_faulty([id_ for fault in faults for id_ in fault.ids]))
         course = loop.course
@@ -490,19 +492,19 @@ class Ending:
         return None
 
     def _send(self, position: Array, velocity: Array) -> None:
-        """Send goals [rad], [rad/s] to the servos without a fault."""
+        """Send goals [rad], [rad/s] to all servos that have no fault."""
         loop = self.loop
         sound = [index for index in range(len(self._servos)) if index not in self._faulty]
         loop.goal[sound], loop.goal_rate[sound] = position[sound], velocity[sound]
         self._write(sound)
 
     def _write(self, indices: list[int]) -> None:
-        """Write the goals of some servos."""
+        """Write the current goals of some servos."""
         loop, servos = self.loop, [self._servos[index] for index in indices]
         loop.write_goals(goal_registers(servos, loop.goal[indices], loop.goal_rate[indices]))
 
     def _come_to_rest(self) -> None:
-        """Wait until all servos answer and are at rest, for REST_TIME at most."""
+        """Wait until all servos answer and are at rest, but no longer than REST_TIME."""
         quiet = 0
         for _ in range(math.ceil(REST_TIME / self.loop.period)):
             if self.loop.stop.for_release:
@@ -527,17 +529,17 @@ class Ending:
                 unconfirmed.append(f"{servo.joint}: {error}")
             registers = health.get(servo.id)
             if registers and registers["bus_watchdog"] == -1:
-                # The watchdog has stopped this servo, so it did not accept a goal until now.
+                # The watchdog has stopped this servo, so that it did not accept any goal until now.
                 loop.measured[index] = servo.to_angle(registers["present_position"])
                 self._hold_measured([index])
         if unconfirmed:
             self.loop.journal.add_line(
-                f"watchdogs not confirmed to be off, they may stop these servos: {'; '.join(unconfirmed)}"
+                f"these servos did not confirm that their watchdogs are off and may stop: {'; '.join(unconfirmed)}"
             )
         return self.loop.journal.add_line("servos with torque on stay ON; switch them off with `dynsim hw stop`")
 
     def _release(self) -> None:
-        """Broadcast torque off until all servos confirm or REST_TIME is over; then switch watchdogs off.
+        """Broadcast "torque off" until all servos confirm it or REST_TIME has passed; then switch the watchdogs off.
 
         Raises PortError.
         """
@@ -551,7 +553,7 @@ class Ending:
             if not still_on or loop.clock.now() >= until:
                 break
             loop.clock.sleep_until(loop.clock.now() + REST_TIME / 10)
-        # Also switch watchdogs off, because a watchdog that trips later makes the goals read-only for the next program.
+        # Also switch the watchdogs off, because a watchdog that trips later makes goals read-only for the next program.
         for id_ in loop.map.ids:
             if id_ not in still_on and health[id_]["bus_watchdog"]:
                 with suppress(NoAnswer, RequestRefused):
@@ -561,7 +563,7 @@ class Ending:
 
 
 def read_health(bus: Bus, servos: Sequence[MappedServo]) -> dict[int, Registers]:
-    """Read registers 64 to 146 of all servos that answer, by ID and name. Raises PortError."""
+    """Read the registers at addresses 64 to 146 of all servos that answer, by ID and name. Raises PortError."""
     return read_registers(bus, servos, HEALTH_BLOCK)
 
 
@@ -586,19 +588,19 @@ def _end(servo: MappedServo, registers: dict[str, int]) -> ServoEnd:
 
 
 APPROACH_ACCELERATION = 10.0
-"""Profile acceleration of the servos for the move to the start [rad/s²]."""
+"""Profile acceleration of the servos during the move to the start [rad/s²]."""
 SETTLE_CYCLES = 10
 SETTLE_TIME = 3.0
-"""Maximum wait for the servos to come to rest [s]."""
+"""Maximum time to wait for the servos to come to rest [s]."""
 RECORD = "measured record"
 """Name of the measured record in the list of outputs that failed."""
 DRY_RUN_TIME = 1.0
-"""Duration of a dry run, which measures the timing of the bus without moving [s]."""
+"""Duration of a dry run, which measures the timing of the bus without moving the robot [s]."""
 
 
 @dataclass(eq=False)
 class Replay:
-    """One run of a motion on servos.
+    """One replay of a motion on servos.
 
     Parameters
     ----------
@@ -609,16 +611,16 @@ class Replay:
     policy : "hold", "decelerate" or "off", optional
         Fault policy; default: the policy in the map.
     live : bool
-        If False, verify the servos and measure the timing of the bus without moving.
+        If False, verify the servos and measure the timing of the bus without moving the robot.
     write_eeprom : bool
-        If True, write EEPROM settings that differ from the map.
+        If True, correct EEPROM settings that differ from the map.
     stop : StopRequest, optional
     dump_folder : path, optional
         Folder for register dumps.
     observer : callable, optional
-        Called with a ReplayProgress after each cycle and at each change of state.
+        Function that is called with a ReplayProgress after each cycle and at each change of state.
     provenance : dict, optional
-        Entries that are added to the provenance of the measured record.
+        Entries to be added to the provenance of the measured record.
 
     Attributes
     ----------
@@ -678,7 +680,7 @@ class Replay:
         except SimulationStopped as error:
             self._fault(Fault(Cause.SIMULATION, f"the simulated robot of the virtual servos (--plant) {error}"))
         except BaseException as error:
-            # Never leave a robot with its torque on without applying the fault policy.
+            # Always apply the fault policy before leaving a robot whose torque is on.
             self._fault(Fault(Cause.PROGRAM, brief(error)))
             for line in traceback.format_exception(error):
                 self.journal.add_line(line.rstrip())
@@ -730,15 +732,15 @@ class Replay:
                 self._check_still_on([servo])
             self.bus.write(servo.id, FIELDS["torque_enable"], 1)
             if not self.bus.read(servo.id, FIELDS["torque_enable"]):
-                raise Stopped(Fault(Cause.ARMING, f"{servo}: torque stays off", (servo.id,)))
+                raise Stopped(Fault(Cause.ARMING, f"{servo}: the torque stays off", (servo.id,)))
             self.loop.servo_armed(index, goal, servo.to_angle(present))
-        # If another program switched torque off meanwhile, servos that were armed after that are still on.
+        # Another program may have switched torque off in the meantime; only servos that were armed later are still on.
         self._check_still_on(self._servos)
         units = watchdog_units(self.map.safety)
         self.loop.all_armed()
         for servo in self._servos:
             self.bus.write(servo.id, FIELDS["bus_watchdog"], units)
-        self.journal.add_line(f"torque on, bus watchdogs at {units * WATCHDOG_SECONDS_PER_UNIT * 1e3:.0f} ms")
+        self.journal.add_line(f"torque on, bus watchdogs set to {units * WATCHDOG_SECONDS_PER_UNIT * 1e3:.0f} ms")
 
     def _check_still_on(self, servos: Sequence[MappedServo]) -> None:
         """Raise Stopped if a servo has lost its torque, and NoAnswer if a servo does not answer."""
@@ -749,7 +751,7 @@ class Replay:
         lost = [servo for servo in servos if not health[servo.id]["torque_enable"]]
         if lost:
             names = ", ".join(map(str, lost))
-            text = f"{names}: torque is off again (switched off by another program, or restarted)"
+            text = f"{names}: torque is off again (another program switched it off, or the servo restarted)"
             raise Stopped(Fault(Cause.TORQUE_LOST, text, tuple(servo.id for servo in lost)))
 
     def _move_to_start(self) -> None:
@@ -758,7 +760,7 @@ class Replay:
         distance = float(np.abs(goal - here).max())
         duration = max(QUINTIC_PEAK * distance / self.map.safety.approach_velocity, self.loop.period)
         self.journal.enter(ReplayState.MOVE_TO_START)
-        self.journal.add_line(f"{distance:.3f} rad in {duration:.1f} s")
+        self.journal.add_line(f"move by up to {distance:.3f} rad in {duration:.1f} s")
         self.loop.begin()
         self.loop.follow(GoalCourse(Approach(here, goal, duration), 0.0, duration, speed=1.0))
         self._settle()
@@ -797,13 +799,14 @@ class Replay:
         asked = "holding" if self.map.safety.at_end == "hold" else "off"
         if self.result.end_state != asked:
             cause = Cause.INTERRUPTED if self.stop.for_release else Cause.END_STATE
-            raise Stopped(Fault(cause, f"should be {asked}, but is {self.result.end_state}"))
+            raise Stopped(Fault(cause, f"the robot should be {asked}, but is {self.result.end_state}"))
         self._log_end()
 
     def _profile(self, servo: MappedServo, *, approaching: bool) -> dict[str, int]:
-        """Return the profile limits of the firmware: slow on the approach, the speed limit of the joint in the replay.
+        """Return the limits for the firmware's motion profile: slow on the approach, at the joint limit in the replay.
 
-        0 means "no limit": it is never used as a velocity; as an acceleration it lets the path determine the motion.
+        A value of 0 means "no limit". It is never used for the velocity; for the acceleration, it is used in the
+        replay, so that the path determines the motion.
         """
         velocity = (
             min(2 * self.map.safety.approach_velocity, velocity_limit(servo)) if approaching else velocity_limit(servo)
@@ -816,7 +819,7 @@ class Replay:
 
     def _fault(self, *faults: Fault) -> None:
         struck, result = self.journal.state, self.result
-        # Stop the robot first and write the log afterwards.
+        # Stop the robot first, and write the log afterwards.
         with self.journal.buffered():
             result.fault_state, result.fault_time = struck, self.clock.now()
             self.journal.enter(ReplayState.FAULT)
@@ -840,13 +843,13 @@ class Replay:
             self.journal.add_line(str(servo))
 
     def _read_registers(self) -> dict[str, Registers | str] | None:
-        """Read the registers of all servos for a dump; None if the port fails after a fault."""
+        """Read the registers of all servos for a register dump; return None if the port fails after a fault."""
         try:
             return all_registers(self.bus, self.map)
         except PortError as error:
             if self.result.fault is None:
                 raise
-            self.journal.add_line(f"no register dump: {error}")
+            self.journal.add_line(f"no register dump was written: {error}")
             return None
 
     def _dump(self, registers: dict[str, Registers | str] | None, name: str) -> None:
@@ -860,7 +863,7 @@ class Replay:
             self.journal.add_line(f"timing: {timing}")
 
     def _sum_up(self) -> None:
-        """Build record and timing of the run."""
+        """Build the measured record and the timing statistics of the run."""
         result, rows = self.result, self.recorder.all()
         started = self.loop.path_started if self.loop.path_started is not None else self.loop.origin
         record = measured_record(rows, self.layout, started)

@@ -1,6 +1,6 @@
-"""Measured record of a replay, including a replay whose process died.
+"""Measured record of a replay, even of a replay whose process died.
 
-The scene is copied from the replayed record; body poses are computed from the measured joint angles.
+The scene is copied from the replayed record; the poses of the bodies are computed from the measured joint angles.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def timing_of(rows: Rows, layout: Layout) -> Timing:
     if len(rows) < 2:
         return {}
     path_time = rows["path_time"]
-    # Cycles in which the path advanced; the first cycle has no earlier time to compare with.
+    # Select the cycles in which the path advanced; for the first cycle, there is no earlier time to compare with.
     followed = np.isfinite(path_time) & (np.diff(path_time, prepend=np.nan) != 0)
     periods, lateness, exchange = np.diff(rows["time"]), rows["lateness"], rows["exchange"]
     return {
@@ -70,11 +70,11 @@ def measured_record(rows: Rows, layout: Layout, origin: float) -> Record:
     Parameters
     ----------
     rows : Rows
-        Data of the cycles.
+        Rows with the data of the cycles.
     layout : Layout
-        Joints and signals of the rows.
+        Joints and signals in the rows.
     origin : float
-        Start of the replayed motion on the clock of the rows [s]; time 0 of the record.
+        Start of the replayed motion on the clock of the rows [s]; it becomes time 0 of the record.
     """
     record = Record(rows["time"] - origin, provenance=layout.provenance)
     joints = tuple(layout.joints)
@@ -98,11 +98,11 @@ def measured_record(rows: Rows, layout: Layout, origin: float) -> Record:
 
 
 def unmeasured(record: Record, servo_map: ServoMap) -> Record | None:
-    """Return the signals for the pose of the robot that no servo measures, such as the base of a snake robot.
+    """Return the signals that determine the pose of the robot but are not measured, such as the base of a snake robot.
 
-    The result contains, over the time of the motion, the columns of scene joints without a servo (for example the
-    wheels of a mobile base); ``grounded``; and as ``lifting`` the angles that the map adds to joints to lift wheels,
-    which are not part of the scene. None if the record has no scene or lacks one of these columns.
+    The result contains, as functions of time, the columns of those joints in the scene that have no servo (for example
+    the wheels of a mobile base), the signal ``grounded``, and, as ``lifting``, the angles that the map adds to joints
+    to lift wheels, which are not part of the scene. It is None if the record has no scene or lacks one of the columns.
     """
     if record.scene is None:
         return None
@@ -129,7 +129,7 @@ def unmeasured(record: Record, servo_map: ServoMap) -> Record | None:
 
 
 def describe(record: Record, scene: Scene | None, followed: Record | None = None) -> Record:
-    """Add events, body poses and hand positions to a measured record, for drawing.
+    """Add events, body poses and hand positions to a measured record, so that it can be drawn.
 
     The record is changed in place and returned. Each change of the signal ``state`` becomes an event. Poses and
     ``hand_position`` are computed from the measured joint positions, ``hand_position_goal`` from the goals.
@@ -139,7 +139,7 @@ def describe(record: Record, scene: Scene | None, followed: Record | None = None
     record : Record
         Measured record.
     scene : Scene or None
-        Scene of the replayed record; without it only events are added.
+        Scene of the replayed record; if it is None, only events are added.
     followed : Record, optional
         Signals of the replayed record that no servo measures (see :func:`unmeasured`). If a joint is in neither record,
         all poses are omitted.
@@ -159,7 +159,7 @@ def describe(record: Record, scene: Scene | None, followed: Record | None = None
         pose = actual.signals[name]
         record.add(name, pose.data, pose.unit, labels=pose.labels, description=f"from measured joints{on}")
     for name in followed.signals:
-        # Skip signals with measured columns: their description would not apply to columns that are copied.
+        # Skip signals with measured columns, because their description would not apply to the copied columns.
         if name != LIFTING and name not in record:
             data = _at(followed, name, at)
             # A wheel pair is either lifted or on the ground.
@@ -177,7 +177,7 @@ def describe(record: Record, scene: Scene | None, followed: Record | None = None
 
 
 def _path_time(record: Record) -> Array:
-    """Return the time in the replayed record; constant before the start and after the end of the motion."""
+    """Return the time in the replayed record, which is constant before the start and after the end of the motion."""
     time = np.asarray(record["record_time"], dtype=np.float64) if "record_time" in record else record.time
     known = np.flatnonzero(np.isfinite(time))
     return np.interp(record.time, record.time[known], time[known]) if len(known) else np.zeros(len(record))
@@ -189,7 +189,10 @@ def _at(followed: Record, name: str, at: Array) -> Array:
 
 
 def _with_poses(record: Record, scene: Scene, followed: Record, at: Array, suffix: str) -> Record | None:
-    """Return a record with the poses of all bodies from measured joints or goals (``suffix``); None if some lack."""
+    """Return a record with the poses of all bodies; None if a joint angle is missing.
+
+    The poses are computed from the measured joint angles, or from the goals if ``suffix`` is "_goal".
+    """
     poses = Record(record.time)
     poses.scene = scene
     added: dict[str, Array] = {}
@@ -210,24 +213,25 @@ def _with_poses(record: Record, scene: Scene, followed: Record, at: Array, suffi
 
 
 def recover(folder: Path, out: Path | None = None) -> Record:
-    """Build ``measured.h5`` and ``summary.json`` from the ``measured.part`` of a replay that died, and remove the part.
+    """Build ``measured.h5`` and ``summary.json`` from ``measured.part`` after a replay died, and remove this file.
 
-    The record is marked incomplete. An existing summary belongs to the same replay, which ended but could not write its
-    record: its end state is kept. An existing complete ``measured.h5`` also belongs to the same replay, because files
-    of earlier replays are moved away before, and is kept.
+    The record is marked incomplete. If a summary exists, it belongs to the same replay, which ended but could not write
+    its record; the end state in this summary is kept. If a complete ``measured.h5`` exists, it also belongs to the same
+    replay, because the files of earlier replays are moved away before a replay starts; this file is kept, too.
 
     Parameters
     ----------
     folder : Path
         Folder of the replay.
     out : Path, optional
-        Folder for record and summary, without such files yet; ``folder`` then stays unchanged and may be read-only.
+        Folder for the record and the summary, which must not contain such files yet. In this case ``folder`` is not
+        changed and may be read-only.
 
     Raises
     ------
     RecordError
-        If there is neither a partial nor a complete record, it is empty or cannot be read, its replay is still running,
-        the record cannot be written, or ``out`` already has one.
+        If there is neither a partial nor a complete record, if the partial record is empty or cannot be read, if its
+        replay is still running, if the record cannot be written, or if ``out`` already contains a record.
     """
     part = folder / PART
     try:
@@ -254,7 +258,7 @@ def recover(folder: Path, out: Path | None = None) -> Record:
 
 
 def write_measured(record: Record, summary: dict[str, Any], folder: Path) -> None:
-    """Write record and summary; if one fails, neither is written."""
+    """Write the record and the summary; if one of them cannot be written, write neither."""
     contents: dict[str, bytes | memoryview] = {MEASURED: record.to_hdf5(), SUMMARY: json_text(summary).encode("utf-8")}
     replace_together(folder, contents)
 
@@ -284,7 +288,7 @@ def _read(part: Path) -> Record:
         layout = Layout(**header["layout"])
         kind = row_type(len(layout.joints))
         if header["format"] != PART_FORMAT or header["row"] != json.loads(json.dumps(kind.descr)):
-            raise ValueError("written by another version of dynsim")
+            raise ValueError("it was written by another version of dynsim")
         scene = Scene.from_json(header["scene"]) if header["scene"] else None
     except (ValueError, TypeError, KeyError) as error:
         raise RecordError(f"{part}: is not a partial record of a replay ({error})") from error
@@ -298,7 +302,7 @@ def _read(part: Path) -> Record:
 
 
 def _rows_in_order(rows: Rows) -> Rows:
-    """Return the rows before the first whose time does not increase: a power cut may leave zeros at the end."""
+    """Return the rows before the first row whose time does not increase; a power failure may leave zeros at the end."""
     forward = np.diff(rows["time"], prepend=-np.inf) > 0
     broken = np.flatnonzero(~(forward & np.isfinite(rows["time"])))
     return rows[: broken[0]] if len(broken) else rows

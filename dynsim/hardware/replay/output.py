@@ -1,7 +1,8 @@
-"""States, results and outputs of a replay: stop requests, log file (``tail -f``), recorded cycles, progress bar.
+"""States, results and outputs of a replay: stop requests, log file, recorded cycles, and progress bar.
 
-The control loop keeps its outputs in memory and never waits; a thread writes them to files or a display. Therefore a
-full or slow disk, or a terminal that does not accept output, cannot delay the loop.
+The control loop keeps its outputs in memory and never waits; another thread writes them to files or to a display.
+Therefore a full or slow disk, or a terminal that does not accept output, cannot delay the loop. The log file can be
+followed during the replay (``tail -f``).
 """
 
 from __future__ import annotations
@@ -35,11 +36,11 @@ from dynsim.record.scene import Scene
 from dynsim.system.files import INCOMPLETE, lock
 from dynsim.system.terminal import plain
 
-# Types of a replay: states, stop requests and signal handlers, progress, timing statistics, and the result.
+# Data types for a replay: states, stop requests and signal handlers, progress, timing statistics, and the result.
 
 
 class ReplayState(IntEnum):
-    """State of a replay; recorded in each cycle."""
+    """State of a replay, which is recorded in each cycle."""
 
     CONNECT = 0
     VERIFY = 1
@@ -59,11 +60,11 @@ NOT_ARMED = "not armed"
 HOLDING, LIMP, MOVING = "holding", "limp: off", "moving"
 SILENT, TRIPPED = "does not answer", "watchdog tripped"
 ROBOT_STATES = {HOLDING: "holding", LIMP: "off", SILENT: "unreachable"}
-"""State of the robot if all servos have the same state; states that are missing here keep their names."""
+"""State of the robot if all servos are in the same state; a state that is not listed here keeps its name."""
 
 
 class StopRequest:
-    """Count Ctrl-C and other signals: the first requests a controlled stop, the second requests torque off."""
+    """Counter for Ctrl-C and other signals: the first requests a controlled stop, the second requests torque off."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -86,24 +87,26 @@ def _available(*names: str) -> list[signal.Signals]:
     return [getattr(signal, name) for name in names if hasattr(signal, name)]
 
 
-# Repeated signals of this group count once: if a terminal is closed, both the system and the shell send SIGHUP, and
-# `timeout` sends SIGTERM to the process and to its group, but torque off would let the robot fall.
-# By default these signals would end the process and leave a moving robot to its watchdogs.
+# By default, these signals would end the process and leave a moving robot to its watchdogs. Several signals from this
+# group count as one request, because a second request switches the torque off and would let the robot fall: if a
+# terminal is closed, both the system and the shell send SIGHUP, and `timeout` sends SIGTERM to the process and to its
+# group.
 _STOP_SIGNALS = _available(
     "SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP", "SIGUSR1", "SIGUSR2", "SIGALRM", "SIGVTALRM", "SIGPROF", "SIGXCPU",
     "SIGIO", "SIGPWR", "SIGSTKFLT",
 )  # fmt: skip
-# Signals of a terminal that is gone or not writable, and of a disk quota: ignored, so that only the write fails.
+# Signals that are sent if a terminal no longer exists or cannot be written to, or if a disk quota is exceeded. They are
+# ignored, so that only the write fails.
 _IGNORED_SIGNALS = _available("SIGTTOU", "SIGTTIN", "SIGPIPE", "SIGXFSZ")
 
 
 @contextmanager
 def stop_on_signals(stop: StopRequest) -> Iterator[None]:
-    """Convert signals within the block to stop requests; an exception in a handler would break a bus transaction.
+    """Convert signals within the block to stop requests; an exception in a handler would interrupt a bus transaction.
 
-    Each Ctrl-C counts. SIGTERM, SIGHUP, SIGQUIT (Ctrl-\\), SIGTSTP (Ctrl-Z, which would leave a moving robot without
-    goals) and all other signals that end a process request the controlled stop only. If SIGHUP is ignored (``nohup``),
-    it stays ignored.
+    Each Ctrl-C counts as one request. SIGTERM, SIGHUP, SIGQUIT (Ctrl-\\), SIGTSTP (Ctrl-Z, which would leave a moving
+    robot without goals) and all other signals that end a process request a controlled stop only, however often they are
+    sent. If SIGHUP is ignored (``nohup``), it stays ignored.
     """
 
     def request_stop(*_: Any) -> None:
@@ -119,20 +122,20 @@ def stop_on_signals(stop: StopRequest) -> Iterator[None]:
         yield
     finally:
         for number, handler in before.items():
-            # None means that C code had set the handler, which Python cannot restore.
+            # None means that the handler was set by C code, so that Python cannot restore it.
             if handler is not None:
                 signal.signal(number, handler)
 
 
 def ignore_stops() -> None:
-    """Ignore stop signals, in a process that is ended by its parent process."""
+    """Ignore stop signals in this process, because its parent process handles them and ends it."""
     for number in (signal.SIGINT, *_STOP_SIGNALS):
         signal.signal(number, signal.SIG_IGN)
 
 
 @dataclass(frozen=True)
 class ReplayProgress:
-    """Progress of a replay after a cycle, for a display.
+    """Progress of a replay after a cycle, to be displayed.
 
     Attributes
     ----------
@@ -140,9 +143,9 @@ class ReplayProgress:
     fraction : float
         Completed fraction of the current motion, 0 to 1.
     following_error : float
-        Largest following error of all joints [rad].
+        Largest following error among all joints [rad].
     temperature : float
-        Temperature of the hottest servo [°C]; NaN before it is known.
+        Temperature of the hottest servo [°C]; NaN as long as it is unknown.
     """
 
     state: ReplayState
@@ -160,7 +163,7 @@ class ServoEnd:
     joint : str
     id : int
     torque : bool or None
-        True if the torque is on. None, like the following values, if the servo did not answer.
+        True if the torque is on. This and the following values are None if the servo did not answer.
     error : int or None
         Hardware error register.
     position, velocity : float or None
@@ -191,10 +194,10 @@ class ServoEnd:
 
 
 def robot_state(servos: Sequence[ServoEnd]) -> str:
-    """Return the state of the robot: "holding", "off", "unreachable", or "mixed" with the states of the servos.
+    """Return the state of the robot: "holding", "off", "unreachable", or "mixed: …" with the states of the servos.
 
-    The largest group is counted and the other servos are listed, for example
-    "mixed: 16 holding; wheel1, wheel2 does not answer; elbow limp: overload".
+    For the state that most servos have in common, the text contains only their number; for other states, it lists the
+    joints, for example "mixed: 16 holding; wheel1, wheel2 does not answer; elbow limp: overload".
     """
     groups: dict[str, list[str]] = {}
     for servo in servos:
@@ -229,16 +232,16 @@ class ReplayResult:
     Attributes
     ----------
     end_state : str
-        State of the robot, read at the end: "holding", "off", "mixed: ..." (states of the servos), "unreachable" (no
-        servo answers; armed servos stop by their watchdogs), or "not armed" (nothing was switched on).
+        State of the robot, as read at the end: "holding", "off", "mixed: ..." (states of the servos), "unreachable" (no
+        servo answers; the watchdogs stop armed servos), or "not armed" (no torque was switched on).
     servos : tuple of ServoEnd
-        State of each servo, read at the end.
+        State of each servo, as read at the end.
     faults : list of Fault
         Declared faults, one for each cause; the first fault stopped the motion.
     fault_state : ReplayState | None
         State in which the first fault occurred.
     fault_time : float
-        Time of the first fault on the clock of the replay [s]; NaN without a fault.
+        Time of the first fault on the clock of the replay [s]; NaN if there was no fault.
     policy_goals : list
         (clock time, ID, register value) of each goal that was sent after the fault.
     record : Record
@@ -246,9 +249,9 @@ class ReplayResult:
     timing : Timing
         Empty before the second cycle.
     torque_still_on : tuple of int
-        IDs that did not confirm torque off.
+        IDs of the servos that did not confirm that their torque is off.
     limits : tuple of LimitRow
-        Limits stored in the servos, next to the limits of the map.
+        Limits stored in the servos, next to the limits in the map.
     """
 
     end_state: str = NOT_ARMED
@@ -264,18 +267,18 @@ class ReplayResult:
 
     @property
     def fault(self) -> Fault | None:
-        """Fault that stopped the motion, the most severe of its cycle; None without a fault."""
+        """Fault that stopped the motion, which is the most severe fault of its cycle; None if there was no fault."""
         return self.faults[0] if self.faults else None
 
     @property
     def fault_text(self) -> str:
-        """Text with all faults, the first with the state in which it occurred; empty without a fault."""
+        """Text with all faults, and with the state in which the first one occurred; empty if there was no fault."""
         first = f" in {self.fault_state.name}" if self.fault_state is not None else ""
         texts = [f"{fault.cause}{'' if number else first}: {fault.text}" for number, fault in enumerate(self.faults)]
         return "; ".join(texts)
 
     def summary(self) -> dict[str, Any]:
-        """Return end state and faults for ``summary.json``."""
+        """Return the end state and the faults, to be written to ``summary.json``."""
         summary: dict[str, Any] = {"end_state": self.end_state, "servos": [servo.as_dict() for servo in self.servos]}
         if self.fault is not None:
             summary |= {"fault": self.fault.cause.value, "fault_text": self.fault.text}
@@ -295,7 +298,7 @@ class ReplayResult:
 
 
 def _joined(first: str, second: str) -> str:
-    """Join two texts "servo: problem" of the same cause; an equal problem is written once."""
+    """Join two texts "servo: problem" with the same cause; if the problems are equal, write the problem only once."""
     who, _, text = first.partition(": ")
     other, _, the_same = second.partition(": ")
     return f"{who}, {other}: {text}" if text and text == the_same else f"{first}; {second}"
@@ -310,13 +313,13 @@ class Stopped(Exception):
 
 
 INTERVAL = 0.5
-"""Time between two writes [s]; a killed process loses about this much output."""
+"""Time between two writes [s]; if the process is killed, the output of about this time is lost."""
 PATIENCE = 5.0
-"""Maximum wait for a blocked file or display after the run [s]."""
+"""Maximum time to wait for a blocked file or display after the run [s]."""
 LOG_INTERVAL = 1.0
 """Time between two log lines with the following error [s]."""
 PART = "measured.part"
-"""Name of the file that grows during a run; the measured record replaces it at the end."""
+"""Name of the file to which the rows are written during a run; at the end, the measured record replaces it."""
 PART_FORMAT = 1
 MEASURED, SUMMARY, LOG = "measured.h5", "summary.json", "replay.log"
 REGISTERS, REGISTERS_AFTER_FAULT = "registers.json", "registers_after_fault.json"
@@ -330,7 +333,7 @@ T = TypeVar("T")
 
 @dataclass(eq=False)
 class Journal:
-    """State of a replay, passed to log and observer. The methods do not raise.
+    """State of a replay, which is reported to the log and to an observer. The methods do not raise exceptions.
 
     Attributes
     ----------
@@ -359,20 +362,20 @@ class Journal:
         self._origin = self.clock.now()
 
     def guard(self, name: str, call: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T | None:
-        """Call an output; an error disables it.
+        """Call a function that writes an output; if it fails, disable this output.
 
         Parameters
         ----------
         name : str
             Name of the output in :attr:`failures`.
         call : callable
-            Function to call. A KeyboardInterrupt or SystemExit in it becomes a stop request, so that the program does
-            not leave a moving robot.
+            Function to call. If it raises KeyboardInterrupt or SystemExit, the exception becomes a stop request, so
+            that the program does not abandon a moving robot.
 
         Returns
         -------
         object or None
-            Result of the call; None if it fails or the output is disabled.
+            Result of the call; None if the call fails or the output is disabled.
         """
         if name in self.failures:
             return None
@@ -384,7 +387,7 @@ class Journal:
             self.failures[name] = error
             self.stop()
         if name != "log":
-            self.add_line(f"{name} failed and is disabled: {self.failures[name]!r}")
+            self.add_line(f"{name} failed and is now disabled: {self.failures[name]!r}")
         return None
 
     def enter(self, state: ReplayState) -> None:
@@ -415,9 +418,9 @@ class Journal:
 
     @contextmanager
     def buffered(self) -> Iterator[None]:
-        """Buffer all log lines until the block ends; the observer is not called meanwhile.
+        """Buffer all log lines until the block ends, and do not call the observer in the meantime.
 
-        Therefore a blocked disk or terminal cannot delay the commands to the robot in the block.
+        Therefore a blocked disk or terminal cannot delay the commands that are sent to the robot within the block.
         """
         self._buffer = []
         try:
@@ -440,11 +443,11 @@ Rows = NDArray[np.void]
 
 
 def row_type(servos: int) -> np.dtype[np.void]:
-    """Return the data type of one cycle of ``servos`` servos: packed, in the byte order of the machine.
+    """Return the data type of a row, which stores one cycle of ``servos`` servos, packed and in native byte order.
 
-    ``time``, ``origin`` (clock time of the start of the path, NaN before), ``path_time``, ``lateness`` and ``exchange``
-    are in [s]. Positions [rad], velocities [rad/s] and torques [N·m] of joints are NaN if a status was missed. Supply
-    is in [V], temperature in [°C].
+    ``time``, ``origin`` (clock time at which the path starts; NaN before the start), ``path_time``, ``lateness`` and
+    ``exchange`` are in [s]. Joint positions [rad], velocities [rad/s] and torques [N·m] are NaN if a status was missed.
+    The supply voltage is in [V], the temperature in [°C].
     """
     seconds = ["time", "origin", "path_time", "lateness", "exchange"]
     numbers = ["state", "stray", "skipped"]
@@ -458,7 +461,7 @@ def row_type(servos: int) -> np.dtype[np.void]:
 
 
 class Recorder:
-    """Collect the timed cycles of a replay as immutable rows, which another thread may read meanwhile.
+    """Recorder that stores the cycles of a replay as immutable rows, which another thread may read in the meantime.
 
     Attributes
     ----------
@@ -486,7 +489,7 @@ class Recorder:
         cycle : Cycle
         state : ReplayState
         path_time, origin : float
-            Time along the path, and clock time of its start [s]; NaN before the start.
+            Time along the path, and clock time at which the path starts [s]; NaN before the start.
         """
         if cycle.health:
             for id_, registers in cycle.health.items():
@@ -509,7 +512,7 @@ class Recorder:
 
 @dataclass(frozen=True)
 class Layout:
-    """Names of the columns of rows in a record.
+    """Names of signals and columns under which the data in the rows appear in a record.
 
     Measured signals have the names and labels of the signals that the servos follow; ``<name>_goal`` is the command.
 
@@ -519,7 +522,7 @@ class Layout:
     labels : list of str
         Labels of the columns that the joints follow.
     positions, velocities : list of str
-        Signals that each joint follows; a joint with a fixed angle uses the signals of its kind.
+        Names of the signals that each joint follows; for a joint with a fixed angle, the signals of its kind.
     provenance : dict
     """
 
@@ -541,37 +544,37 @@ class Layout:
         )
 
     def groups(self) -> Iterator[tuple[str, str, list[int]]]:
-        """Yield the name of each signal, "position" or "velocity", and its columns."""
+        """Yield, for each signal, its name, the quantity ("position" or "velocity"), and its columns."""
         for source, names in (("position", self.positions), ("velocity", self.velocities)):
             for name in dict.fromkeys(names):
                 yield name, source, [column for column, other in enumerate(names) if other == name]
 
 
 class Outlet:
-    """Output that writes data of the control loop from memory to a file, or to a display.
+    """Output that transfers data of the control loop from memory to a file or to a display.
 
     Attributes
     ----------
     name : str
     failure : Exception or None
-        Error after which no more data were written.
+        First error; no data are written after it.
     """
 
     name: str
     failure: Exception | None = None
 
     def pump(self) -> None:
-        """Write the data since the last call. After an exception it is not called again."""
+        """Write the data that have been added since the last call. After an exception, it is not called again."""
         raise NotImplementedError
 
     def close(self) -> None:
-        """Close the output after the last call of ``pump``, even if that failed."""
+        """Close the output after the last call of ``pump``, even if this call failed."""
 
 
 class GrowingFile(Outlet):
     """New file that can be read while it grows; it is locked until it is closed.
 
-    See :func:`dynsim.system.files.lock`.
+    The lock is described in :func:`dynsim.system.files.lock`.
 
     Parameters
     ----------
@@ -585,13 +588,13 @@ class GrowingFile(Outlet):
     Raises
     ------
     OSError
-        If the file cannot be created or exists already.
+        If the file cannot be created or already exists.
     """
 
     def __init__(self, name: str, path: Path, pending: Callable[[], bytes], *, durable: bool = False) -> None:
         self.name, self._pending, self._durable = name, pending, durable
         self._path = path
-        # Unbuffered: closing would try to write the content of a buffer again after an error, and fail again.
+        # Do not buffer: after an error, closing the file would try to write the buffer again, and would fail again.
         self._stream = path.open("xb", buffering=0)
         try:
             lock(self._stream.fileno(), wait=False)
@@ -600,7 +603,7 @@ class GrowingFile(Outlet):
             raise
 
     def append(self, data: bytes) -> None:
-        """Write data at the end of the file. Raises OSError."""
+        """Append data to the file. Raises OSError."""
         left = memoryview(data)
         while left:
             left = left[self._stream.write(left) or 0 :]
@@ -615,7 +618,7 @@ class GrowingFile(Outlet):
         self._stream.close()
 
     def discard(self) -> None:
-        """Close and remove the file, if its run does not start."""
+        """Close and remove the file, because the run for which it was created does not start."""
         with suppress(OSError):
             self._stream.close()
         with suppress(OSError):
@@ -672,12 +675,12 @@ def row_stream(path: Path, recorder: Recorder, layout: Layout, scene: Scene | No
 
 
 class Background:
-    """Thread that pumps outlets every ``interval`` [s] and whenever it is woken.
+    """Thread that calls ``pump`` of all outlets every ``interval`` [s] and whenever it is woken.
 
     Raises
     ------
     RuntimeError
-        If the thread cannot be started; the outlets are closed.
+        If the thread cannot be started; the outlets are closed in this case.
     """
 
     def __init__(self, outlets: Sequence[Outlet], interval: float) -> None:
@@ -698,12 +701,12 @@ class Background:
         self._woken.set()
 
     def close(self, patience: float = PATIENCE) -> dict[str, Exception]:
-        """Pump a last time, end the thread, and return failed outlets with their first errors.
+        """Call ``pump`` one last time, end the thread, and return the first error of each outlet that has failed.
 
         Parameters
         ----------
         patience : float
-            Maximum wait [s]; an outlet that takes longer has failed with a TimeoutError.
+            Maximum time to wait [s]; if an outlet takes longer, its error is a TimeoutError.
         """
         self._ending = True
         self.wake()
@@ -752,7 +755,7 @@ def move_away(folder: Path) -> Path | None:
     Raises
     ------
     PortError
-        If another replay is writing to the folder.
+        If another replay is still writing to the folder.
     OSError
         If a file cannot be moved.
     """
@@ -770,7 +773,7 @@ def move_away(folder: Path) -> Path | None:
 
 
 def is_locked(part: Path) -> bool:
-    """Return True if the process that writes a streamed record is alive. Raises OSError."""
+    """Return True if the process that is writing a streamed record is still alive. Raises OSError."""
     try:
         with part.open("rb") as stream:
             return not lock(stream.fileno(), wait=False)
@@ -786,17 +789,17 @@ def _new_folder(folder: Path) -> Path:
     raise AssertionError
 
 
-# Progress bar of a replay, drawn in a separate thread so that a blocked terminal cannot delay the motion.
+# Progress bar of a replay; a separate thread draws it, so that a blocked terminal cannot delay the motion.
 
 
 DRAWING_INTERVAL = 0.1
 """Time between two drawings [s]."""
 DISPLAY_PATIENCE = 1.0
-"""Maximum wait for a blocked terminal after the run [s]."""
+"""Maximum time to wait for a blocked terminal after the run [s]."""
 
 
 class Display(Outlet):
-    """Progress bar with state, following error and temperature; an observer that shows the latest ReplayProgress."""
+    """Progress bar with state, following error and temperature, which shows the latest ReplayProgress of a replay."""
 
     name = "progress bar"
 
@@ -811,7 +814,7 @@ class Display(Outlet):
             console=console,
             transient=True,
             auto_refresh=False,
-            # Output of other threads must not wait for this thread.
+            # Do not redirect: the output of other threads must not wait for this thread.
             redirect_stdout=False,
             redirect_stderr=False,
         )
@@ -841,9 +844,9 @@ class Display(Outlet):
 
 @contextmanager
 def displayed(console: Console, failures: dict[str, BaseException]) -> Iterator[Display | None]:
-    """Show a progress bar within the block; yields None if its thread cannot be started.
+    """Show a progress bar within the block; yield None if the thread that draws it cannot be started.
 
-    An error of the display is added to ``failures`` at the end of the block.
+    If the display has failed, its error is added to ``failures`` at the end of the block.
     """
     display = Display(console)
     try:

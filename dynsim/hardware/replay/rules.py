@@ -38,7 +38,7 @@ from dynsim.hardware.servo_map import MappedServo, Safety, ServoMap
 
 
 class Cause(StrEnum):
-    """Cause of the end of a replay."""
+    """Cause of a fault that ends a replay."""
 
     INTERRUPTED = "interrupted"
     PORT = "port"
@@ -64,7 +64,7 @@ class Cause(StrEnum):
 
 @dataclass(frozen=True)
 class Fault:
-    """One declared fault.
+    """Fault that was declared during a replay.
 
     Attributes
     ----------
@@ -74,7 +74,7 @@ class Fault:
     ids : tuple of int
         IDs of the faulty servos; empty if the fault is not specific to some servos.
     time : float
-        Time of the declaration, on the clock of the replay [s].
+        Time at which the fault was declared, on the clock of the replay [s].
     """
 
     cause: Cause
@@ -85,32 +85,32 @@ class Fault:
 
 @dataclass
 class Cycle:
-    """Commands and measurements of one cycle; arrays have shape (N,), in joint coordinates and the order of the map.
+    """Commands and measurements in one cycle; arrays have shape (N,) and contain joint values in the order of the map.
 
     Attributes
     ----------
     time : float
-        Start of the cycle, on the clock of the replay [s].
+        Start time of the cycle, on the clock of the replay [s].
     goal_position, goal_velocity : array
         Goals [rad], [rad/s].
     position, velocity, torque : array
         Measured values [rad], [rad/s], [N·m]; NaN if the status was missed.
     alert : bool array
-        Alert bits of the statuses.
+        Alert bits in the status packets.
     lateness : float
-        Delay of the start after the deadline [s].
+        Delay of the start of the cycle after its deadline [s].
     skipped : int
         Number of cycles skipped before this one.
     exchange : float
-        Duration of the bus traffic without the health read [s].
+        Duration of the bus traffic, not including the health read [s].
     stray : int
-        Number of bytes outside answers.
+        Number of received bytes that do not belong to answers.
     silence : float
-        Longest time without a packet to the servos, from the previous cycle to the end of this one [s].
+        Longest time without a packet to the servos between the previous cycle and the end of this cycle [s].
     outdated : tuple of int
-        IDs of servos that answered an earlier request instead of this one.
+        IDs of servos that answered an earlier request instead of the request in this cycle.
     health : dict
-        Registers of the servo whose health was read, by ID; empty if none was read.
+        Registers of the servo whose health was read in this cycle, by ID; empty if no health was read.
     """
 
     time: float
@@ -139,9 +139,9 @@ def watchdog_units(safety: Safety) -> int:
 
 
 class AbortRules:
-    """Check the cycles of a replay, from arming to the end of the fault policy.
+    """Checker for the cycles of a replay, from arming until the fault policy has been applied.
 
-    A fault is declared once per servo. Consequences of an earlier fault of a servo are not declared.
+    A fault is declared only once per servo. Faults that result from an earlier fault of a servo are not declared.
     """
 
     def __init__(self, servo_map: ServoMap, plan: CyclePlan) -> None:
@@ -158,17 +158,17 @@ class AbortRules:
         self._declared: set[tuple[Cause, int | None]] = set()
 
     def following_error(self, cycle: Cycle) -> NDArray[np.float64]:
-        """Return commanded minus measured, shape (N,): [rad] in position mode, [rad/s] in velocity mode."""
+        """Return the commanded minus the measured values (N,): [rad] in position mode, [rad/s] in velocity mode."""
         return np.where(
             self._in_position_mode, cycle.goal_position - cycle.position, cycle.goal_velocity - cycle.velocity
         )
 
     def examine(self, cycle: Cycle) -> list[Fault]:
-        """Return the faults that this cycle shows for the first time, the most severe first."""
+        """Return the faults that appear in this cycle for the first time, in order of decreasing severity."""
         missed = cycle.missed
         error = np.abs(self.following_error(cycle))
         self._missed = np.where(missed, self._missed + 1, 0)
-        # A missed status has no error and torque: their counters neither grow nor restart.
+        # If a status is missed, the error and the torque are unknown: their counters are neither increased nor reset.
         self._following = _count(self._following, error > self._following_limit, missed)
         self._torque = _count(self._torque, np.abs(cycle.torque) > self._torque_limit, missed)
         self._late = self._late + 1 if cycle.lateness > self._late_after else 0
@@ -202,19 +202,19 @@ class AbortRules:
             return None
         self._new(Cause.STALL)
         text = (
-            f"stalled for {silence:.2f} s, so the bus watchdogs of the servos ({self._watchdog:.2f} s) have tripped; "
+            f"no packet was sent for {silence:.2f} s, so that the servos' watchdogs ({self._watchdog:.2f} s) tripped; "
             "close other programs, or lower --rate"
         )
         return Fault(Cause.STALL, text)
 
     def _new(self, cause: Cause, id_: int | None = None) -> bool:
-        """Mark a fault as declared and return True if it was not declared before."""
+        """Mark a fault as declared, and return True if it had not been declared before."""
         known = (cause, id_) in self._declared
         self._declared.add((cause, id_))
         return not known
 
     def _newly(self, cause: Cause, indices: Iterable[int]) -> list[MappedServo]:
-        """Mark a fault of some servos as declared and return the servos for which it was not declared before."""
+        """Mark a fault of some servos as declared, and return the servos for which it had not been declared before."""
         return [self._servos[k] for k in indices if self._new(cause, self._servos[k].id)]
 
     def _health(self, servo: MappedServo, registers: dict[str, int]) -> Iterator[Fault]:
@@ -233,12 +233,12 @@ class AbortRules:
                 yield Fault(cause, f"{servo}: {text}", (servo.id,))
         supply = self._safety.supply
         if not supply.lowest <= volts <= supply.highest and self._new(Cause.VOLTAGE):
-            # One supply feeds all servos, so the fault has no IDs and all servos stop synchronously.
+            # All servos have the same supply, so the fault has no IDs and all servos stop synchronously.
             yield Fault(Cause.VOLTAGE, f"{servo}: {volts:.1f} V, allowed {supply.lowest:g} to {supply.highest:g} V")
 
     def _silent(self, indices: NDArray[np.intp], cycle: Cycle) -> Iterator[Fault]:
         if hit := self._newly(Cause.MISSED_STATUS, indices):
-            text = f"no status for {self._safety.missed_cycles} cycles: {', '.join(map(str, hit))}"
+            text = f"no status received for {self._safety.missed_cycles} cycles from {', '.join(map(str, hit))}"
             if outdated := [servo for servo in hit if servo.id in cycle.outdated]:
                 text += f"; answers to earlier requests come from {', '.join(map(str, outdated))}"
             if len(indices) == len(self._servos) > 1:
@@ -248,7 +248,7 @@ class AbortRules:
     def _beyond(
         self, cause: Cause, over: NDArray[np.bool_], values: NDArray[np.float64], quantity: str
     ) -> Iterator[Fault]:
-        # Ignore servos with an earlier fault: a servo without torque or answer is off its goal, too.
+        # Ignore servos with an earlier fault: a servo without torque, or without an answer, is far from its goal, too.
         in_trouble = {id_ for _, id_ in self._declared}
         if hit := self._newly(
             cause, [k for k in map(int, np.flatnonzero(over)) if self._servos[k].id not in in_trouble]

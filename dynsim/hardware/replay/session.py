@@ -1,4 +1,4 @@
-"""Replay session: open the port, run the replay, write its files, and raise its failures as exceptions."""
+"""Replay session: opens the port, runs the replay, writes its files, and raises its failures as exceptions."""
 
 from __future__ import annotations
 
@@ -47,27 +47,27 @@ def run_replay(
 ) -> ReplayResult:
     """Replay a checked motion; write ``measured.h5``, ``summary.json``, ``replay.log`` and register dumps.
 
-    Files of an earlier replay are moved to a subfolder first. During the replay a separate thread writes the log, and
-    the cycles to ``measured.part``: if this process dies, :func:`dynsim.hardware.replay.measured.recover` builds a
-    record from it.
+    Files of an earlier replay are moved to a subfolder first. During the replay, a separate thread writes the log and
+    saves the cycles in ``measured.part``. If this process dies, :func:`dynsim.hardware.replay.measured.recover` can
+    build a record from this file.
 
     Parameters
     ----------
     motion : MotionTask
     servo_map : ServoMap
     connection : context manager
-        Yields bus and clock, see :func:`dynsim.hardware.ports.bus_on`.
+        Context manager that yields the bus and the clock, see :func:`dynsim.hardware.ports.bus_on`.
     folder : Path
         Output folder.
     live : bool
-        If False, the robot does not move.
+        If False, perform a dry run, in which the robot does not move.
     **options
-        Further options of :class:`dynsim.hardware.replay.machine.Replay`.
+        Further options for :class:`dynsim.hardware.replay.machine.Replay`.
 
     Raises
     ------
     PortError, VerificationFailed
-        If nothing was armed.
+        If the replay failed before any servo was armed.
     ReplayInterrupted
         If a signal stopped the run.
     ReplayAborted
@@ -94,7 +94,7 @@ def run_replay(
         if not isinstance(error, Exception):
             _save(result, folder, failures)
             raise
-        # The end state of the result is valid; only closing the port has failed.
+        # The result and its end state are valid, because only closing the port has failed.
         failures["port"] = error
     _save(result, folder, failures)
     raise_for(result, folder, failures)
@@ -116,12 +116,12 @@ def shown_by(folder: Path) -> Iterator[Failures]:
     Yields
     ------
     failures : dict
-        The block adds other failures to it.
+        Dictionary to which the block adds other failures.
 
     Raises
     ------
     OutputsFailed
-        If there are failures and the block has raised nothing; otherwise they are a warning.
+        If there are failures and the block has raised no error; if it has raised an error, a warning reports them.
     """
     failures: Failures = {}
     try:
@@ -130,7 +130,7 @@ def shown_by(folder: Path) -> Iterator[Failures]:
         _flush(failures)
         if failures:
             warnings.warn(_failure_text(failures), stacklevel=3)
-            # With other errors the summary may belong to an earlier replay.
+            # After other errors, the summary may belong to an earlier replay.
             if isinstance(error, ReplayAborted | OutputsFailed):
                 _add_to_summary(folder, failures)
         raise
@@ -167,7 +167,7 @@ def _open_outputs(replay: Replay, folder: Path) -> Background:
         files.append(row_stream(folder / PART, replay.recorder, replay.layout, replay.motion.scene))
         background = Background(files, INTERVAL)
     except (OSError, RuntimeError) as error:
-        # Remove the empty files, which would look like a replay that died.
+        # Remove the empty files; otherwise they would look like the files of a replay that died.
         for file in files:
             file.discard()
         reason = getattr(error, "strerror", None) or error
@@ -179,7 +179,7 @@ def _open_outputs(replay: Replay, folder: Path) -> Background:
 
 
 def _save(result: ReplayResult, folder: Path, failures: Failures) -> None:
-    """Write record and summary, and remove the streamed record that they replace; add errors to ``failures``."""
+    """Write the record and the summary, remove the streamed record that they replace; add errors to ``failures``."""
     try:
         if RECORD not in failures:
             summary = result.record.summary | {"outputs_failed": _messages(failures)}
@@ -194,7 +194,7 @@ def _save(result: ReplayResult, folder: Path, failures: Failures) -> None:
             failures[f"removal of {PART}"] = error
             _add_to_summary(folder, failures)
         return
-    # Write the end state of the robot even if there is no space for its record.
+    # Write the end state of the robot even if there is no space for the record.
     try:
         write_json(folder / SUMMARY, result.summary() | {"outputs_failed": _messages(failures)})
     except Exception as error:
@@ -210,7 +210,7 @@ def _failure_text(failures: Failures) -> str:
 
 
 def raise_for(result: ReplayResult, folder: Path, failures: Failures) -> None:
-    """Raise the exception of a fault or of failed outputs, with its exit code.
+    """Raise the exception that corresponds to the fault or to failed outputs; return if there are none.
 
     Raises
     ------

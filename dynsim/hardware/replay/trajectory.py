@@ -1,7 +1,7 @@
-"""Motions of servos as functions of time, and the trajectory of servo goals from a record.
+"""Motions of servos as functions of time, and the trajectory of servo goals that is built from a record.
 
-The trajectory is continuous in time and starts and ends at rest. Between the samples of a record, joint angles are the
-cubic Hermite interpolant of (q, v), or linear if the record holds its rates from sample to sample (a sampled
+The trajectory is continuous in time, and starts and ends at rest. Between the samples of a record, joint angles are the
+cubic Hermite interpolant of (q, v), or linear functions if the record holds its rates from sample to sample (a sampled
 controller). If the record starts or ends in motion, an interval of constant acceleration is added (a parabola, which
 the interpolant represents exactly), so that the robot starts and ends at rest without a jump in velocity.
 """
@@ -22,13 +22,13 @@ from dynsim.hardware.servo_map import MappedServo, ServoMap
 from dynsim.record import TIME, Record
 from dynsim.snake.lifting import grounded_pairs, lifted
 
-# Motions of servos: postures as functions of time, the advance of the loop along them, and demands on the servos.
+# Motions of servos: postures as functions of time, how the loop advances along them, and their demands on the servos.
 
 
 Array = NDArray[np.float64]
 
 QUINTIC_PEAK = 1.875
-"""Maximum rate of :func:`quintic`, multiplied by its duration."""
+"""Maximum rate of :func:`quintic`, multiplied by the duration of the move."""
 
 
 class Motion(Protocol):
@@ -39,7 +39,7 @@ class Motion(Protocol):
 
 
 class GoalCourse:
-    """Advance of the loop along a motion, by one period from goal to goal, independent of the clock.
+    """Progress of the control loop along a motion: one period from goal to goal, independent of the clock.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ class GoalCourse:
 
     @property
     def fraction(self) -> float:
-        """Completed fraction of the motion, 0 to 1."""
+        """Completed fraction of the motion, from 0 to 1."""
         return min(1.0, max(0.0, self.time / (self.end or 1.0)))
 
     def at(self, time: float) -> tuple[Array, Array]:
@@ -83,20 +83,20 @@ class GoalCourse:
         May raise :class:`~dynsim.hardware.replay.output.Stopped`.
         """
         self._goals += 1
-        # Use the scheduled time: jitter of the loop must not affect the goals.
+        # Use the scheduled time, because jitter of the loop must not affect the goals.
         self.time = min(self.end, self._start + self.speed * period * self._goals)
         position, rate = self.at(self.time)
         return position, self.speed * rate
 
     def braking_time(self, stop_time: float) -> float:
-        """Return the time [s] of a stop along the motion at constant deceleration; ``stop_time`` [s] is desired."""
-        # If the motion ends earlier, it ends at rest.
+        """Return how long a stop along the motion at constant deceleration takes [s]; ``stop_time`` is desired [s]."""
+        # If the motion ends before the stop does, it ends at rest anyway.
         return stop_time
 
 
 @dataclass(frozen=True)
 class Needs:
-    """Demands of a motion on one joint: lowest and highest angle [rad], maximum speed [rad/s]."""
+    """Demands of a motion on one joint: its lowest angle, highest angle [rad] and maximum speed [rad/s]."""
 
     low: float
     high: float
@@ -105,7 +105,7 @@ class Needs:
 
 @dataclass(frozen=True)
 class CyclePlan:
-    """Time budget of the bus.
+    """Time budget of the bus in each cycle.
 
     Attributes
     ----------
@@ -114,7 +114,7 @@ class CyclePlan:
     cycle_time : float
         Planned duration of writing all goals and reading all states [s].
     health_every : int
-        Number of cycles per health read of one servo.
+        Number of cycles from one health read to the next; each reads the health of one servo.
     """
 
     rate: float
@@ -124,7 +124,7 @@ class CyclePlan:
 
 @dataclass(frozen=True)
 class Approach:
-    """Synchronous rest-to-rest move of all joints between two postures on a quintic.
+    """Synchronous rest-to-rest move of all joints between two postures; the joint angles follow a quintic polynomial.
 
     Attributes
     ----------
@@ -144,7 +144,10 @@ class Approach:
 
 
 def quintic(duration: float, time: float) -> tuple[float, float]:
-    """Return the fraction s of a rest-to-rest move and its rate [1/s]: s = 10u³ − 15u⁴ + 6u⁵, u = time/duration."""
+    """Return the completed fraction s of a rest-to-rest move, and its rate [1/s].
+
+    s = 10u³ − 15u⁴ + 6u⁵ with u = time/duration.
+    """
     if duration <= 0:
         return 1.0, 0.0
     u = min(max(time / duration, 0.0), 1.0)
@@ -152,28 +155,28 @@ def quintic(duration: float, time: float) -> tuple[float, float]:
 
 
 REST = 1e-6
-"""Joint speed [rad/s] below which a record counts as at rest."""
+"""A record counts as at rest if its joint speeds are below this value [rad/s]."""
 GAP_FACTOR, LONG_FACTOR = 2.5, 1.5
-"""A time step of more than GAP_FACTOR times the median is a gap, in which the motion is unknown. A step of more than
-LONG_FACTOR times the quantile LONG_QUANTILE probably lacks samples (the median step may itself lack samples)."""
+"""A time step longer than GAP_FACTOR times the median is a gap, in which the motion is unknown. In a step longer than
+LONG_FACTOR times the quantile LONG_QUANTILE, samples are probably missing (even the median step may lack samples)."""
 LONG_QUANTILE = 0.1
 JERK_WINDOW = 0.1
-"""Time over which the jerk is averaged [s]: about twice the lag of these servos (43.5 ms). The limit on acceleration
-bounds a single jump in velocity; repeated jumps wear the gears."""
+"""Time over which the jerk is averaged [s]: about twice the lag of these servos (43.5 ms). The acceleration limit
+bounds a single jump in velocity; the jerk limit bounds repeated jumps, which wear the gears."""
 GROUNDED = "grounded"
-"""Signal of dynsim records with the wheel pairs on the ground; used if the map has no ``lifts``."""
+"""Signal in dynsim records that states which wheel pairs are on the ground; it is used if the map has no ``lifts``."""
 SHAKING_WINDOW = 0.3
-"""Time within which a change of velocity that is reversed counts as shaking [s]."""
+"""A change of velocity counts as shaking if it is reversed within this time [s]."""
 
 
 @dataclass(frozen=True)
 class Path:
-    """Joint angles over path time.
+    """Joint angles as functions of the path time.
 
     Attributes
     ----------
     time : array, shape (T,)
-        Knots [s]; 0 is the first sample of the record, negative knots are the run-up.
+        Times of the knots [s]; 0 is the time of the first sample of the record, and negative times are in the run-up.
     position : array, shape (T, N)
         Joint angles at the knots [rad], in the order of the servo map.
     rate_after, rate_before : array, shape (T-1, N)
@@ -194,7 +197,7 @@ class Path:
         return float(self.time[-1])
 
     def at(self, time: float) -> tuple[Array, Array]:
-        """Return position [rad] and velocity [rad/s], shape (N,), at a path time [s]; at rest outside the path."""
+        """Return the position [rad] and velocity [rad/s] at a path time [s], shape (N,); at rest outside the path."""
         if time <= self.time[0]:
             return self.position[0].copy(), np.zeros(self.position.shape[1])
         if time >= self.time[-1]:
@@ -205,12 +208,12 @@ class Path:
         return q0 + s * (m0 + s * (b + s * a)), (m0 + s * (2 * b + 3 * s * a)) / h
 
     def since(self, time: float, more: int) -> Path:
-        """Return the part of the path from ``more`` knots before the last knot that is not after ``time`` [s]."""
+        """Return the end of the path; it starts ``more`` knots before the last knot that is not after ``time`` [s]."""
         first = max(0, int(np.searchsorted(self.time, time, side="right")) - 1 - more)
         return Path(self.time[first:], self.position[first:], self.rate_after[first:], self.rate_before[first:])
 
     def longer(self, time: float, position: Array, rate_after: Array, rate_before: Array) -> Path:
-        """Return the path with one more knot; the rates are at the start and the end of the new interval."""
+        """Return the path with one more knot; the two rates apply at the start and the end of the new interval."""
         return Path(
             np.append(self.time, time),
             np.vstack([self.position, position]),
@@ -219,7 +222,7 @@ class Path:
         )
 
     def _cubics(self, k: int | slice) -> tuple[Array, ...]:
-        """Return h [s], q0, m0, b, a of intervals, where q = q0 + m0 s + b s² + a s³ with s from 0 to 1."""
+        """Return h [s], q0, m0, b and a for some intervals, where q = q0 + m0 s + b s² + a s³ with s from 0 to 1."""
         h = (self.time[1:][k] - self.time[:-1][k])[..., None]
         q0, q1 = self.position[:-1][k], self.position[1:][k]
         m0, m1 = h * self.rate_after[k], h * self.rate_before[k]
@@ -228,14 +231,14 @@ class Path:
     def extremes(self, since: float = -math.inf) -> Extremes:
         """Return candidates for the extreme positions, velocities and accelerations of each interval.
 
-        The acceleration q'' = (2b + 6a s)/h² is linear in an interval of length h, s = (t − t_k)/h, so its extremes are
-        at the two ends. If the rate has a step, the step divided by its time is the third candidate. Only intervals
-        that end after ``since`` [s] are included.
+        In an interval of length h, with s = (t − t_k)/h, the acceleration q'' = (2b + 6a s)/h² is linear, so its
+        extremes are at the two ends. If there is a step in the rate, the step divided by its time is the third
+        candidate. Only intervals that end after ``since`` [s] are included.
         """
         late = slice(max(0, int(np.searchsorted(self.time, since, side="right")) - 1), None)
         h, q0, m0, b, a = self._cubics(late)
-        # Position is extreme at 3a s² + 2b s + m0 = 0, velocity at 6a s + 2b = 0. The root has the form without
-        # cancellation; an interval without a root uses its start instead.
+        # The position is extreme where 3a s² + 2b s + m0 = 0, the velocity where 6a s + 2b = 0. The root is computed in
+        # a form without cancellation; if an interval has no root, its start is used instead.
         with np.errstate(divide="ignore", invalid="ignore"):
             root = b + np.where(b < 0, -1.0, 1.0) * np.sqrt(b * b - 3 * a * m0)
             at_position = np.stack([np.zeros_like(a), np.ones_like(a), -root / (3 * a), -m0 / root])  # (4, T-1, N)
@@ -252,10 +255,10 @@ class Path:
 
     @cached_property
     def _steps(self) -> Array:
-        """Acceleration of the step in rate at the start of each interval [rad/s²], shape (T-1, N).
+        """Acceleration for the step in the rate at the start of each interval [rad/s²], shape (T-1, N).
 
-        A rate that is held from sample to sample is assigned to the middle of its interval, so the step between two
-        rates takes half of each interval. The first interval has no step.
+        A rate that is held from sample to sample is assigned to the middle of its interval. Therefore the step between
+        two rates lasts for half of each of the two intervals. The first interval has no step.
         """
         h = np.diff(self.time)[:, None]
         steps = np.zeros_like(self.rate_after)
@@ -263,12 +266,13 @@ class Path:
         return steps
 
     def jerk(self, window: float, since: float = -math.inf) -> tuple[Array, Array]:
-        """Return the maximum of the mean magnitude of the jerk over ``window`` [s] of path time.
+        """Return the largest mean magnitude of the jerk in a window that is ``window`` [s] of path time long.
 
-        j(t) = (1/window) Σ |a_{k+1} − a_k| over the knots between t − window and t, where a_k is the mean acceleration
-        of the interpolant on both sides of knot k, plus the step in rate there. It is the mean of |d³q/dt³| for a
-        smooth path, 4 |a| f for an oscillation at f [Hz], whatever the window, and Δa/window for a single jump. Between
-        knots, a is linear. Only windows that end after ``since`` [s] are included.
+        j(t) = (1/window) Σ |a_{k+1} − a_k|, where the sum is over the knots between t − window and t. a_k is the mean
+        of the accelerations of the interpolant on both sides of knot k, plus the acceleration for the step in the rate
+        at this knot; between knots, a is linear. j is the mean of |d³q/dt³| for a smooth path, 4 |a| f for an
+        oscillation at f [Hz], whatever the window, and Δa/window for a single jump. Only windows that end after
+        ``since`` [s] are included.
 
         Returns
         -------
@@ -289,11 +293,11 @@ class Path:
     def shaking(self, window: float, since: float = -math.inf) -> tuple[Array, Array]:
         """Return the maximum change of velocity that is reversed within ``window`` [s] of path time.
 
-        It is min(P, N) with P = ∫ max(q'', 0) dt and N = ∫ max(−q'', 0) dt over the window, including steps in rate. It
-        does not depend on a constant velocity of the joint. A zigzag of d every h has d · window/h² if the window
-        contains many teeth; a spike of d within 2h (out in h, back in h) has 2d/h with held rates. A single move gains
-        and loses its maximum speed once, which counts if the move is not longer than the window. Only windows that end
-        after ``since`` [s] are included.
+        It is min(P, N) with P = ∫ max(q'', 0) dt and N = ∫ max(−q'', 0) dt over the window, including steps in the
+        rate. It does not depend on a constant velocity of the joint. For a zigzag of d every h, it is d · window/h² if
+        the window contains many teeth; for a spike of d within 2h (out in h, back in h) with held rates, it is 2d/h. A
+        single move gains and loses its maximum speed once, which counts if the move is not longer than the window. Only
+        windows that end after ``since`` [s] are included.
 
         Returns
         -------
@@ -308,7 +312,7 @@ class Path:
             # q'' is linear in an interval; if it changes sign, the rate has an extreme inside the interval.
             turning = self.rate_after + 0.5 * h * first * (first / (first - last))
             turning = np.where(first * last < 0, turning, self.rate_before)
-            # Gain before and after the extreme of the rate, and in the step at the end of the interval.
+            # Sum of the gains before and after the extreme of the rate, and in the step at the end of the interval.
             gained = np.maximum(turning - self.rate_after, 0.0) + np.maximum(self.rate_before - turning, 0.0)
             change, step = self.rate_before - self.rate_after, self.rate_after[1:] - self.rate_before[:-1]
             gained[:-1] += np.maximum(step, 0.0)
@@ -325,10 +329,10 @@ class Path:
         return 2 * b / h / h, (2 * b + 6 * a) / h / h
 
     def _within(self, total: Array, window: float, since: float) -> tuple[Array, Array]:
-        """Return the ends of windows (M,) [s] and the growth of ``total``, a running sum at the knots, in them (M, N).
+        """Return the end times of windows (M,) [s], and by how much ``total`` grows in each window (M, N).
 
-        The growth is linear between windows that start or end at a knot, and not larger for a window that extends
-        beyond the path.
+        ``total`` is a running sum at the knots. Only windows that start or end at a knot are needed: in between, the
+        growth is linear. A window that extends beyond the path does not have a larger growth.
         """
         ends = np.concatenate([self.time, self.time + window])
         ends = ends[(ends > since) & (ends <= self.end)]
@@ -336,19 +340,19 @@ class Path:
             return ends, self._interpolated(total, ends) - self._interpolated(total, ends - window)
 
     def _interpolated(self, values: Array, times: Array) -> Array:
-        """Interpolate values at the knots (T, N) linearly to other times (M, N); before the path the first is used."""
+        """Interpolate values at the knots (T, N) linearly to other times (M, N); before the path, use the first."""
         left = np.maximum(np.searchsorted(self.time[:-1], times, side="right") - 1, 0)
         fraction = np.maximum((times - self.time[left]) / (self.time[left + 1] - self.time[left]), 0.0)[:, None]
         return values[left] + fraction * (values[left + 1] - values[left])
 
     def _worst(self, ends: Array, values: Array) -> tuple[Array, Array]:
-        """Return the largest value of each joint and the end of its window."""
+        """Return the largest value for each joint, and the end time of the window in which it occurs."""
         worst = values.argmax(axis=0)
         return values[worst, np.arange(values.shape[1])], ends[worst]
 
 
 class Extremes(NamedTuple):
-    """Candidates for extreme values and their path times, each of shape (candidates, T-1, N)."""
+    """Candidates for extreme values, and their path times; all arrays have the shape (candidates, T-1, N)."""
 
     position_time: Array
     position: Array
@@ -359,13 +363,13 @@ class Extremes(NamedTuple):
 
 
 def path_of_record(record: Record, servo_map: ServoMap) -> Path:
-    """Build the path from the columns that the servos follow, with both ends at rest.
+    """Build the path from the record columns that the servos follow; it starts and ends at rest.
 
     Raises
     ------
     CheckRefused
-        If a signal or column is missing, time does not increase or has gaps, a value is not finite, or the record is
-        too short.
+        If a signal or column is missing, if the time does not increase or has gaps, if a value is not finite, or if the
+        record is too short.
     """
     _check_time(record)
     time = record.time - record.time[0]
@@ -406,14 +410,14 @@ def _check_time(record: Record) -> None:
     if gaps := long_steps(record, GAP_FACTOR, 0.5):
         raise CheckRefused(
             f"the record has {len(gaps)} gap(s) in which the motion is unknown: {gaps[0]}; "
-            "simulate with an even step, or cut the record"
+            "simulate with a uniform time step, or cut the record"
         )
 
 
 def long_steps(record: Record, factor: float, share: float) -> list[str]:
     """Return a description of each time step that is longer than ``factor`` times the usual step.
 
-    The usual step is the quantile ``share`` of all steps; 0.5 is the median.
+    The usual step is the quantile ``share`` of all steps; a ``share`` of 0.5 is the median.
     """
     steps = np.diff(record.time)
     usual = float(np.quantile(steps, share, method="lower"))
@@ -430,7 +434,7 @@ def column_of(record: Record, signal: str, servo: MappedServo, unit: str) -> Arr
     Raises
     ------
     CheckRefused
-        If the signal or column does not exist or has another unit, or a value is not finite.
+        If the signal or column does not exist, has another unit, or contains a value that is not finite.
     """
     if signal not in record:
         raise CheckRefused(
@@ -458,14 +462,14 @@ def column_of(record: Record, signal: str, servo: MappedServo, unit: str) -> Arr
 
 
 def wheel_offsets(record: Record, servo_map: ServoMap) -> dict[str, Array]:
-    """Return the angles that lifting adds to the joints in ``lifts`` of the map, shape (T,) each [rad].
+    """Return the angles [rad] that are added to joints to lift wheels, by joint name, each of shape (T,).
 
     The result is empty if the map has no ``lifts``.
 
     Raises
     ------
     CheckRefused
-        If the record lifts wheels and the map has no ``lifts``, or it lifts wheels that cannot be lifted.
+        If the record lifts wheels but the map has no ``lifts``, or if it lifts wheels that cannot be lifted.
     """
     lifts = servo_map.lifts
     if lifts is None:
@@ -481,8 +485,8 @@ def _refuse_lifted_wheels(record: Record) -> None:
     if len(up):
         names = ", ".join(record.labels[GROUNDED][k] for k in up)
         raise CheckRefused(
-            f"the record lifts wheel pairs ({names}) but the servo map has no 'lifts', so they would drag over the "
-            "floor; add to the map, for example:\n"
+            f"the record lifts wheel pairs ({names}) but the servo map has no 'lifts', so they would drag on the "
+            "floor; add this entry to the map, for example:\n"
             "  lifts: {joints: [psi3, psi4, psi5, psi6, psi7, psi8], clearance_mm: 5, blend_s: 0.3}"
         )
 

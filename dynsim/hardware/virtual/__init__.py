@@ -1,1 +1,1 @@
-"""Virtual servos: registers and motion, serial line, scripted faults, and the plant that they drive."""
+"""Virtual servos: their registers and motion, the serial line, scripted faults, and the plant that the servos drive."""

@@ -1,4 +1,4 @@
-"""Fault scripts of virtual servos: kind, servo, time and probability of each fault, reproducible by a seed."""
+"""Fault scripts for virtual servos: kind, servo, time and probability of each fault; a seed makes them reproducible."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ Probability = Annotated[float, Field(ge=0, le=1)]
 
 
 class _Timed(StrictConfig):
-    """Fault that is active from ``at`` [s after the first torque enable] for ``duration`` [s].
+    """Fault that is active from ``at`` [s after the torque of any servo is first enabled] for ``duration`` [s].
 
-    Without ``at`` it is always active; without ``duration`` it does not end.
+    A fault without ``at`` is always active; a fault without ``duration`` does not end.
     """
 
     at: Annotated[float, Field(ge=0)] | None = None
     duration: Annotated[float, Field(gt=0)] | None = None
 
     def active(self, since_torque: float) -> bool:
-        """Return True if the fault is active ``since_torque`` [s] after the first torque enable (−∞ before it)."""
+        """Return True if the fault is active ``since_torque`` [s] after torque was first enabled (−∞ if never)."""
         start, end = self.span
         return start <= since_torque < end
 
@@ -38,7 +38,7 @@ class _Timed(StrictConfig):
 
 
 class LineFault(_Timed):
-    """Damage to the status packets of one servo, or of all servos without ``id``."""
+    """Damage to the status packets of one servo, or of all servos if there is no ``id``."""
 
     kind: Literal["lost_status", "truncated_status", "bad_crc", "noise"]
     id: int | None = None
@@ -46,7 +46,7 @@ class LineFault(_Timed):
 
 
 class LateStatus(_Timed):
-    """Status packets that are delayed by ``delay`` [s]; with n periods, cycle k + n receives the answer of cycle k."""
+    """Delay of status packets by ``delay`` [s]; if this is n periods, cycle k + n receives the answer to cycle k."""
 
     kind: Literal["late_status"]
     id: int | None = None
@@ -55,20 +55,20 @@ class LateStatus(_Timed):
 
 
 class PortFault(_Timed):
-    """An adapter that echoes all sent bytes, or is unplugged."""
+    """Fault of the adapter: it echoes all bytes that are sent, or is unplugged."""
 
     kind: Literal["echo", "unplug"]
 
 
 class ServoFault(_Timed):
-    """Duplicate ID, loss of power or cable, restart, shutdown after an error, tripped watchdog, or jam of a servo."""
+    """Fault of one servo: duplicate ID, lost power or cable, restart, shutdown by an error, watchdog trip, or jam."""
 
     kind: Literal["duplicate_id", "drop_off", "reboot", "overload", "overheat", "watchdog_trip", "stuck"]
     id: int
 
 
 class WrongRegister(_Timed):
-    """A servo that does not match the map: its register contains ``value``."""
+    """Servo that does not match the map, because one of its registers contains ``value``."""
 
     kind: Literal["wrong_model", "wrong_firmware", "wrong_mode"]
     id: int
@@ -92,14 +92,14 @@ class AngleFault(_Timed):
 
 
 class VoltageSag(_Timed):
-    """A drop of the supply voltage by ``drop`` [V]."""
+    """Drop in the supply voltage by ``drop`` [V]."""
 
     kind: Literal["voltage_sag"]
     drop: Annotated[float, Field(gt=0)]
 
 
 class SupplyLoss(_Timed):
-    """Loss of supply for ``duration`` [s]: all servos lose torque and do not answer, then restart from their EEPROM."""
+    """Loss of the supply for ``duration`` [s]: no servo has torque or answers; later all restart from their EEPROM."""
 
     kind: Literal["supply_loss"]
     at: Annotated[float, Field(ge=0)]
@@ -107,7 +107,7 @@ class SupplyLoss(_Timed):
 
 
 class TemperatureRamp(_Timed):
-    """A servo that warms by ``heating_rate`` [K/s] in addition to its losses."""
+    """Warming of a servo by ``heating_rate`` [K/s], in addition to the warming caused by its losses."""
 
     kind: Literal["temperature_ramp"]
     id: int
@@ -129,12 +129,12 @@ Fault = Annotated[
 
 
 class FaultScript(StrictConfig):
-    """Faults of one run.
+    """Faults to be injected in one run.
 
     Attributes
     ----------
     seed : int
-        Seed of all random choices.
+        Seed for all random choices.
     faults : list
     """
 
@@ -143,7 +143,7 @@ class FaultScript(StrictConfig):
 
     @model_validator(mode="after")
     def _servos_are_there(self, info: ValidationInfo) -> FaultScript:
-        """Reject faults of unknown servos, if the IDs are in the validation context ``{"ids": ...}``."""
+        """Reject faults of unknown servos if the known IDs are passed in the validation context as ``{"ids": ...}``."""
         ids = info.context["ids"] if info.context else None
         for number, fault in enumerate(self.faults):
             id_ = getattr(fault, "id", None)
@@ -160,11 +160,11 @@ def load_fault_script(path: str | Path, ids: Collection[int] | None = None) -> F
     ----------
     path : str or Path
     ids : collection of int, optional
-        Allowed servo IDs; default: any.
+        Allowed servo IDs; by default, all IDs are allowed.
 
     Raises
     ------
     ServoMapError
-        If the file is missing, is not YAML or has an invalid entry; the message has file and line.
+        If the file is missing, is not YAML or has an invalid entry; the message states the file and the line.
     """
     return read_yaml(Path(path), FaultScript, {"ids": ids})

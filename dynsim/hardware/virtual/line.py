@@ -1,7 +1,8 @@
-"""A virtual half-duplex line with servos, a port of the client library on it, and a pseudo-terminal for other programs.
+"""Virtual half-duplex line with servos, its port for the client library, and its pseudo-terminal for other programs.
 
-The line accepts the bytes of requests and returns the bytes of answers with their arrival times. :class:`VirtualPort`
-connects it to the client library, and :class:`PseudoTerminal` to a serial device.
+The line accepts the bytes of requests, and returns the bytes of answers with their arrival times.
+:class:`VirtualPort` connects it to the client library, and :class:`PseudoTerminal` makes it available as a serial
+device.
 """
 
 from __future__ import annotations
@@ -32,9 +33,9 @@ from dynsim.hardware.virtual.simulated_plant import ServoPlant
 BYTE_TIMEOUT = 5e-3
 """Maximum pause within a packet [s] (unverified)."""
 TURNAROUND = 20e-6
-"""Time before the answer of a servo in addition to its return delay [s] (unverified)."""
+"""Time before a servo answers, in addition to its return delay [s] (unverified)."""
 ADAPTER_LATENCY = 1e-3
-"""Delay from the line to the reader: a USB adapter with a latency timer of 1 ms [s]."""
+"""Delay from the line to the reader [s], as for a USB adapter with a latency timer of 1 ms."""
 
 Listener = Callable[[float, Packet], None]
 
@@ -49,11 +50,11 @@ class VirtualLine:
     positions : sequence of float
         Initial servo angles [rad], 0 at tick 0.
     plant : ServoPlant, optional
-        Plant that the servos drive; default: a separate inertia for each servo.
+        Plant that the servos drive; by default, each servo drives a separate inertia.
     script : FaultScript, optional
         Scripted faults.
     listener : callable, optional
-        Called with (time, packet) for each valid packet that a servo can receive.
+        Function that is called with (time, packet) for each valid packet that a servo can receive.
     """
 
     def __init__(
@@ -75,7 +76,7 @@ class VirtualLine:
 
     @property
     def time(self) -> float:
-        """Time of the servos [s]."""
+        """Simulated time of the servos [s]."""
         return self.servos.time
 
     def advance(self, now: float) -> None:
@@ -85,7 +86,7 @@ class VirtualLine:
             self.servos.inject()
 
     def transmit(self, data: bytes, start: float, baud: int) -> list[tuple[float, bytes]]:
-        """Send bytes on the line.
+        """Send bytes over the line.
 
         Parameters
         ----------
@@ -98,7 +99,7 @@ class VirtualLine:
         Returns
         -------
         list of (float, bytes)
-            Arrival time of the last byte at the reader [s], and bytes of each answer.
+            Arrival time of the last byte of each answer at the reader [s], and the bytes of this answer.
 
         Raises
         ------
@@ -115,7 +116,7 @@ class VirtualLine:
         # An incomplete packet is discarded after a pause.
         expired = start - self._last_byte > BYTE_TIMEOUT
         self._last_byte = end
-        # The bytes are noise for servos with another bit rate.
+        # For servos with another bit rate, the bytes are noise.
         if baud in self.servos.baud_groups:
             decoder = self._decoders.setdefault(baud, Decoder())
             packets = [*decoder.flush()] if expired else []
@@ -171,14 +172,14 @@ class VirtualLine:
 
 
 def line_for_map(servo_map: ServoMap, **options: Any) -> VirtualLine:
-    """Build a line with the servos of a map, configured as the map requires.
+    """Build a line with the servos of a map, which are configured as the map requires.
 
     Parameters
     ----------
     servo_map : ServoMap
     **options
-        ``posture``: initial angles by joint [rad], default: zero or the fixed angle in the map; other options are
-        passed to :class:`VirtualLine`.
+        ``posture`` contains initial angles by joint [rad]; the default is the fixed angle in the map, or zero. All
+        other options are passed to :class:`VirtualLine`.
     """
     posture = options.pop("posture", {})
     angles, servos = [], {}
@@ -193,14 +194,14 @@ def line_for_map(servo_map: ServoMap, **options: Any) -> VirtualLine:
     return VirtualLine(servos, positions=angles, **options)
 
 
-# Port of virtual servos for the client library.
+# Port through which the client library communicates with virtual servos.
 
 
 class VirtualPort(PortHandler):
-    """Port of the client library on a :class:`VirtualLine`, with a clock that starts at 0.
+    """Port that connects the client library to a :class:`VirtualLine`; its clock starts at 0.
 
-    With a virtual clock the port never waits: a read without available bytes advances the clock to the next byte or to
-    the time-out.
+    With a virtual clock, the port never waits: if no bytes are available, a read advances the clock to the next byte or
+    to the time-out.
     """
 
     POLL = 1e-5
@@ -263,25 +264,25 @@ class VirtualPort(PortHandler):
             self._input += self._arriving.popleft()[1]
 
 
-# Virtual servos on a pseudo-terminal, which other programs open as a serial device.
+# Virtual servos on a pseudo-terminal, which other programs can open like a serial device.
 
 
 _BAUD_BY_CODE = {
     getattr(termios, name): int(name[1:]) for name in dir(termios) if name[0] == "B" and name[1:].isdigit()
 }
 _TCGETS2 = 0x802C542A
-"""Linux request for terminal settings with a numeric bit rate, because clients may use rates without a code."""
+"""Linux request for terminal settings with a numeric bit rate; clients may use bit rates that have no code."""
 _OUTPUT_SPEED = slice(40, 44)
 IDLE = 1e-3
-"""Maximum wait for bytes before the servos are advanced [s]; short, so that little is left to compute at a request."""
+"""Maximum time to wait for bytes before the servos are advanced [s]; if it is short, requests are answered quickly."""
 
 
 STALL = 10e-3
-"""Maximum pause of this process that counts as time of the servos [s]; the rest of a longer pause is ignored."""
+"""Maximum pause of this process for which the time of the servos advances [s]; the rest of a pause is ignored."""
 
 
 class PseudoTerminal:
-    """Serve a :class:`VirtualLine` on a pseudo-terminal in wall time.
+    """Pseudo-terminal through which other programs access a :class:`VirtualLine` in real time.
 
     Attributes
     ----------
@@ -290,18 +291,18 @@ class PseudoTerminal:
     """
 
     def __init__(self, line: VirtualLine, link: Path | None = None) -> None:
-        """Open the terminal and create the symbolic link ``link`` to it, if set.
+        """Open the terminal and, if ``link`` is set, create a symbolic link with this path to the terminal.
 
         Raises
         ------
         PortError
-            If the link cannot be created, is another kind of file, or leads to an existing device, or the system has no
-            pseudo-terminals.
+            If the link cannot be created, if another kind of file exists at its path, if an existing link points to an
+            existing device, or if the system has no pseudo-terminals.
         """
         require_posix("virtual servos on a pseudo-terminal")
         self.line = line
         self._master, self._slave = os.openpty()
-        # Keep the slave end open, otherwise the master reads end-of-file between two clients.
+        # Keep the slave end open; otherwise the master would read end-of-file between two clients.
         tty.setraw(self._slave)
         os.set_blocking(self._master, False)
         self.device = os.ttyname(self._slave)
@@ -317,12 +318,12 @@ class PseudoTerminal:
                 raise PortError(f"{link}: cannot be linked to {self.device} ({error.strerror})") from error
 
     def _refuse_device_in_use(self, link: Path) -> None:
-        """Raise PortError unless the link is left over from a killed process: broken, or leading to this device."""
+        """Raise PortError unless the link was left by a killed process: it is broken, or points to this device."""
         if link.exists() and os.readlink(link) != self.device:
             there = os.readlink(link)
             self._link = None
             self.close()
-            raise PortError(f"{link}: leads to {there}, which is in use (other virtual servos?); choose another link")
+            raise PortError(f"{link}: points to {there}, which is in use (by other virtual servos?); use another link")
 
     def serve(self, keep_on: Callable[[], bool]) -> None:
         """Answer requests until ``keep_on`` returns False or a scripted fault unplugs the adapter."""
@@ -332,7 +333,7 @@ class PseudoTerminal:
             now = time.monotonic() - origin
             wait = min(IDLE, max(0.0, outgoing[0][0] - now)) if outgoing else IDLE
             readable, _, _ = select.select([self._master], [], [], wait)
-            # Stop the time of the servos while this process was suspended, because real servos would not be late.
+            # Do not count the time in which this process was suspended, because real servos would not be late.
             origin += max(0.0, time.monotonic() - last - STALL)
             last = time.monotonic()
             now = last - origin
@@ -346,14 +347,14 @@ class PseudoTerminal:
                 self._send(outgoing.popleft()[1])
 
     def _answer(self, data: bytes, now: float) -> list[tuple[float, bytes]]:
-        # When the bytes arrive, the write time of the client and of the USB adapter has already passed.
+        # When the bytes arrive, the client and the USB adapter have already taken the time that writing them requires.
         baud = self.baud
         arrivals = self.line.transmit(data, now - len(data) * 10 / baud, baud)
         return [(arrival - ADAPTER_LATENCY, frame) for arrival, frame in arrivals]
 
     @property
     def baud(self) -> int:
-        """Bit rate set by the client [bit/s]; the rate of the servos if the system does not report it."""
+        """Bit rate set by the client [bit/s]; if the system does not report it, the bit rate of the servos."""
         with contextlib.suppress(OSError):
             settings = fcntl.ioctl(self._slave, _TCGETS2, bytes(44))
             return int.from_bytes(settings[_OUTPUT_SPEED], sys.byteorder)
@@ -361,12 +362,12 @@ class PseudoTerminal:
         return _BAUD_BY_CODE.get(termios.tcgetattr(self._slave)[5], first.baud)
 
     def _send(self, data: bytes) -> None:
-        # As with a real adapter, a client that does not read loses bytes.
+        # As with a real adapter, bytes are lost if the client does not read them.
         with contextlib.suppress(BlockingIOError):
             os.write(self._master, data)
 
     def close(self) -> None:
-        """Close the terminal, and remove the link if it still leads to this device."""
+        """Close the terminal, and remove the link if it still points to this device."""
         if self._link is not None and self._link.is_symlink() and os.readlink(self._link) == self.device:
             self._link.unlink()
         for descriptor in (self._master, self._slave):

@@ -1,4 +1,4 @@
-"""Servos of a virtual line: registers, motion, heat, supply, watchdogs, and the firmware that answers requests."""
+"""Servos on a virtual line: registers, motion, heating, supply, watchdogs, and the firmware that answers requests."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from dynsim.hardware.bus.packet import ALERT, STATUS, Instruction, Packet, Statu
 from dynsim.hardware.virtual.faults import AngleFault, Fault, FaultScript, TemperatureRamp, VoltageSag
 from dynsim.hardware.virtual.simulated_plant import Drive, InertialLoad, ServoPlant
 
-# Registers of one virtual servo, with the access rules of a real servo.
+# Registers of one virtual servo; the access rules are the same as in a real servo.
 
 
 GOAL_LIMITS = {"goal_pwm": "pwm_limit", "goal_current": "current_limit", "goal_velocity": "velocity_limit"}
@@ -49,7 +49,7 @@ class ServoRegisters:
         self.model = model
         self._table = bytearray(TABLE_SIZE)
         self._field_at = {item.address: name for name, item in model.fields.items()}
-        # Each read of a state needs a dozen registers: look up their addresses once.
+        # Reading a state requires a dozen registers, so look up their addresses once.
         self._spans = {
             name: (slice(item.address, item.address + item.size), item.size, item.signed)
             for name, item in model.fields.items()
@@ -71,7 +71,7 @@ class ServoRegisters:
         return BAUD_RATES[self["baud"]]
 
     def reset(self, keep: Collection[str] = ()) -> None:
-        """Reset all registers except ``keep`` to factory defaults, and restart."""
+        """Reset all registers except ``keep`` to factory defaults, and restart the servo."""
         kept = {name: self[name] for name in keep}
         for name, item in self.model.fields.items():
             self[name] = kept.get(name, item.default)
@@ -92,7 +92,7 @@ class ServoRegisters:
         self["goal_pwm"] = self["pwm_limit"]
 
     def read(self, address: int, length: int) -> bytes | None:
-        """Return bytes with indirect addresses resolved; None outside the table."""
+        """Return bytes of the table with indirect addresses resolved; None if some bytes are outside the table."""
         if length < 1 or address + length > TABLE_SIZE:
             return None
         if address + length <= INDIRECT_BLOCKS[0][1]:
@@ -100,7 +100,7 @@ class ServoRegisters:
         return bytes(self._table[self._resolve(a)] for a in range(address, address + length))
 
     def write(self, address: int, data: bytes) -> StatusError:
-        """Write consecutive registers; after an error, none is written."""
+        """Write consecutive registers, or none of them if there is an error."""
         if not data or address + len(data) > TABLE_SIZE:
             return StatusError.ACCESS
         end = address + len(data)
@@ -172,26 +172,26 @@ class ServoRegisters:
 
 
 PROTOCOL = 2
-"""Protocol of the line. A servo with another protocol never answers."""
+"""Protocol version used on the line. A servo that is set to another version never answers."""
 PHYSICS_STEP = 2e-3
 COMMUNICATION_END = 14
-"""Communication settings (IDs, bit rate, protocol) have addresses below this."""
+"""Communication settings (IDs, bit rate, protocol) have addresses below this address."""
 GOALS = range(100, 120)
-"""Addresses of goals and profile; a write to these addresses changes neither torque nor mode."""
+"""Addresses of the goals and the profile; writing to these addresses does not change the torque state or the mode."""
 TRAJECTORY = 136, 144
-"""Addresses of speed and position of the profile, which are updated only when they are read."""
+"""Addresses of the speed and position of the profile, which are updated only when they are read."""
 STATE = range(124, 136)
-"""Addresses of load, speed and position, which are read in each cycle without voltage, temperature and clock."""
+"""Addresses of load, speed and position; each cycle reads them, but not the voltage, the temperature and the clock."""
 BOOT_TIME = 0.3
 """Time after a reboot in which a servo does not answer [s] (unverified)."""
 AMBIENT = 25.0  # °C
 THERMAL_RESISTANCE = 2.0  # K/W (unverified)
 THERMAL_TIME = 300.0  # s (unverified)
-OVERLOAD_FRACTION = 0.9  # of stall torque (unverified)
+OVERLOAD_FRACTION = 0.9  # fraction of the stall torque (unverified)
 OVERLOAD_TIME = 1.0  # s (unverified)
 SUPPLY, SUPPLY_RESISTANCE = 12.0, 0.05  # V, Ω
 BROWN_OUT = 6.0
-"""Supply below which the electronics of the servos stop; they restart above it [V] (unverified)."""
+"""Supply voltage below which the electronics of the servos stop, and above which they restart [V] (unverified)."""
 OVERHEATING, OVERLOAD, INPUT_VOLTAGE = 1 << 2, 1 << 5, 1 << 0
 WRONG_REGISTERS = {"wrong_model": "model_number", "wrong_firmware": "firmware", "wrong_mode": "operating_mode"}
 
@@ -203,9 +203,9 @@ class BaudGroup:
     Attributes
     ----------
     by_id : dict of int to list of int
-        Servos by present ID; several servos may have the same ID.
+        Initial IDs of the servos by their present ID; several servos may have the same present ID.
     members : int array
-        Indices of the servos in the order of the line.
+        Indices of the servos in the list of all servos.
     """
 
     by_id: dict[int, list[int]] = field(default_factory=dict)
@@ -213,7 +213,7 @@ class BaudGroup:
 
 
 def group_by_baud(servos: Mapping[int, ServoRegisters]) -> dict[int, BaudGroup]:
-    """Return the servos that receive packets at each bit rate [bit/s], from their present registers."""
+    """Return the servos that receive packets at each bit rate [bit/s], according to their present registers."""
     groups: dict[int, BaudGroup] = {}
     for index, (first_id, registers) in enumerate(servos.items()):
         if registers["protocol"] != PROTOCOL:
@@ -230,18 +230,19 @@ class VirtualServos:
     Parameters
     ----------
     registers : mapping of int to ServoRegisters
-        Registers by ID. If a servo gets another ID later, this key and the ID in fault scripts stay the same.
+        Registers by initial ID. If the ID of a servo is changed later, this key and the ID in fault scripts stay the
+        same.
     positions : iterable of float
         Initial servo angles [rad], 0 at tick 0.
     plant : ServoPlant or None
-        Plant that the servos drive; if None, a separate inertia for each servo.
+        Plant that the servos drive; if None, each servo drives a separate inertia.
     script : FaultScript
         Scripted faults; :class:`~dynsim.hardware.virtual.line.VirtualLine` applies those of status packets.
 
     Attributes
     ----------
     supply : float
-        Voltage of the supply without load [V].
+        Supply voltage without load [V].
     registers : dict
         ServoRegisters by initial ID.
     ids : list of int
@@ -249,19 +250,19 @@ class VirtualServos:
     baud_groups : dict of int to BaudGroup
         Servos that receive packets at each bit rate.
     time : float
-        Time of the servos [s].
+        Simulated time of the servos [s].
     torque_since : float
-        Time at which torque was first switched on [s]; infinite before.
+        Time at which the torque of any servo was first switched on [s]; infinite before this time.
     last_packet : array, shape (N,)
-        Time of the last packet that each servo could receive, for the watchdogs [s].
+        Time of the last packet that each servo could receive [s]; used by the watchdogs.
     dead : set of int
-        IDs without power or cable.
+        IDs of the servos whose power or cable is lost.
     unplugged : bool
         True if the adapter was unplugged.
     temperature : array, shape (N,)
         Temperature of the windings [°C].
     play : array, shape (N,)
-        Angle after the backlash [rad].
+        Angle of the output side of the backlash [rad].
     """
 
     def __init__(
@@ -315,7 +316,7 @@ class VirtualServos:
         return [fault for fault in self._script.faults if fault.active(since)]
 
     def _next_fault(self) -> float:
-        """Return the time at which the next fault starts or ends [s]."""
+        """Return the time of the next start or end of a fault [s]."""
         changes = [self.torque_since + time for fault in self._script.faults for time in fault.span]
         return min((time for time in changes if time > self.time), default=math.inf)
 
@@ -363,12 +364,12 @@ class VirtualServos:
     # -- requests -----------------------------------------------------------------------------------------------------
 
     def receives(self, id_: int) -> bool:
-        """Return True if a servo can receive packets."""
+        """Return True if a servo can receive packets now."""
         there = self._powered and id_ in self.registers and id_ not in self.dead
         return there and self.time >= self._boot_until.get(id_, 0.0)
 
     def read(self, id_: int, address: int, length: int) -> bytes | None:
-        """Return present bytes of the control table of a servo; None outside the table."""
+        """Return bytes of a servo's control table, with present measurements; None if they are outside the table."""
         index = self.ids.index(id_)
         self.measure(index, motion_only=STATE.start <= address and address + length <= STATE.stop)
         if address < TRAJECTORY[1] and address + length > TRAJECTORY[0]:
@@ -379,7 +380,7 @@ class VirtualServos:
         return self.registers[id_].read(address, length)
 
     def write(self, id_: int, address: int, data: bytes) -> StatusError:
-        """Write to a control table, and apply the consequences."""
+        """Write to the control table of a servo, and apply the consequences for its state."""
         registers, index = self.registers[id_], self.ids.index(id_)
         torque, mode = registers["torque_enable"], registers["operating_mode"]
         if error := registers.write(address, data):
@@ -416,7 +417,7 @@ class VirtualServos:
         self.reload(index)
 
     def _update_supply(self, current: float) -> None:
-        """Update the supply voltage for a current [A]; servos fail below BROWN_OUT and restart above it."""
+        """Update the supply voltage for a total current [A]; servos fail below BROWN_OUT and restart above it."""
         sag = sum(fault.drop for fault in self.active_faults() if isinstance(fault, VoltageSag))
         self._drive.voltage = (self.supply - sag - SUPPLY_RESISTANCE * current) * self._switched_on
         powered = self._drive.voltage >= BROWN_OUT
@@ -426,15 +427,15 @@ class VirtualServos:
                 self.reboot(id_)
 
     def reset_turns(self, index: int) -> None:
-        """Start counting turns from the present position."""
+        """Restart the count of turns at the present position."""
         self._turns[index] = self._sense[index] * round(self.plant.position[index] / RAD_PER_TICK) // TICKS_PER_TURN
 
     # -- motion, heat, supply -----------------------------------------------------------------------------------------
 
     def step(self, until: float) -> None:
-        """Execute one physics step, or, if nothing moves, all steps that fit in before ``until`` [s]."""
+        """Execute one physics step or, if nothing moves, all steps until ``until`` [s] or until a fault changes."""
         if not self._drive.enabled.any() and self.plant.rests:
-            # Nothing moves: one long step for the temperatures, so that a wait for pings costs no time.
+            # Nothing moves: update the temperatures in one long step, so that waiting for pings is not slow.
             steps = max(1, int((min(until, self._next_fault()) - self.time) / PHYSICS_STEP))
             self.time += steps * PHYSICS_STEP
             self._warm(steps * PHYSICS_STEP)
@@ -446,13 +447,13 @@ class VirtualServos:
             self._watch()
 
     def _set_points(self, dt: float) -> None:
-        """Move the set points to the goals with the speed and acceleration of the profile (0: unlimited)."""
+        """Move the set points towards the goals, with the speed and acceleration of the profile (0: unlimited)."""
         drive = self._drive
         to_go = self._goal_position - drive.set_position
         acceleration = np.where(self._profile_acceleration > 0, self._profile_acceleration, np.inf)
         speed = np.where(self._profile_velocity > 0, self._profile_velocity, np.inf)
         distance = np.abs(to_go)
-        # Maximum speed that allows braking before the goal; 0 at the goal, whatever the acceleration.
+        # Maximum speed that still allows braking before the goal; it is 0 at the goal, whatever the acceleration.
         braking = np.sqrt(2 * acceleration * np.maximum(distance, 1e-12))
         wanted = np.sign(to_go) * np.minimum(np.minimum(speed, braking), distance / dt)
         change = acceleration * dt
@@ -493,7 +494,7 @@ class VirtualServos:
                 self.trip_watchdog(index)
 
     def raise_error(self, index: int, bit: int) -> None:
-        """Set a bit of the error register, and switch torque off if ``shutdown`` contains this bit."""
+        """Set a bit in the error register, and switch the torque off if the register ``shutdown`` contains this bit."""
         registers = self.registers[self.ids[index]]
         registers["hardware_error"] |= bit
         if registers["hardware_error"] & registers["shutdown"]:
@@ -501,7 +502,7 @@ class VirtualServos:
             self.reload(index)
 
     def trip_watchdog(self, index: int) -> None:
-        """Stop a servo, which then accepts no goals until its watchdog is cleared."""
+        """Stop a servo as its watchdog does; it then rejects goals until the watchdog is cleared."""
         self.hold_position(index)
         self.registers[self.ids[index]]["bus_watchdog"] = -1
         self.reload(index)
@@ -529,7 +530,7 @@ class VirtualServos:
     def reload(self, index: int) -> None:
         """Load the settings that affect the motion from the registers."""
         registers = self.registers[self.ids[index]]
-        # Reverse mode changes the direction of the shaft, but not of the homing offset.
+        # Reverse mode changes the direction of the shaft, but not the sign of the homing offset.
         self._sense[index] = -1 if registers["drive_mode"] & 1 else 1
         self._drive.enabled[index] = bool(registers["torque_enable"])
         self._drive.in_position_mode[index] = registers["operating_mode"] != OperatingMode.VELOCITY
@@ -539,7 +540,7 @@ class VirtualServos:
         self._load_goals(index)
 
     def _load_goals(self, index: int) -> None:
-        """Load goals and profile from the registers."""
+        """Load the goals and the profile from the registers."""
         registers = self.registers[self.ids[index]]
         self._goal_position[index] = self._angle(index, registers["goal_position"])
         self._goal_velocity[index] = self._sense[index] * registers["goal_velocity"] * RAD_S_PER_UNIT
@@ -573,17 +574,17 @@ class VirtualServos:
         registers["realtime_tick"] = int(self.time * 1e3) % 32768
 
 
-# Firmware of the virtual servos: instructions of Protocol 2.0 and their answers.
+# Firmware of the virtual servos: it executes the instructions of Protocol 2.0 and answers them.
 
 
 CLEAR_TURNS = b"\x01\x44\x58\x4c\x22"
 RESET_ALL = 0xFF
 KEPT_BY_RESET: dict[int, tuple[str, ...]] = {RESET_ALL: (), 0x01: ("id",), 0x02: ("id", "baud")}
-"""Registers that a factory reset does not change, by the parameter of the reset."""
+"""Registers that a factory reset does not change, by the parameter of the reset instruction."""
 
 
 class Answer(NamedTuple):
-    """Frame that one or several servos send at the same time.
+    """Frame that one servo sends, or that several servos send at the same time.
 
     Attributes
     ----------
@@ -591,7 +592,7 @@ class Answer(NamedTuple):
         Initial IDs of the sending servos; several if they have the same present ID.
     frame : bytes
     chained : bool
-        True if the frame follows the previous answer without a pause.
+        True if the frame directly follows the previous answer, without a pause.
     """
 
     servos: tuple[int, ...]
@@ -600,7 +601,7 @@ class Answer(NamedTuple):
 
 
 def merge_frames(frames: Sequence[tuple[int, bytes]]) -> Answer:
-    """Merge the frames of servos that answer at the same time: all drive the line, and a zero bit wins (unverified)."""
+    """Merge frames that are sent at the same time: all servos drive the line, and a zero bit wins (unverified)."""
     line = bytearray(max((frame for _, frame in frames), key=len))
     for _, frame in frames:
         for k, byte in enumerate(frame):
@@ -613,14 +614,14 @@ def _word(parameters: bytes, at: int) -> int:
 
 
 class Firmware:
-    """Execute instructions on servos, which are identified by their initial IDs."""
+    """Firmware that executes instructions on servos, which are identified by their initial IDs."""
 
     def __init__(self, servos: VirtualServos) -> None:
         self._servos = servos
         self._registered: dict[int, tuple[int, bytes]] = {}
 
     def answers(self, packet: Packet, group: BaudGroup) -> Iterator[Answer]:
-        """Execute an instruction and yield the answers, in their order on the line."""
+        """Execute an instruction and yield the answers, in the order in which they are sent."""
         p = packet.parameters
         match packet.instruction:
             case Instruction.SYNC_READ | Instruction.FAST_SYNC_READ if len(p) >= 5:
@@ -646,7 +647,7 @@ class Firmware:
         yield from (self._fast_read if fast else self._read_many)(entries, group)
 
     def _write_silently(self, id_: int, address: int, data: bytes, group: BaudGroup) -> None:
-        """Write without an answer: a refused goal is not reported, as on real servos."""
+        """Write without answering: as on real servos, a rejected goal is not reported."""
         for servo in self._awake(group, id_):
             self._servos.write(servo, address, data)
 
@@ -679,7 +680,7 @@ class Firmware:
             case Instruction.ACTION:
                 error = self._act(servo)
             case Instruction.REBOOT | Instruction.FACTORY_RESET:
-                # The answer is sent first, from the state before the restart.
+                # Create the answer first, because it describes the state before the restart.
                 answer = self._status(servo, id_, StatusError.NONE)
                 if packet.instruction == Instruction.REBOOT:
                     self._servos.reboot(servo)
@@ -703,7 +704,7 @@ class Firmware:
                 yield merge_frames(frames)
 
     def _fast_read(self, entries: Sequence[tuple[int, int, int]], group: BaudGroup) -> Iterator[Answer]:
-        """Yield the parts of one packet; the servos after a silent servo do not send (unverified)."""
+        """Yield the parts of one packet, one from each servo; servos after a silent servo do not send (unverified)."""
         senders, replies = [], []
         for id_, address, length in entries:
             servo = next(iter(self._awake(group, id_)), None)
@@ -731,11 +732,11 @@ class Firmware:
         return Packet(id_, STATUS, data, error | alert)
 
     def _awake(self, group: BaudGroup, id_: int) -> list[int]:
-        """Return the servos with an ID that can receive packets."""
+        """Return the servos that have the ID ``id_`` and can receive packets."""
         return list(filter(self._servos.receives, group.by_id.get(id_, ())))
 
     def _act(self, servo: int) -> StatusError:
-        """Execute the registered write, unless a restart has cleared it."""
+        """Execute the write that was registered for a servo, unless a restart has cleared it."""
         registers = self._servos.registers[servo]
         if not registers["registered_instruction"]:
             return StatusError.RESULT_FAIL
@@ -743,7 +744,7 @@ class Firmware:
         return self._servos.write(servo, *self._registered.pop(servo))
 
     def _clear_turns(self, servo: int) -> StatusError:
-        """Start counting turns from the present position; fails if the servo moves."""
+        """Restart the count of turns at the present position; return an error if the servo is moving."""
         index = self._servos.ids.index(servo)
         if abs(self._servos.plant.velocity[index]) > self._servos.registers[servo]["moving_threshold"] * RAD_S_PER_UNIT:
             return StatusError.RESULT_FAIL

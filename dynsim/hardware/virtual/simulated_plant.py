@@ -1,11 +1,12 @@
-"""Plants of virtual servos: the motor law, simple inertias, and a simulated robot with gravity, stops and contacts.
+"""Plants for virtual servos: the motor law, simple inertias, and a simulated robot with gravity, stops and contacts.
 
-The robot is a :class:`dynsim.Simulation` of the robot of a scenario, with servo models from the map as motors. Contacts
-follow the unilateral law, whatever law the scenario has, because a real floor does not pull. The integrator is time
-stepping if the scenario uses it, and for a snake robot, which stands on its wheels; otherwise it is event-driven.
+The simulated robot is a :class:`dynsim.Simulation` of a scenario's robot, with servo models from the map as motors. Its
+contacts are unilateral, whatever the scenario specifies, because a real floor does not pull. The integrator is time
+stepping for a snake robot, which stands on its wheels, and for a scenario that uses time stepping; otherwise the
+integrator is event-driven.
 
-Servos round their angles to ticks, so a braced elbow may appear some tenths of a millimetre below its floor, or a joint
-beyond its stop. The arm then starts in the nearest admissible posture.
+Servos round their angles to ticks. Therefore a braced elbow may appear some tenths of a millimetre below its floor, or
+a joint beyond its stop. The arm then starts in the nearest admissible posture.
 """
 
 from __future__ import annotations
@@ -29,27 +30,27 @@ if TYPE_CHECKING:
     from dynsim.model.drives import Servo
     from dynsim.scenario import Scenario
 
-# Mechanics of virtual servos: motor law, interface of plants, and separate inertias as the simplest plant.
+# Mechanics of virtual servos: motor law, interface for plants, and separate inertias as the simplest plant.
 
 
 STIFFNESS_PER_STALL_TORQUE = 41.0 / MX_106.stall_torque  # 1/rad
 VELOCITY_TIME_CONSTANT = 0.02
-"""Time constant of the closed velocity loop of a servo without load [s] (unverified)."""
+"""Time constant of a servo's closed velocity loop without load [s] (unverified)."""
 FREE_DAMPING = 0.1
 """Damping of an unpowered gear train as a fraction of the back-EMF damping (unverified)."""
 
 
 @dataclass
 class Drive:
-    """Set points of the servo controllers; arrays of shape (N,), in servo angles.
+    """Set points of the servo controllers, as arrays of shape (N,) in servo coordinates, and the supply voltage.
 
     Attributes
     ----------
     enabled, in_position_mode : bool arrays
     set_position : array
-        Set points of the position [rad].
+        Position set points [rad].
     set_velocity : array
-        Set points of the velocity [rad/s].
+        Velocity set points [rad/s].
     voltage : float
         Supply voltage at the servos [V].
     """
@@ -62,7 +63,7 @@ class Drive:
 
 
 class MotorLaw:
-    """Torque of N servos from their set points: the servo law of the simulation with the constants of the models.
+    """Law for the torque of N servos as a function of their set points, with the constants of the servo models.
 
     Attributes
     ----------
@@ -77,7 +78,7 @@ class MotorLaw:
         self.damping = self.stall_torque / np.array([model.no_load_speed for model in models])
         self.stiffness = STIFFNESS_PER_STALL_TORQUE * self.stall_torque
         self.inertia = self.damping**2 / (4 * self.stiffness)
-        # Imported here because a replay on real servos imports this module, but not the simulation.
+        # Imported here, because a replay on real servos imports this module but does not need the simulation.
         from dynsim.model.drives import ServoBank
 
         self._bank = ServoBank(self.servos([model.name for model in models], np.ones(len(models))))
@@ -89,7 +90,7 @@ class MotorLaw:
         return self._bank.torque(position, velocity)
 
     def servos(self, joints: list[str], gears: Array) -> list[Servo]:
-        """Return the servos as motors of joints, with gears (N,) in servo turns per joint turn.
+        """Return the servos as motors of joints; ``gears`` (N,) contains the servo turns per joint turn.
 
         K_m = V/ω_no_load and R = V K_m/τ_stall at 12 V, so that d = K_m²/R; the torque per volt is K_m/R.
         """
@@ -134,7 +135,7 @@ class InertialLoad:
         self._jammed[:] = False
 
     def stop(self, index: int) -> None:
-        """Stop one shaft at its present angle and lock it during the next step (a jammed gear)."""
+        """Stop one shaft at its present angle and lock it during the next step, like a jammed gear."""
         self.velocity[index] = 0.0
         self._jammed[index] = True
 
@@ -144,24 +145,24 @@ Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
 START_CHANGE = 5.0 * RAD_PER_TICK
-"""Maximum change of a joint at the start to remove penetrations, which are caused by ticks and backlash [rad]."""
+"""Maximum change of a joint angle to remove penetrations at the start, which ticks and backlash can cause [rad]."""
 GAP_TOLERANCE = 1e-10  # [m]
 SNAKE_STEP, ARM_STEP = 2e-3, 1e-3
-"""Maximum time step, equal to the step of the servo physics, and default time step of an arm [s]."""
+"""Maximum time step, which is equal to the time step of the servo physics, and default time step for an arm [s]."""
 SLOW, STEADY = 1e-4, 1e-2
-"""Rate [rad/s] and acceleration [rad/s²] below which a robot without torque is at rest."""
+"""Rate [rad/s] and acceleration [rad/s²] below which a robot without torque counts as at rest."""
 
 
 class SimulatedArm:
     """A :data:`~dynsim.hardware.virtual.simulated_plant.ServoPlant`: a robot with a position servo at each joint.
 
-    A joint is locked by the stand of the robot until its servo is first switched on; otherwise an arm would fall while
-    its joints are armed one after another.
+    Each joint is locked, as if the robot were on a stand, until its servo is switched on for the first time; otherwise
+    an arm would fall while its joints are armed one after another.
 
     Parameters
     ----------
     scenario : dynsim.Scenario
-        Source of robot, payloads and contacts; forces over time are ignored.
+        Scenario with the robot, payloads and contacts; forces that are functions of time are ignored.
     servo_map : ServoMap
     posture : array, shape (n,)
         Initial joint angles [rad], in the order of :func:`served_joints`; see :func:`admissible_posture`.
@@ -171,7 +172,7 @@ class SimulatedArm:
     ServoMapError
         If the servos of the map do not match the joints of the model.
     ModelError
-        If a contact point starts farther below its surface than rounding to ticks explains.
+        If a contact point starts so far below its surface that rounding to ticks cannot be the reason.
     """
 
     def __init__(self, scenario: Scenario, servo_map: ServoMap, posture: Array) -> None:
@@ -184,7 +185,7 @@ class SimulatedArm:
             raise ServoMapError(
                 f"{servo_map.path} has servos for {', '.join(labels)}, but the plant has joints {', '.join(served)}"
             )
-        # Servo k moves joint labels[k] with angle q[order[k]] and rate v[rows[k]].
+        # Servo k moves the joint labels[k], whose angle is q[order[k]] and whose rate is v[rows[k]].
         self._labels = labels = [served[label] for label in labels]
         self._rows = np.array([robot.joint_names.index(joint) for joint in labels])
         self._order = np.array(robot.position_index)[self._rows]
@@ -192,7 +193,7 @@ class SimulatedArm:
         self._scale = np.array([servo.sign * servo.gear for servo in servos])  # servo angle per joint angle
         self._zero = np.array([servo.zero_tick * RAD_PER_TICK for servo in servos])
         self._law = MotorLaw([servo.model for servo in servos])
-        # The servos have the masses of the motors that they replace.
+        # Each servo has the mass of the motor that it replaces.
         masses = {motor.joint: (motor.mass, motor.mass_point) for motor in robot.motors}
         motors = [
             replace(servo, mass=mass, mass_point=point)
@@ -249,7 +250,7 @@ class SimulatedArm:
         self.position, self.velocity = self._shafts()
 
     def _shafts(self) -> tuple[Array, Array]:
-        """Return angles [rad] and speeds [rad/s] of the servos."""
+        """Return the angles [rad] and speeds [rad/s] of the servo shafts."""
         state = self.simulation.state
         return self._zero + self._scale * state.q[self._order], self._scale * state.v[self._rows]
 
@@ -267,8 +268,8 @@ rests : bool
 
 
 def served_joints(robot: Robot) -> dict[str, str]:
-    """Return the joints with servos, by servo label: all joints of an arm, the joints with motors of a snake robot."""
-    # Imported here and below because a replay on real servos imports this package, but not the simulation.
+    """Return the joints with servos, by servo label: all joints of an arm, or the motorised joints of a snake robot."""
+    # Imported here and below, because a replay on real servos imports this package but does not need the simulation.
     from dynsim.compile.snake_tree import SnakeTree
 
     if not isinstance(robot, SnakeTree):
@@ -279,7 +280,7 @@ def served_joints(robot: Robot) -> dict[str, str]:
 
 
 def _start_coordinates(bare: Scenario, robot: Robot, posture: dict[str, float]) -> Array:
-    """Return coordinates (nq,) for joint angles [rad]; an arm is made admissible, a snake robot is on its wheels."""
+    """Return coordinates (nq,) for joint angles [rad]: an admissible posture of an arm, or a snake on its wheels."""
     from dynsim.compile.snake_tree import SnakeTree, at_angles
     from dynsim.scenario import build
 
@@ -289,11 +290,11 @@ def _start_coordinates(bare: Scenario, robot: Robot, posture: dict[str, float]) 
 
 
 def admissible_posture(scenario: Scenario, model: Model, posture: Array) -> Array:
-    """Return a posture with joints within their stops and contact points on or above their surfaces, (n,) [rad].
+    """Return a posture (n,) [rad] with all joints within their stops and no contact point below its surface.
 
-    It is the nearest posture to first order, Δq = −Jᵀ(J Jᵀ)⁺ gap for all points that were ever below, repeated until
-    the gaps are rounding errors; changes are logged. If a joint would have to change by more than START_CHANGE, the
-    posture is returned unchanged and the simulation rejects it with a message.
+    To first order it is the nearest such posture: Δq = −Jᵀ(J Jᵀ)⁺ gap, for all points that have been below their
+    surfaces, is repeated until the gaps are rounding errors. Changes are logged. If a joint would have to change by
+    more than START_CHANGE, the posture is returned unchanged, and the simulation rejects it with a message.
     """
     from dynsim.compile.shapes import gap_at
     from dynsim.scenario import build
@@ -315,18 +316,18 @@ def admissible_posture(scenario: Scenario, model: Model, posture: Array) -> Arra
     change = np.abs(q - posture).max(initial=0.0)
     if not 0.0 < change <= START_CHANGE:
         return posture
-    log.info("a joint starts %.2g rad away from its servo position, to satisfy contacts and stops", change)
+    log.info("a joint starts %.2g rad away from its servo position, so that contacts and stops are satisfied", change)
     return q
 
 
 def _slopes(function: Callable[[Array], Array], q: Array, step: float = 1e-6) -> Array:
-    """Return the Jacobian of a function of the joints by central differences, (c, n)."""
+    """Return the Jacobian (c, n) of a function of the joint angles, computed by central differences."""
     shifts = step * np.eye(len(q))
     return np.array([(function(q + shift) - function(q - shift)) / (2.0 * step) for shift in shifts]).T
 
 
 def _plant_only(scenario: Scenario) -> Scenario:
-    """Return a scenario with plant, payloads and unilateral contacts only, without controller and forces over time."""
+    """Return a scenario with only the plant, payloads and unilateral contacts: no controller, no forces over time."""
     from dynsim.scenario.combinations import BILATERAL_KEYS
     from dynsim.scenario.schema import Contacts, Payload
 
@@ -339,7 +340,7 @@ def _plant_only(scenario: Scenario) -> Scenario:
         "contacts": Contacts(**{**keys, "law": "unilateral"}),
         "loads": payloads,
         "initial": None,  # the ticks of the servos determine the posture
-        "integrator": type(config.integrator)(method="dopri5"),  # set points change every 2 ms, which ends steps
+        "integrator": type(config.integrator)(method="dopri5"),  # every 2 ms, new set points end a step
     }
     if config.integrator.method == "time_stepping":
         step = min(config.integrator.step_s or ARM_STEP, SNAKE_STEP)
@@ -354,22 +355,22 @@ def _plant_only(scenario: Scenario) -> Scenario:
 def simulated_arm(
     scenario_name: str, variant: str | None, servo_map: ServoMap, posture: dict[str, float]
 ) -> SimulatedArm:
-    """Build the robot of a scenario as the plant of the servos of a map.
+    """Build the robot of a scenario as the plant that the servos of a map drive.
 
     Parameters
     ----------
     scenario_name : str
         Scenario file or name of a shipped scenario.
     variant : str or None
-        Variant of the scenario; default: the first.
+        Variant of the scenario; default: the first variant.
     servo_map : ServoMap
     posture : dict
-        Initial joint angles [rad], by label; missing joints start as in the scenario.
+        Initial joint angles [rad], by label; joints that are not listed start as in the scenario.
 
     Raises
     ------
     ScenarioError, ModelError
-        If the scenario does not exist or has no rigid-body model (a kinematic plant).
+        If the scenario does not exist, or its plant is kinematic and has no rigid-body model.
     ServoMapError
         If the servos of the map do not match the joints of the robot.
     """

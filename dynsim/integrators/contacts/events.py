@@ -1,13 +1,14 @@
 """Events of the unilateral law (contacts, joint stops, dry friction): guards, mode changes and log.
 
 Each candidate has two guards; each stop and each joint with dry friction has one. The first guard of a candidate is its
-gap if open, its normal force if closed. The second is the margin μ_s f_n − |f_t| if it sticks; if it slides, its speed
-along the slip direction at the start of the step. Guards of joints are analogous. An event is a fall through zero.
+gap if it is open, or its normal force if it is closed. The second guard is the margin μ_s f_n − |f_t| if it sticks, or
+its speed along the slip direction at the start of the step if it slides. Guards of joints are analogous. An event
+occurs when a guard falls through zero.
 
-Forces are continuous at lift-off and at the start of slip, where the complementarity problem is degenerate: the mode of
-that one candidate is set directly. After all other events, and if that is inconsistent, all modes are solved for. The
-same applies at the end of the best split of dependent rows, where several points and joints start to slip at once and
-forces jump.
+Forces are continuous at lift-off and at the start of slip, where the complementarity problem is degenerate; the mode of
+the single candidate is therefore set directly. If the result is inconsistent, and after all other events, all modes are
+solved for again. They are also solved for when the best split of dependent rows reaches its limit, because several
+points and joints then start to slip at once and forces jump.
 """
 
 from __future__ import annotations
@@ -66,17 +67,17 @@ from dynsim.integrators.contacts.resting import hold_free_joints, projection_res
 from dynsim.integrators.run import GAP_TOLERANCE, RATE_TOLERANCE, Run, project_level
 from dynsim.jit.kernel import internal_kernel, noinline_kernel
 
-# Release of joints held by dry friction when other rows begin to turn them.
+# Functions that release joints held by dry friction when other rows begin to turn them.
 
 
-# Fraction of the projection tolerances that errors which projection cannot remove may reach, and the fraction below
+# Maximum of the errors that projection cannot remove, as a fraction of the projection tolerances, and fraction below
 # which the sum of the errors is not examined.
 MOST_LEFT, LITTLE_LEFT = 0.5, 0.25
 
 
 @internal_kernel
 def record_residual(unilateral: UnilateralArrays, ws: Workspace):
-    """Record the error that projection leaves right after a choice of modes; it does not grow if nothing moves."""
+    """Record the error that remains after projection, right after a choice of modes; at rest it does not grow."""
     left = 0.0
     if unilateral.number[ku.REDUNDANT] == 1.0:
         left, _ = contradiction(unilateral, ws)
@@ -91,7 +92,10 @@ def release_limit(unilateral: UnilateralArrays):
 
 @internal_kernel
 def agreement_margin(unilateral: UnilateralArrays, ws: Workspace, k):
-    """Return 1 if the rows agree, below 0 if a joint must be released; the guard of the first held joint checks all."""
+    """Return 1 if the rows agree, or a value below 0 if a joint must be released.
+
+    The guard of the first held joint checks all held joints.
+    """
     for j in range(k):
         if unilateral.dry_table[j, ku.DRY_HOLDS] == 1:
             return 1.0
@@ -103,14 +107,14 @@ def agreement_margin(unilateral: UnilateralArrays, ws: Workspace, k):
 def contradiction(unilateral: UnilateralArrays, ws: Workspace):
     """Compute the residual of projection along rows that involve held joints, right after ``derivative``.
 
-    Nothing else in the workspace changes.
+    No other data in the workspace change.
 
     Returns
     -------
     left : float
-        Norm of the residual as a fraction of the tolerance; the larger of gaps and rates.
+        Norm of the residual as a fraction of the tolerance: the larger value of gaps and rates.
     joint : int
-        Joint to release, or −1.
+        Joint to release, or −1 if none.
     """
     rows, p, off, most, gives = ws.rows, ws.counts[ka.ROWS], 0.0, 0.0, -1
     row_errors(ws)
@@ -139,10 +143,10 @@ def contradiction(unilateral: UnilateralArrays, ws: Workspace):
 
 @internal_kernel
 def first_to_slip(unilateral: UnilateralArrays, errors, norm):
-    """Return the held joint that slips first as forces against these errors grow; −1 if none is involved.
+    """Return the held joint that slips first as the forces that oppose these errors grow; −1 if none is involved.
 
-    The errors lie along the only combination w of rows with wᵀ J = 0, so forces can change along w without changing the
-    motion. They grow against the errors until one of them reaches the bound that opposes its error.
+    The errors are along the only combination w of rows with wᵀ J = 0, so forces can change along w without changing the
+    motion. The forces grow against the errors until one of them reaches the bound that opposes its error.
     """
     table, least, joint, forces = unilateral.dry_table, math.inf, -1, unilateral.vector[0]
     for k in range(table.shape[0]):
@@ -156,16 +160,16 @@ def first_to_slip(unilateral: UnilateralArrays, errors, norm):
 
 @noinline_kernel
 def release_joint(system: System, ws: Workspace, run: Run):
-    """Release a held joint that contradicts other rows, so that these rows can turn it; True if there was one.
+    """Release a held joint that contradicts other rows, so that these rows can turn it; return whether one was found.
 
-    Call right after :func:`evaluate`, then choose all modes. If the rate of the joint is only rounding, it is held
-    again in its new position.
+    Call this function right after :func:`evaluate`, and then choose all modes. If the rate of the joint is only a
+    rounding error, the joint is held again in its new position.
     """
     unilateral, mode, y, layout = system.unilateral, system.unilateral.mode, run.y, system.layout
     if unilateral.number[ku.REDUNDANT] == 0.0:
         return False
     left, k = contradiction(unilateral, ws)
-    # Half of the growth suffices: rounding changes the value at which the event was located.
+    # Half of the growth is sufficient, because rounding changes the value at which the event was located.
     if k < 0 or left < 0.5 * (unilateral.number[ku.LEFT] + release_limit(unilateral)):
         return False
     unilateral.dry_table[k, ku.DRY_HOLDS] = 0
@@ -186,24 +190,25 @@ LOG_KINDS = 8
 # Columns of the tally that count landings, lift-offs, starts of slip and bounces.
 COUNTERS = (ku.LANDINGS, ku.LIFT_OFFS, ku.SLIP_STARTS, -1, ku.BOUNCES)
 
-# Run.gaps: gap, its rate, normal and position of a candidate at the start of the step, its slip along REFERENCE and the
-# rate of that slip.
+# Run.gaps: gap, gap rate, normal and position of a candidate at the start of the step, slip along REFERENCE, and the
+# rate of this slip.
 GAP_THEN, RATE_THEN, NORMAL_THEN, POSITION_THEN, SLIP_THEN, SLIP_RATE_THEN = 0, 1, 2, 5, 8, 9
 
-# A candidate that starts or comes to rest this close to its surface touches it [m].
+# A candidate that starts or comes to rest at most this far from its surface touches it [m].
 TOUCH = 1e-9
-# More than MOST_EVENTS events of one candidate or stop in WINDOW [s] are chatter; the speed below which impacts settle
-# then grows tenfold, up to MOST_SETTLE [m/s or rad/s].
+# More than MOST_EVENTS events of one candidate or stop within WINDOW [s] count as chatter; the speed below which
+# impacts settle is then raised tenfold, up to MOST_SETTLE [m/s or rad/s].
 WINDOW, MOST_EVENTS, MOST_SETTLE = 1.0, 200, 1e-2
-# More changes at one instant (of length INSTANT [s]), or more chatter of one candidate or stop, end the run.
+# If more changes than this occur at one instant (of length INSTANT [s]), or one candidate or stop chatters more often
+# than this, the run ends.
 MOST_CHANGES, MOST_CHATTER = 60, 100
 INSTANT = 1e-11
-# A frozen direction of slip is updated when friction has turned from it by the angle with this tangent.
+# A frozen slip direction is updated when friction has turned away from it by more than the angle with this tangent.
 TURNED = 0.5
 # At the limit of the best split, sticking is still a solution. For the choice of modes, friction at rest is therefore
-# reduced by FIRST_REDUCTION, then by ten times as much at each trial up to MOST_REDUCTION, until the chosen modes agree
-# with their forces: far above rounding and the tolerances of the choice, far below the uncertainty of friction
-# coefficients.
+# reduced by FIRST_REDUCTION, and by ten times as much in each further trial up to MOST_REDUCTION, until the chosen
+# modes agree with their forces. These values are far above rounding and the tolerances of the choice, and far below the
+# uncertainty of friction coefficients.
 FIRST_REDUCTION, MOST_REDUCTION = 1e-5, 2e-3
 # Fraction of the largest force below which the normal force of a sticking point at its limit counts as zero.
 NO_FORCE = 1e-8
@@ -229,7 +234,7 @@ def contact_guard(contacts: ContactArrays, unilateral: UnilateralArrays | None, 
     mode = ws.active[k, ka.MODE]
     if kind == NORMAL_GUARD:
         if mode == ka.STICKING and unilateral.number[ku.SPLIT] == 1.0 and normal_is_open(unilateral, ws, k):
-            # The least possible normal force touches zero without crossing it.
+            # The minimum possible normal force reaches zero without crossing it.
             return approach_without_force(contacts, unilateral, ws, k)
         return (
             ws.contacts[k, ka.GAP] + unilateral.slide[k, ku.LANDS_AT]
@@ -239,21 +244,22 @@ def contact_guard(contacts: ContactArrays, unilateral: UnilateralArrays | None, 
     if mode == ka.SLIDING and contacts.law[k, ka.STATIC] > 0.0:
         return unilateral.slide[k, ku.SPEED] + unilateral.slide[k, ku.HEADWAY] + BACKWARD
     if mode == ka.STICKING:
-        # Dependent rows whose split of least norm is outside the cones: the forces are the smallest inside, lie on a
-        # cone, and do not show the remaining margin. If no split fits, the best one shows the contacts at the limit.
+        # If the split of least norm of dependent rows is outside the cones, the forces are the smallest ones inside.
+        # They lie on a cone and do not show the remaining margin. If no split is inside all cones, the best one shows
+        # which contacts are at their limit.
         return best_margin_or(unilateral, margin(contacts, unilateral, ws, k))
     return 1.0
 
 
 @internal_kernel
 def rest_margin(unilateral: UnilateralArrays, ws: Workspace, k):
-    """Return 1 if held dry-friction joint k does not accelerate, below 0 if its row can no longer hold it.
+    """Return 1 if held dry-friction joint k does not accelerate, or a value below 0 if its row can no longer hold it.
 
-    Rows may depend on each other in one posture only, such as the rows of a joint and of a point at the crest of a
-    surface. Next to this posture they contradict each other, at first by less than the rank of their system shows, and
-    the least-squares solution leaves accelerations along them. The joint slides when modes are chosen again. It counts
-    as accelerated above the limit of that choice, or above twice the acceleration left then if the choice held it
-    anyway. Below this limit, rates and gaps along the rows show the contradiction in time.
+    Rows may depend on each other in a single posture, such as the rows of a joint and of a point at the crest of a
+    surface. Near this posture they contradict each other, at first by less than the rank of their system reveals, and
+    the least-squares solution leaves accelerations along them. The joint slides when modes are chosen again. The joint
+    counts as accelerating above the limit of that choice or, if the choice held it anyway, above twice the acceleration
+    that remained then. Below this limit, rates and gaps along the rows reveal the contradiction in time.
     """
     if unilateral.number[ku.REDUNDANT] == 0.0:
         return 1.0
@@ -270,20 +276,21 @@ def best_margin_or(unilateral: UnilateralArrays, own):
 
 @internal_kernel
 def held_joint_accelerates(unilateral: UnilateralArrays, ws: Workspace, k):
-    """True if the event of held dry-friction joint k is that it accelerates, not that its force is at the bound."""
+    """Return whether the event of held dry-friction joint k is an acceleration and not a force at its bound."""
     force_margin = best_margin_or(unilateral, dry_margin(unilateral, ws, k))
     return dry_bound(unilateral, k) * rest_margin(unilateral, ws, k) < force_margin
 
 
 @internal_kernel
 def too_long(model: ModelArrays, contacts: ContactArrays, unilateral: UnilateralArrays | None, ws: Workspace, h, gaps):
-    """Return the fraction of the step to take instead if it has passed over an event, or 1.
+    """Return the fraction of the step that should be taken instead if it has passed over an event, or 1.
 
-    An open candidate may dip below its surface, or a joint beyond its open stop, and be out again at the end: the
-    minimum of the cubic through gaps and gap rates at both ends shows this; ``gaps``, (c, GAPS_SIZE), has the values at
-    the start. In the same way the slip of a point, or the rate of a joint with dry friction, may have reversed twice.
-    A candidate may have gone through a body: it is then on the other side and has moved at least the sum of both gaps.
-    A point with a frozen slip direction may have become fast across it, where friction would act along its slip.
+    An open candidate may dip below its surface, or a joint may move beyond its open stop, and be outside again at the
+    end of the step. The minimum of the cubic through the gaps and gap rates at both ends reveals this; ``gaps``,
+    (c, GAPS_SIZE), contains the values at the start. In the same way, the slip of a point or the rate of a joint with
+    dry friction may have reversed twice. A candidate may have passed through a body: it is then on the other side and
+    has moved at least by the sum of both gaps. A point with a frozen slip direction may have become fast across this
+    direction, so that friction should act along its actual slip.
     """
     fraction = 1.0
     if unilateral is None:  # resolved at compile time
@@ -294,7 +301,7 @@ def too_long(model: ModelArrays, contacts: ContactArrays, unilateral: Unilateral
             joint, side = unilateral.dry_table[k, ku.DRY_JOINT], dry[k, ku.DRY_SIDE]
             then, now = h * side * dry[k, ku.DRY_ACCELERATION_THEN], h * side * ws.joints[joint, ka.QDD]
             before, after = side * dry[k, ku.DRY_RATE_THEN], side * ws.joints[joint, ka.QD]
-            # A joint slower than CREEP hardly moves, and a search for its reversals makes some contacts chatter.
+            # A joint slower than CREEP hardly moves, and searching for its reversals would make some contacts chatter.
             slack = dry[k, ku.DRY_HEADWAY] + unilateral.number[ku.CREEP]
             fraction = min(fraction, dip(before, then, after, now, slack))
     for k in range(gaps.shape[0]):
@@ -309,7 +316,7 @@ def too_long(model: ModelArrays, contacts: ContactArrays, unilateral: Unilateral
                 fraction = min(fraction, max(1.5 * slow / speed, 0.01))
         if slips_along(contacts, ws, k):
             then, now = h * gaps[k, SLIP_RATE_THEN], h * slip_rate(model, contacts, unilateral, ws, k)
-            # Slower slip hardly has a direction, and a search for its reversals makes some contacts chatter.
+            # Slower slip hardly has a direction, and searching for its reversals would make some contacts chatter.
             slack = unilateral.slide[k, ku.HEADWAY] + slow
             fraction = min(fraction, dip(gaps[k, SLIP_THEN], then, unilateral.slide[k, ku.SPEED], now, slack))
         if passes_through(ws, gaps, k):
@@ -328,7 +335,7 @@ def too_long(model: ModelArrays, contacts: ContactArrays, unilateral: Unilateral
 
 @internal_kernel
 def slips_along(contacts: ContactArrays, ws: Workspace, k):
-    """True if candidate k slides with friction; the sign of its slip along REFERENCE decides the direction."""
+    """Return whether candidate k slides with friction, whose direction depends on the sign of slip along REFERENCE."""
     return ws.active[k, ka.MODE] == ka.SLIDING and contacts.law[k, ka.STATIC] > 0.0
 
 
@@ -349,9 +356,9 @@ def slip_rate(model: ModelArrays, contacts: ContactArrays, unilateral: Unilatera
 
 @internal_kernel
 def dip(g0, d0, g1, d1, depth):
-    """Return the fraction of a step at which the cubic through gaps g with changes d per step dips below −depth; or 1.
+    """Return the fraction of a step at which the cubic through gaps g with changes d per step is below −depth, or 1.
 
-    It is the position of the minimum.
+    The fraction is the position of the cubic's minimum.
     """
     if d0 >= 0.0 or d1 <= 0.0:
         return 1.0
@@ -363,10 +370,10 @@ def dip(g0, d0, g1, d1, depth):
 
 @internal_kernel
 def lowest(d0, a, b):
-    """Return where d0 x + a x² + b x³ has a minimum between 0 and 1, or 1."""
+    """Return the position between 0 and 1 at which d0 x + a x² + b x³ has a minimum, or 1 without a minimum."""
     root, x = a * a - 3.0 * b * d0, 1.0
     if root > 0.0:
-        # This form of the root has no cancellation.
+        # This form of the root avoids cancellation.
         if d0 < 0.0 and a + math.sqrt(root) != 0.0:
             x = -d0 / (a + math.sqrt(root))
         elif d0 >= 0.0 and a < 0.0 and b > 0.0:
@@ -376,7 +383,7 @@ def lowest(d0, a, b):
 
 @internal_kernel
 def passes_through(ws: Workspace, gaps, k):
-    """True when open candidate k may have gone through a body within the step.
+    """Return whether open candidate k may have passed through a body within the step.
 
     A distance changes by at most the length of the point's path, so the path must be at least as long as both gaps
     together; a path that bends by half a turn is π/2 times as long as its chord.
@@ -395,7 +402,7 @@ def passes_through(ws: Workspace, gaps, k):
 
 @internal_kernel
 def note_gaps(model: ModelArrays, contacts: ContactArrays, unilateral: UnilateralArrays | None, ws: Workspace, gaps):
-    """Record gaps, slip, rates of joints, normals and positions at the start of a step, for :func:`too_long`."""
+    """Record gaps, slip, joint rates, normals and positions at the start of a step; :func:`too_long` needs them."""
     if unilateral is None:  # resolved at compile time
         return
     for k in range(unilateral.dry.shape[0]):
@@ -446,9 +453,9 @@ def watch_modes(
 
 @internal_kernel
 def take_directions(unilateral: UnilateralArrays | None, ws: Workspace, run: Run):
-    """Freeze slip directions of points that have become slow, release them if fast again; after the samples of a step.
+    """Freeze slip directions of points that have become slow, and release them if fast again; call after sampling.
 
-    Friction does not jump: a direction is frozen along the slip, and released when it is along the slip.
+    Friction does not jump, because a direction is frozen along the slip and released when it is again along the slip.
     """
     if unilateral is None:
         return
@@ -462,7 +469,7 @@ def take_directions(unilateral: UnilateralArrays | None, ws: Workspace, run: Run
         if fast or not frozen:
             put_vector(slide, k, ku.REFERENCE, vector(slide, k, ku.NEXT))
         elif speed * speed > along * along + (TURNED * slow) ** 2:
-            # Start from the direction of friction, see slide_direction. Slip across it relaxes: the method restarts.
+            # Start from the direction of friction, see slide_direction. Slip across it relaxes, so the method restarts.
             for s in range(3):
                 slide[k, ku.REFERENCE + s] = (slow - along) * slide[k, ku.REFERENCE + s] + speed * slide[k, ku.NEXT + s]
             run.count[ki.STARTED] = 0
@@ -475,8 +482,8 @@ def take_directions(unilateral: UnilateralArrays | None, ws: Workspace, run: Run
 def stay_tangential(slide, ws: Workspace, k):
     """Keep a frozen direction tangential to the surface, whose normal turns as the point moves.
 
-    A point without friction may never have slipped; its direction is then zero, or rounding along the normal, which is
-    removed.
+    A point without friction may never have slipped; its direction is then zero, or a rounding error along the normal,
+    which is removed.
     """
     state, size, along = ws.contacts, 0.0, 0.0
     for s in range(3):
@@ -484,7 +491,7 @@ def stay_tangential(slide, ws: Workspace, k):
     for s in range(3):
         slide[k, ku.REFERENCE + s] -= along * state[k, ka.NORMAL + s]
         size += slide[k, ku.REFERENCE + s] ** 2
-    # Without friction there may be no direction yet.
+    # A point without friction may not have a direction yet.
     if size > 0.0:
         for s in range(3):
             slide[k, ku.REFERENCE + s] /= math.sqrt(size)
@@ -492,9 +499,10 @@ def stay_tangential(slide, ws: Workspace, k):
 
 @internal_kernel
 def at_limit(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Workspace, k):
-    """True if candidate k, whose slip guard has fallen through zero, begins to slip or leaves.
+    """Return whether candidate k, whose slip guard has fallen through zero, begins to slip or leaves.
 
-    The guards of dependent rows fall together, with the largest worst margin. Candidates with a larger margin hold.
+    The guards of dependent rows fall through zero together, with the best worst-case margin. Candidates with a larger
+    margin continue to stick.
     """
     if unilateral.number[ku.SPLIT] == 0.0:
         return True
@@ -509,7 +517,7 @@ def split_slack(ws: Workspace):
 
 @internal_kernel
 def consistent(system: System, ws: Workspace):
-    """True when all forces agree with their modes, right after ``derivative``."""
+    """Return whether all forces agree with their modes; call right after ``derivative``."""
     unilateral, table = system.unilateral, system.unilateral.stop_table
     slack = force_slack(ws)
     for k in range(table.shape[0]):
@@ -534,7 +542,7 @@ def solve_modes(system: System, ws: Workspace, run: Run, first):
     before = ws.counts[ka.DEPENDENT]
     resolve(system, ws, run, TOUCH)
     record_residual(system.unilateral, ws)
-    # Do not count dependent rows that were held together only on trial.
+    # Do not count dependent rows of modes that were only tried.
     ws.counts[ka.DEPENDENT] = before
     if not first:
         log_changes(system, ws, run)
@@ -545,11 +553,11 @@ def solve_modes(system: System, ws: Workspace, run: Run, first):
 
 @internal_kernel
 def split_ends(system: System, ws: Workspace, run: Run):
-    """True if the best split of several points and joints that stick together has reached its limit.
+    """Return whether the best split among several points and joints that stick together has reached its limit.
 
-    The set that then starts to slip, and its forces, are discontinuous: a single point or joint would be only part of
-    that set. A single sticking point that shares its force with no joint or stop starts alone, in the direction of its
-    friction.
+    At this limit, several of them start to slip at once and their forces jump, so the mode of a single point or joint
+    must not be changed alone. A single sticking point that shares its force with no joint or stop starts to slip alone,
+    in the direction of its friction.
     """
     unilateral, strongest = system.unilateral, 0.0
     if unilateral.number[ku.SPLIT] == 0.0:
@@ -563,12 +571,13 @@ def split_ends(system: System, ws: Workspace, run: Run):
         kind, k = run.event_table[e, ki.EVENT_KIND], run.event_table[e, ki.EVENT_INDEX]
         if kind < NORMAL_GUARD or run.event[e, ki.VALUE] > 0.0:
             continue
-        # A joint that shares its force with no other row begins to slip alone, even if other rows share theirs.
+        # A joint that shares its force with no other row begins to slip alone, even if other rows share their forces.
         if kind == DRY_GUARD and unilateral.dry_table[k, ku.DRY_HOLDS] == 1 and joint_shares(unilateral, ws, k):
             return True
         if kind == STOP_GUARD and unilateral.stop_table[k, ku.STOP_CLOSED] == 1 and stops > 0:
             return True
-        # A point at the apex of its cone leaves; if its friction drops, modes are chosen at full friction.
+        # A point at the apex of its cone leaves. If friction drops when the point slips, modes are chosen at full
+        # friction.
         if kind == SLIP_GUARD and ws.active[k, ka.MODE] == ka.STICKING and not friction_drops(system, k):
             pressed = ws.rows[ws.active[k, ka.FIRST_ROW], ka.FORCE] > NO_FORCE * strongest
             if pressed and point_shares(unilateral, ws, k) and at_limit(system.contacts, unilateral, ws, k):
@@ -580,7 +589,7 @@ def split_ends(system: System, ws: Workspace, run: Run):
 def solve_reduced(system: System, ws: Workspace, run: Run):
     """Choose all modes with slightly reduced friction at rest and log the changes.
 
-    Returns False and restores everything if no choice agrees.
+    Returns False and restores everything if no choice agrees with its forces.
     """
     number, clock = system.unilateral.number, run.clock
     before, not_unique, reduction = ws.counts[ka.DEPENDENT], clock[ki.NOT_UNIQUE], FIRST_REDUCTION
@@ -589,7 +598,7 @@ def solve_reduced(system: System, ws: Workspace, run: Run):
     while not agrees and reduction <= MOST_REDUCTION:
         number[ku.HOLDING] = 1.0 - reduction
         resolve(system, ws, run, TOUCH)
-        # At full friction, modes in which too much sticks would agree.
+        # Check at the reduced friction: at full friction, modes in which too many contacts stick would also agree.
         agrees = run.count[ki.STATUS] == ki.RUNNING and consistent(system, ws)
         if not agrees:
             restore_modes(system, ws, run)
@@ -608,7 +617,7 @@ def solve_reduced(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def rearm(run: Run):
-    """Set all guards of the unilateral law to their positive side."""
+    """Mark all guards of the unilateral law as being on their positive side."""
     for e in range(run.event.shape[0]):
         if run.event_table[e, ki.EVENT_KIND] >= NORMAL_GUARD:
             run.event[e, ki.SIDE], run.event[e, ki.VALUE] = 1.0, 1.0
@@ -616,7 +625,7 @@ def rearm(run: Run):
 
 @internal_kernel
 def count_changes(system: System, run: Run):
-    """End a run whose modes keep changing without time passing."""
+    """End the run if its modes keep changing at the same instant."""
     number = system.unilateral.number
     number[ku.CHANGES] = number[ku.CHANGES] + 1.0 if run.clock[ki.TIME] - number[ku.LAST_CHANGE] <= INSTANT else 1.0
     number[ku.LAST_CHANGE] = run.clock[ki.TIME]
@@ -626,7 +635,7 @@ def count_changes(system: System, run: Run):
 
 @internal_kernel
 def log(run: Run, code):
-    """Write an event to the log; if the log is full, only the entry is lost."""
+    """Write an event to the log; if the log is full, the entry is lost but the run continues."""
     count = run.count
     if count[ki.LOGGED] < run.log_time.shape[0]:
         run.log_time[count[ki.LOGGED]], run.log_event[count[ki.LOGGED]] = run.clock[ki.TIME], code
@@ -670,7 +679,7 @@ def log_stop(system: System, run: Run, k, kind):
 
 @internal_kernel
 def watch_chatter(run: Run, table, k, settle, first):
-    """Count an event of row k, with SETTLE in column ``settle``; on chatter, impacts settle from a higher speed.
+    """Count an event of row k, with SETTLE in column ``settle``; in case of chatter, raise the settling speed.
 
     Log codes begin at ``first``.
     """
@@ -703,7 +712,7 @@ def log_changes(system: System, ws: Workspace, run: Run):
             log_contact(system, run, k, BOUNCE)
     for k in range(table.shape[0]):
         before, closed = table[k, ku.STOP_BEFORE] == 1, table[k, ku.STOP_CLOSED] == 1
-        # A joint may be driven away from its stop in the instant of its hit.
+        # A joint may be driven away from its stop at the same instant at which it hits the stop.
         struck = table[k, ku.STOP_STRUCK] == 1
         if not before and (closed or struck):
             log_stop(system, run, k, STOP_HIT)
@@ -713,7 +722,7 @@ def log_changes(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def log_joints(unilateral: UnilateralArrays, run: Run):
-    """Log joints that dry friction has begun or ceased to hold since their state in DRY_TOLD."""
+    """Log joints that dry friction has begun or ceased to hold since the state stored in DRY_TOLD."""
     for k in range(unilateral.dry_table.shape[0]):
         log_joint(unilateral, run, k, 1 if dry_rests(unilateral, k) else 0)
 
@@ -729,7 +738,7 @@ def log_joint(unilateral: UnilateralArrays, run: Run, k, holds):
 
 @internal_kernel
 def break_loose(unilateral: UnilateralArrays, ws: Workspace, k):
-    """Let joint k, which dry friction no longer holds, slide against it; False if its slip has ended."""
+    """Let joint k, which dry friction no longer holds, slide; return False if its slip has ended."""
     table, split = unilateral.dry_table, unilateral.number[ku.SPLIT] == 1.0
     if table[k, ku.DRY_HOLDS] == 0:
         return False
@@ -742,7 +751,7 @@ def break_loose(unilateral: UnilateralArrays, ws: Workspace, k):
 
 @noinline_kernel
 def switch_contacts(unilateral: UnilateralArrays | None, system: System, ws: Workspace, run: Run):
-    """Change modes at the contact events that end the accepted step; the method restarts at the next step."""
+    """Change the modes at contact events that end the accepted step; the method restarts at the next step."""
     if unilateral is None:
         return
     mode, table = unilateral.mode, unilateral.stop_table
@@ -787,7 +796,7 @@ def switch_contacts(unilateral: UnilateralArrays | None, system: System, ws: Wor
         elif ws.active[k, ka.MODE] == ka.OPEN:
             directly = False
         elif kind == NORMAL_GUARD and mode[k, ku.WANTED] == ka.STICKING and unilateral.number[ku.SPLIT] == 1.0:
-            # The others may start to slip as it leaves.
+            # Other points may start to slip when this one leaves.
             mode[k, ku.LEAVES], directly, leaves = 1, False, True
         elif kind == NORMAL_GUARD:
             mode[k, ku.WANTED] = ka.OPEN
@@ -797,12 +806,12 @@ def switch_contacts(unilateral: UnilateralArrays | None, system: System, ws: Wor
                 continue
             r = ws.active[k, ka.FIRST_ROW]
             if ws.rows[r, ka.FORCE] <= NO_FORCE * strongest:
-                # At the apex of its cone it leaves; there is no direction in which it could slip.
+                # At the apex of its cone, the point leaves, because no direction exists in which it could slip.
                 mode[k, ku.WANTED] = ka.OPEN
                 log_contact(system, run, k, LIFT_OFF)
                 continue
             if friction_drops(system, k):
-                # Forces jump, and the slip direction with them.
+                # The forces jump, and so does the slip direction.
                 mode[k, ku.KINETIC_ONLY], directly = 1, False
                 continue
             begin_slip(system, ws, k, ws.rows[r + 1, ka.FORCE], ws.rows[r + 2, ka.FORCE])
@@ -810,7 +819,7 @@ def switch_contacts(unilateral: UnilateralArrays | None, system: System, ws: Wor
             mode[k, ku.WANTED], begins = ka.SLIDING, True
             log_contact(system, run, k, SLIP_START)
         elif mode[k, ku.WANTED] == ka.SLIDING:
-            # Either slip has only turned, or all modes must be chosen.
+            # If the slip has only turned, it continues; otherwise all modes must be chosen.
             directly = slip_on(unilateral, ws, k, 10.0 * unilateral.number[ku.SLOW]) and directly
     if directly:
         keep_shares(unilateral, ws, mode[:, ku.WANTED])
@@ -820,7 +829,7 @@ def switch_contacts(unilateral: UnilateralArrays | None, system: System, ws: Wor
         log_joints(unilateral, run)
         rearm(run)
         count_changes(system, run)
-    # When one leaves, points that start to slip hardly accelerate yet: with full friction they would seem at rest.
+    # When a point leaves, points that start to slip hardly accelerate yet; at full friction they would seem to rest.
     elif not leaves or not solve_reduced(system, ws, run):
         solve_modes(system, ws, run, False)
     run.count[ki.STARTED] = 0

@@ -1,6 +1,7 @@
 """Impacts: touching contacts are projected onto their surfaces, and impulses stop or reverse their approach.
 
-Moreau's law with Newton's restitution and Coulomb's cone on impulses, for all touching contacts and stops at once.
+The law is Moreau's, with Newton's restitution and Coulomb's cone for impulses; it is solved for all touching contacts
+and stops at once.
 """
 
 from __future__ import annotations
@@ -33,20 +34,23 @@ from dynsim.integrators import run as kp
 from dynsim.integrators.run import Run, project_level
 from dynsim.jit.kernel import internal_kernel, noinline_kernel
 
-# An approach faster than this many times the projection tolerance of rates is an impact.
+# An approach is an impact if it is faster than this multiple of the projection tolerance for rates.
 STRIKE = 3.0
-# Successive impacts at one instant after which restitution is zero.
+# Number of successive impacts at one instant after which restitution is zero.
 MOST_BOUNCES = 30.0
-# Newton starts for an impact problem with restitution, which has no solution if restitution contradicts friction.
+# Number of Newton starts for an impact problem with restitution; it has no solution if restitution contradicts
+# friction.
 BOUNCE_STARTS = 40
-# A point that begins to touch is brought this close to its surface [m].
+# Distance from its surface within which a point that begins to touch is brought [m].
 FOOT_TOLERANCE = 1e-13
-# Projections that leave more than this fraction of a gap converge linearly: the point approaches a singular posture.
+# A projection that leaves more than this fraction of a gap converges only linearly, because the point approaches a
+# singular posture.
 SLOWLY = 0.1
-# Solution of the cones: residual relative to the largest entry, and fraction of the largest force that counts as zero.
+# Tolerances of the contact problem: residual relative to the largest entry, and fraction of the largest force that
+# counts as zero.
 CONE_TOLERANCE, FORCE_TOLERANCE = 1e-9, 1e-9
-# If all rates or accelerations are smaller, the goal of residuals is relative to this instead: with closed brakes a
-# point has motions of 1e-30, and no force on it improves on zero force [m/s, m/s²].
+# If all rates or accelerations are smaller than this, the target of the residual is relative to this value instead
+# [m/s, m/s²]: with closed brakes a point has motions of 1e-30, and no force gives a smaller residual than zero force.
 IMMOBILE = 1e-3
 # The search for another solution of an impact starts with forces that give this fraction of the largest rate.
 OTHER_START = 1e-6
@@ -54,7 +58,7 @@ OTHER_START = 1e-6
 
 @internal_kernel
 def evaluate(system: System, ws: Workspace, run: Run):
-    """Evaluate the right-hand side at the present state with the present modes, and the errors of its rows."""
+    """Evaluate the right-hand side and the row errors at the present state with the present modes."""
     derivative(system, run.clock[ki.TIME], run.y, ws, run.stage[0])
     run.count[ki.EVALUATIONS] += 1
     row_errors(ws)
@@ -75,14 +79,15 @@ def strike_limit(ws: Workspace, k):
 
 @internal_kernel
 def find_touching(system: System, ws: Workspace, touch):
-    """Mark candidates and stops that touch and do not leave; True if any of them approaches.
+    """Mark candidates and stops that touch and do not leave; return whether any of them approaches.
 
-    A point that no joint can move along its normal in this posture does not touch: its force would be arbitrary.
-    Neither does a point that a projection could bring onto its surface only by changing the posture. If the posture
-    changes, the point lands as soon as it is deeper than now.
+    A point that no joint can move along its normal in this posture does not count as touching, because its force would
+    be arbitrary. The same applies to a point that a projection could bring onto its surface only by changing the
+    posture. If the posture changes, the point lands as soon as it is deeper than now.
 
-    When an unpressed point leaves, open points that rest at their surfaces stay open, and land if they move deeper:
-    if closed, one of them could hold the others in place although nothing presses it either, and leave at once.
+    When a point leaves because nothing presses it, open points that rest at their surfaces stay open, and land if they
+    move deeper. If they were closed, one of them could hold the others in place although nothing presses it either, and
+    would leave at once.
     """
     unilateral = system.unilateral
     state, mode, table = ws.contacts, unilateral.mode, unilateral.stop_table
@@ -102,7 +107,7 @@ def find_touching(system: System, ws: Workspace, touch):
         mode[k, ku.TOUCHING] = 1 if near else 0
         if near and state[k, ka.GAP_RATE] < -limit:
             mode[k, ku.STRUCK] = 1
-        # A point that lands is stopped however slow it is: nothing else would stop it if it stayed open.
+        # A landing point is stopped even if it is slow, because nothing else would stop it if it stayed open.
         strikes = strikes or (near and state[k, ka.GAP_RATE] < (-limit if closed else 0.0))
     for k in range(table.shape[0]):
         rate = stop_rate(unilateral, ws, k)
@@ -128,15 +133,15 @@ def keep_touching(unilateral: UnilateralArrays, ws: Workspace):
 
 @internal_kernel
 def close_touching(system: System, ws: Workspace, run: Run):
-    """Bring touching points and joints onto their surfaces and stops, to rounding, before they are held in position.
+    """Bring touching points and joints onto their surfaces and stops, up to rounding, before they are held.
 
     A point lands slightly below its surface. If rows depend on each other, like the rows of a point on a body with one
-    degree of freedom, there might be no state at which its normal row and the tangential rows of a point of contact
-    above the surface all vanish. A point about to bounce is not held: lifted at each bounce, it would bounce
-    indefinitely.
+    degree of freedom, there might be no state at which its normal row and the tangential rows of a contact point above
+    the surface all vanish. A point that is about to bounce is not moved: if it were lifted at each bounce, it would
+    bounce indefinitely.
 
-    Joints that dry friction holds do not move, unless that contradicts a stop or point that comes down with them: then
-    friction lets them move, by at most the gaps to close, and holds them in their new positions.
+    Joints that dry friction holds do not move, unless this contradicts a stop or point that comes down with them. In
+    that case, friction lets them move, by at most the gaps to close, and holds them in their new positions.
     """
     unilateral = system.unilateral
     mode, table = unilateral.mode, unilateral.dry_table
@@ -162,12 +167,12 @@ def close_touching(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def project_down(system: System, ws: Workspace, run: Run):
-    """Project positions onto the active rows, to rounding if possible; False if the rows cannot be met."""
+    """Project positions onto the active rows, up to rounding if possible; return False if the rows cannot be met."""
     before = worst = math.inf
     for trial in range(1 + kp.PROJECTION_LIMIT):
         evaluate(system, ws, run)
         worst = largest_of_rows(ws, ka.ROW_GAP)
-        # If a point is nearly immobile along its normal, steps only halve the distance to where it is fully immobile.
+        # If a point is nearly immobile along its normal, each step only halves the distance to full immobility.
         if worst <= FOOT_TOLERANCE or SLOWLY * before < worst <= kp.GAP_TOLERANCE or trial == kp.PROJECTION_LIMIT:
             break
         before = worst
@@ -177,7 +182,7 @@ def project_down(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def begin_problem(unilateral: UnilateralArrays, couplings, count):
-    """Write ``count`` joint rows, the first ``couplings`` of them couplings, as the first of a contact problem."""
+    """Write ``count`` joint rows, of which the first ``couplings`` are couplings, as the first rows of the problem."""
     index, vector, bounded = unilateral.index, unilateral.vector, couplings + dry_rows_held(unilateral)
     for r in range(count):
         index[ku.KINDS, r] = kc.BOTH_WAYS if r < couplings else kc.BOX if r < bounded else kc.ONE_WAY
@@ -218,9 +223,9 @@ def fill_problem(unilateral: UnilateralArrays, ws: Workspace, size):
 
 @internal_kernel
 def gather(system: System, ws: Workspace, run: Run):
-    """Write normal and tangential rows of everything that touches, and their system, into the workspace.
+    """Write the normal and tangential rows of all touching contacts, stops and joints, and their system.
 
-    Writes kinds and table rows of the rows into ``unilateral.index``; returns the number of rows.
+    The kinds and table rows of these rows are written to ``unilateral.index``. Returns the number of rows.
     """
     unilateral, mode = system.unilateral, system.unilateral.mode
     close_touching(system, ws, run)
@@ -237,14 +242,14 @@ def gather(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def solve_problem(unilateral: UnilateralArrays, W, size, largest, starts):
-    """Solve the contact problem of ``unilateral.vector`` and W, (size, size), into SOLUTION; False on failure.
+    """Solve the contact problem of ``unilateral.vector`` and W, (size, size), into SOLUTION; return False on failure.
 
     Parameters
     ----------
     largest : float
-        Largest of the rates or accelerations to bring to zero.
+        Largest of the rates or accelerations that the forces must bring to zero.
     starts : int
-        Starts of Newton's method before a problem that may have no solution is given up; 0: unlimited.
+        Number of starts of Newton's method before a problem that may have no solution is abandoned; 0: unlimited.
     """
     vector, room, kind = unilateral.vector, unilateral.room[ku.SCRATCH :], unilateral.index[ku.KINDS]
     b, mu, f, good = vector[ku.OFFSET], vector[ku.CONE_FRICTION], vector[ku.SOLUTION], 1e-2 * CONE_TOLERANCE
@@ -266,7 +271,7 @@ def friction_at_rest(system: System, k):
 
 @internal_kernel
 def friction_of_impact(system: System, ws: Workspace, k):
-    """Return the coefficient of friction of candidate k in an impact: at the slip before it, or static if at rest."""
+    """Return the friction coefficient of candidate k in an impact: at the slip before it, or static if at rest."""
     slip, before = slip_speed(ws, k), system.unilateral.mode[k, ku.BEFORE]
     if before == ka.STICKING or (before == ka.OPEN and slip <= system.unilateral.number[ku.SLOW]):
         return friction_at_rest(system, k)
@@ -275,21 +280,21 @@ def friction_of_impact(system: System, ws: Workspace, k):
 
 @internal_kernel
 def impulses(system: System, ws: Workspace, p, largest, share):
-    """Solve for the impulses of :func:`impact` with ``share`` of the restitutions; write row losses into FORCE [J].
+    """Solve for the impulses of :func:`impact` with restitution times ``share``; write losses of rows to FORCE [J].
 
-    Returns False if there is no solution, or only one that would create energy.
+    Returns False if no solution exists, or if the solution would create energy.
     """
     unilateral, rows = system.unilateral, ws.rows
     vector, mode = unilateral.vector, unilateral.mode
     for r in range(p):
         vector[ku.OFFSET, r], vector[ku.SOLUTION, r] = rows[r, ka.ROW_RATE], 0.0
-        # Dry friction of joints is bounded and takes no impulse.
+        # The dry friction of joints is bounded and therefore transmits no impulse.
         vector[ku.CONE_FRICTION, r] = 0.0
     for k in range(mode.shape[0]):
         if mode[k, ku.TOUCHING] == 1:
             r = ws.active[k, ka.FIRST_ROW]
             vector[ku.CONE_FRICTION, r] = friction_of_impact(system, ws, k)
-            # A closed point had no speed to reverse: a brake or another impact has just caused this speed.
+            # A closed point has no approach speed to reverse; a brake or another impact has just caused its speed.
             falls = mode[k, ku.STRUCK] == 1 and mode[k, ku.BEFORE] == ka.OPEN
             if falls and -rows[r, ka.ROW_RATE] > unilateral.tally[k, ku.SETTLE]:
                 vector[ku.OFFSET, r] *= 1.0 + share * system.contacts.law[k, ka.RESTITUTION]
@@ -299,7 +304,7 @@ def impulses(system: System, ws: Workspace, p, largest, share):
     f, total, turnover = vector[ku.SOLUTION], 0.0, 0.0
     for r in range(p):
         after = affine_row(ws.small[0], f, rows[:, ka.ROW_RATE], p, r)
-        # FORCE is free until the next evaluation.
+        # FORCE is unused until the next evaluation.
         rows[r, ka.FORCE] = -0.5 * f[r] * (rows[r, ka.ROW_RATE] + after)
         total += rows[r, ka.FORCE]
         turnover += abs(rows[r, ka.FORCE])
@@ -308,10 +313,10 @@ def impulses(system: System, ws: Workspace, p, largest, share):
 
 @internal_kernel
 def forget_rounding(system: System, ws: Workspace):
-    """Zero the rates in OFFSET of rows that were closed before the impact if they are within the tolerance.
+    """Zero rates in OFFSET that are within the tolerance, for rows that were closed before the impact.
 
-    An impact may have several solutions, for instance with a wedged point that leaves or stays. From zero forces, the
-    sign of such a rate would decide between them, and that sign is rounding.
+    An impact may have several solutions, for instance if a wedged point may leave or stay. In a search from zero
+    forces, the sign of such a rate would decide between them, but the sign is due to rounding.
     """
     unilateral, offset = system.unilateral, system.unilateral.vector[ku.OFFSET]
     mode, table = unilateral.mode, unilateral.stop_table
@@ -331,15 +336,15 @@ def forget_rounding(system: System, ws: Workspace):
 
 @internal_kernel
 def stays_or_leaves(unilateral: UnilateralArrays, k):
-    """True if candidate k takes part in an impact and was closed before it."""
+    """Return whether candidate k takes part in an impact and was closed before it."""
     return unilateral.mode[k, ku.TOUCHING] == 1 and unilateral.mode[k, ku.BEFORE] != ka.OPEN
 
 
 @internal_kernel
 def look_for_other(system: System, ws: Workspace, run: Run, p, largest):
-    """Count points that were closed and leave in the impact if another solution keeps them; SOLUTION is unchanged.
+    """Count closed points that leave in the impact although another solution keeps them; SOLUTION is unchanged.
 
-    One start near the forces of the wedge finds most of these solutions, not all.
+    The search has one start, near the forces of the wedge, and finds most but not all of these solutions.
     """
     unilateral = system.unilateral
     tally, vector = unilateral.tally, unilateral.vector
@@ -371,17 +376,17 @@ def look_for_other(system: System, ws: Workspace, run: Run, p, largest):
 
 @internal_kernel
 def impact(system: System, ws: Workspace, run: Run):
-    """Apply impulses that stop approaches: u = W P + b with b = J v and, for normals that strike, (1 + e) n·v.
+    """Apply impulses P that stop approaches: u = W P + b with b = J v, or (1 + e) n·v for normals that strike.
 
-    Then v += M⁻¹ Jᵀ P, and the energy −½ P·(J v₋ + J v₊) is booked as impact loss.
+    Then v += M⁻¹ Jᵀ P, and the energy −½ P·(J v₋ + J v₊) is recorded as impact loss.
     """
     unilateral, y, layout = system.unilateral, run.y, system.layout
     vector, mode, rows = unilateral.vector, unilateral.mode, ws.rows
     p = gather(system, ws, run)
     largest = largest_of_rows(ws, ka.ROW_RATE)
     # Newton's restitution may contradict friction: a wedged point cannot leave, and some impacts would gain energy.
-    # Such impacts are solved without restitution: this problem always has a solution, and a loss. The same applies to
-    # points that throw each other back and forth at one instant: impacts that accumulate end in contact.
+    # Such impacts are solved without restitution; this problem always has a solution, and it loses energy. The same
+    # applies to points that throw each other back and forth at one instant: accumulating impacts end in contact.
     bouncing = unilateral.number[ku.CHANGES] <= MOST_BOUNCES and impulses(system, ws, p, largest, 1.0)
     if not bouncing and not impulses(system, ws, p, largest, 0.0):
         run.count[ki.STATUS], run.clock[ki.NOT_UNIQUE] = ki.NO_CONTACT_FORCES, run.clock[ki.TIME]
@@ -400,7 +405,7 @@ def impact(system: System, ws: Workspace, run: Run):
             y[layout.contact + kst.CONTACT_SIZE * k + kst.IMPULSE] += f[r]
     r = system.couplings.joint.shape[0] + dry_rows_held(unilateral)
     for s in range(r):
-        # Loss of a closing brake, which stops its joint as a coupling does.
+        # Add the loss of a closing brake, which stops its joint as a coupling does.
         y[layout.loss + kst.IMPACT_LOSS] += rows[s, ka.FORCE]
     for k in range(unilateral.stop_table.shape[0]):
         if unilateral.stop_table[k, ku.STOP_CLOSED] == 1:
@@ -409,12 +414,12 @@ def impact(system: System, ws: Workspace, run: Run):
             r += 1
 
 
-# Snapshot of everything that a choice of contact modes writes, so that the choice can be tried and undone.
+# Snapshot of all data that a choice of contact modes writes, so that the choice can be tried and undone.
 
 
 @noinline_kernel
 def save_modes(unilateral: UnilateralArrays, ws: Workspace, run: Run):
-    """Save modes, their tables and the state between two steps, when ``y_new`` is free."""
+    """Save the modes, their tables and the state between two steps, when ``y_new`` is unused."""
     for k in range(unilateral.mode.shape[0]):
         unilateral.mode[k, ku.WANTED] = ws.active[k, ka.MODE]
     transfer_tables(unilateral, True)
@@ -424,12 +429,12 @@ def save_modes(unilateral: UnilateralArrays, ws: Workspace, run: Run):
 
 @noinline_kernel
 def restore_modes(system: System, ws: Workspace, run: Run):
-    """Restore modes, tables and state as saved by :func:`save_modes`, and evaluate the right-hand side there."""
+    """Restore the modes, tables and state saved by :func:`save_modes`, and evaluate the right-hand side there."""
     unilateral = system.unilateral
     transfer_tables(unilateral, False)
     for i in range(run.y.shape[0]):
         run.y[i] = run.y_new[i]
-    # First with the present rows, for the positions of points, from which the earlier rows start.
+    # Evaluate with the present rows first: the earlier rows are built from the positions of the points.
     evaluate(system, ws, run)
     take_modes(system, ws, run)
     run.count[ki.STATUS] = ki.RUNNING
@@ -460,10 +465,10 @@ def transfer(kept, at, table, store):
     return at
 
 
-# Acceleration of a sticking point without its own force: shows whether anything presses it against its surface.
+# Acceleration of a sticking point without its own force, which shows whether anything presses it against its surface.
 
 
-# Newton starts for the contact problem of the other points; if all fail, the point counts as pressed.
+# Number of Newton starts for the contact problem of the other points; if all fail, the point counts as pressed.
 STARTS = 8
 # Fraction of the largest right-hand side below which an acceleration counts as zero.
 NO_ACCELERATION = 1e-8
@@ -473,16 +478,16 @@ NO_ACCELERATION = 1e-8
 def approach_without_force(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Workspace, k):
     """Return the acceleration of sticking candidate k towards its surface without its own force.
 
-    Call right after ``derivative``. The contact problem has all other forces: in it, sticking points may slip, held
-    joints may move and stops may open; sliding points keep their direction. The result [m/s²] is positive, by
-    NO_ACCELERATION, if nothing moves the point, so that the guard of a point that leaves falls through zero.
+    Call this function right after ``derivative``. The contact problem contains all other forces: sticking points may
+    slip, held joints may move and stops may open; sliding points keep their direction. If nothing moves the point, the
+    result [m/s²] is slightly positive (NO_ACCELERATION), so that the guard of a point that leaves falls through zero.
     """
     index, vector, active, W = unilateral.index, unilateral.vector, ws.active, ws.small[0]
     size = ws.counts[ka.COUPLED]
     begin_problem(unilateral, rows_of_couplings(unilateral, ws), size)
     for j in range(ws.contacts.shape[0]):
         if j != k and active[j, ka.MODE] != ka.OPEN:
-            # Columns of sliding points already include their friction in W.
+            # In W, the columns of sliding points already include their friction.
             friction = unilateral.number[ku.HOLDING] * contacts.law[j, ka.STATIC]
             size = add_candidate(unilateral, ws, size, j, active[j, ka.MODE] == ka.SLIDING, friction)
     largest, first = largest_of_rows(ws, ka.RHS), active[k, ka.FIRST_ROW]
@@ -499,8 +504,8 @@ def approach_without_force(contacts: ContactArrays, unilateral: UnilateralArrays
 def watch_unpressed(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Workspace, h):
     """Add an accepted step to the time of each point that sticks although nothing presses it.
 
-    This applies only if the split of least norm lies in all cones: equally stiff supports have this split, and hold the
-    point. Otherwise the guard of the normal force lets the point leave.
+    This applies only if the split of least norm is in all cones: this is the split among equally stiff supports, which
+    hold the point. Otherwise the guard of the normal force lets the point leave.
     """
     if unilateral.number[ku.REDUNDANT] == 0.0 or unilateral.number[ku.SPLIT] == 1.0 or ws.counts[ka.STUCK] == 0:
         return

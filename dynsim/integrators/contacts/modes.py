@@ -1,9 +1,9 @@
 """Contact modes (open, sliding, sticking) from impacts and the complementarity problem of accelerations.
 
-Forces may jump at a start, a landing and the end of slip, so the modes of everything that touches are chosen again.
-First impulses stop approaching points and joints (:mod:`dynsim.integrators.contacts.impacts`); then
+Forces may jump at the start, at a landing and at the end of slip, so the modes of all touching contacts and stops are
+then chosen again. First, impulses stop approaching points and joints (:mod:`dynsim.integrators.contacts.impacts`); then
 
-    0 ≤ f_n ⟂ n·r̈ ≥ 0,   |f_t| ≤ μ_s f_n, and f_t = −μ_s f_n a_t/|a_t| where a_t ≠ 0
+    0 ≤ f_n ⟂ n·r̈ ≥ 0,   |f_t| ≤ μ_s f_n, and f_t = −μ_s f_n a_t/|a_t| if a_t ≠ 0
 
 is solved for the points at rest along their surfaces; points that slide already have the force f_n (n − μ t) with the
 single unknown f_n. The solution shows which points lift off, which stick, and which begin to slip in which direction.
@@ -57,37 +57,39 @@ from dynsim.jit.kernel import internal_kernel, noinline_kernel
 
 # An acceleration along the surface below this fraction of the largest right-hand side counts as zero.
 SLIP_TOLERANCE = 1e-8
-# Forces that contradict their modes by less than this, absolute [N] and relative to the largest, are rounding.
+# Forces that contradict their modes by less than this, absolute [N] and relative to the largest force, are due to
+# rounding.
 FORCE_SLACK = 1e-9
-# A point or joint that slips against its direction more slowly than this has not stopped yet, and one that slips along
-# it faster continues [m/s or rad/s]: if slip begins with almost no acceleration, its speed is rounding.
+# A point or joint that slips against its direction more slowly than this [m/s or rad/s] has not stopped yet; one that
+# slips along its direction faster than this continues. If slip begins with almost no acceleration, its speed is only
+# rounding.
 BACKWARD = 2e-11
-# A joint with a smaller share of the accelerations that contradicting rows leave is not involved.
+# A joint with a smaller share than this in the accelerations that contradictory rows leave is not involved.
 LEAST_SHARE = 1e-3
-# If no forces agree with slip slower than this, or than twice SLOW [m/s], the slip is stopped, as unbounded friction
-# would stop it: an impact of 5e-11 J per kilogram at 1e-5 m/s. Otherwise points that land within a step of coming to
-# rest would end a run.
+# If slip is slower than this, or than twice SLOW [m/s], and no forces agree with it, the slip is stopped as by
+# unbounded friction; at 1e-5 m/s this is an impact of 5e-11 J per kilogram. Otherwise, a point that lands within a step
+# of coming to rest would end the run.
 NEARLY_AT_REST = 1e-5
-# Margins of a split that differ by less than this fraction of its largest force are equal, and forces with no larger
-# margin are a corner of the admissible forces: the accuracy of the program that finds the best split.
+# Accuracy of the program that finds the best split, as a fraction of its largest force. Margins that differ by less are
+# equal, and forces with no larger margin are at a corner of the admissible forces.
 SPLIT_SLACK = 1e-7
-# A friction force within this fraction of the cone counts as on it.
+# A friction force counts as on its cone if it is within this fraction of it.
 ON_CONE = 1e-7
-# Bisections of the interval of a slip direction: to rounding.
+# Number of bisections of the interval of a slip direction, sufficient to reach rounding.
 MOST_HALVINGS = 60
-# Which joints with dry friction a choice of modes holds: all slow joints; all slow joints unless their rates contradict
-# other closed rows; only joints at rest.
+# Rules for the joints with dry friction that a choice of modes holds: all slow joints; all slow joints unless their
+# rates contradict other closed rows; only joints at rest.
 HOLD_SLOW, HOLD_COMPATIBLE, HOLD_RESTING = 0, 1, 2
-# Holding heavy joints may change the rates of light joints by a multiple of the rate lost; if joints geared to the held
-# joints lose more than this multiple, the held joints were not at rest.
+# Holding heavy joints may change the rates of light joints by a multiple of the rate that the heavy joints lose. If
+# joints geared to the held joints lose more than this multiple, the held joints were not at rest.
 MOST_CHANGE = 100.0
 
 
 @internal_kernel
 def resolve(system: System, ws: Workspace, run: Run, touch):
-    """Stop striking points and joints, and choose modes for everything closed or at most ``touch`` [m] off.
+    """Stop striking points and joints, and choose modes for all that are closed or within ``touch`` [m] of contact.
 
-    ``unilateral.mode`` records the modes BEFORE, and the candidates that STRUCK. Sets STATUS if there is no solution.
+    ``unilateral.mode`` records the modes BEFORE, and the candidates that STRUCK. STATUS is set if no solution exists.
     """
     unilateral = system.unilateral
     mode, table = unilateral.mode, unilateral.stop_table
@@ -108,7 +110,7 @@ def resolve(system: System, ws: Workspace, run: Run, touch):
 
 @internal_kernel
 def choose(system: System, ws: Workspace, run: Run):
-    """Choose modes by the accelerations of everything that touches; bring the rates of closed rows to zero."""
+    """Choose modes from the accelerations of all touching points and joints; bring the rates of closed rows to zero."""
     mode, stops, dry = system.unilateral.mode, system.unilateral.stop_table, system.unilateral.dry_table
     for k in range(mode.shape[0]):
         mode[k, ku.TOUCHED] = mode[k, ku.TOUCHING]
@@ -122,7 +124,7 @@ def choose(system: System, ws: Workspace, run: Run):
     if run.count[ki.STATUS] == ki.RUNNING and some_reversed(system, ws):
         restore_touching(system.unilateral)
         choose_joints(system, ws, run)
-    # Each pass finds at least one more.
+    # Each pass finds at least one more overloaded point or joint, so the loop ends.
     while run.count[ki.STATUS] == ki.RUNNING and note_overloaded(system, ws):
         restore_touching(system.unilateral)
         choose_joints(system, ws, run)
@@ -132,11 +134,11 @@ def choose(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def note_overloaded(system: System, ws: Workspace):
-    """Mark points and joints that the chosen modes hold with more force than their friction; True if there are more.
+    """Mark points and joints that the chosen modes hold with more force than their friction; return whether any is new.
 
-    A point or joint that other rows leave little mobility, or that moves a heavy body, hardly accelerates when its
-    friction is exceeded: by less than the solution shows, see ``slips``. Its force shows that it slips. If held, it
-    would break loose at once, and be held again, endlessly.
+    If other rows leave a point or joint little mobility, or if it moves a heavy body, it hardly accelerates when its
+    friction is exceeded, by less than the solution can show (see ``slips``). Its force, however, shows that it slips.
+    If it were held, it would break loose and be held again endlessly.
     """
     unilateral, more = system.unilateral, False
     mode, dry, number = unilateral.mode, unilateral.dry_table, unilateral.number
@@ -148,7 +150,8 @@ def note_overloaded(system: System, ws: Workspace):
     for k in range(mode.shape[0]):
         if ws.active[k, ka.MODE] == ka.STICKING and mode[k, ku.OVERLOADED] == 0:
             left = margin(system.contacts, unilateral, ws, k)
-            # A point past its static friction is held by kinetic friction; shared forces may be split differently.
+            # A point that has exceeded static friction is held by kinetic friction; shared forces may be split
+            # differently.
             alone = number[ku.REDUNDANT] == 0.0 or not point_shares(unilateral, ws, k)
             if mode[k, ku.KINETIC_ONLY] == 1 and alone:
                 law = system.contacts.law
@@ -164,7 +167,7 @@ def note_overloaded(system: System, ws: Workspace):
 
 @internal_kernel
 def force_slack(ws: Workspace):
-    """Return the size below which forces that contradict their modes are rounding [N or N m]."""
+    """Return the magnitude below which forces that contradict their modes are rounding errors [N or N m]."""
     strongest = 0.0
     for k in range(ws.contacts.shape[0]):
         strongest = max(strongest, abs(ws.contacts[k, ka.NORMAL_FORCE]))
@@ -173,7 +176,7 @@ def force_slack(ws: Workspace):
 
 @internal_kernel
 def some_reversed(system: System, ws: Workspace):
-    """True if a joint or point slides, not slowly, against the direction for which its friction was chosen."""
+    """Return whether a joint or point slides noticeably against the direction for which its friction was chosen."""
     unilateral, turned = system.unilateral, False
     slow = 2.0 * unilateral.number[ku.SLOW]
     for k in range(unilateral.dry_table.shape[0]):
@@ -188,10 +191,10 @@ def some_reversed(system: System, ws: Workspace):
 
 @noinline_kernel
 def choose_joints(system: System, ws: Workspace, run: Run):
-    """Choose modes and, if there are no forces, choose again without the points and stops that leave.
+    """Choose modes; if no forces agree with them, choose again without the points and stops that leave.
 
-    An impact may leave rates that are too slow to count as leaving. By convention, not by the law, they are taken to be
-    zero: if that has no solution, these points and stops have no force.
+    An impact may leave rates that are too slow to count as leaving. By convention, not by the contact law, these rates
+    are taken to be zero. If this problem has no solution, these points and stops have no force.
     """
     not_unique = run.clock[ki.NOT_UNIQUE]
     choose_rule(system, ws, run)
@@ -203,7 +206,10 @@ def choose_joints(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def release_leaving(system: System, ws: Workspace):
-    """Release points and stops that leave faster than rounding but slower than impacts settle; True if any do."""
+    """Release points and stops that leave faster than rounding but slower than impacts settle.
+
+    Returns whether any were released.
+    """
     unilateral, any_leaves = system.unilateral, False
     mode, table = unilateral.mode, unilateral.stop_table
     for k in range(mode.shape[0]):
@@ -217,10 +223,10 @@ def release_leaving(system: System, ws: Workspace):
 
 @internal_kernel
 def choose_rule(system: System, ws: Workspace, run: Run):
-    """Call :func:`choose_modes` with each rule to hold joints with dry friction until one is not rejected."""
+    """Call :func:`choose_modes` with each rule for holding joints by dry friction until one is not rejected."""
     if search_modes(system, ws, run, HOLD_COMPATIBLE):
         return
-    # A joint that moves, however slowly, because a contact or stop moves it, is not at rest.
+    # A joint that a contact or stop moves, however slowly, is not at rest.
     restore_touching(system.unilateral)
     search_modes(system, ws, run, HOLD_RESTING)
     if run.count[ki.STATUS] != ki.RUNNING:
@@ -231,12 +237,12 @@ def choose_rule(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def search_modes(system: System, ws: Workspace, run: Run, rule):
-    """Call :func:`choose_modes` from zero forces, or near the forces before the event if that would end in a corner.
+    """Call :func:`choose_modes` from zero forces or, if that would end in a corner, near the forces before the event.
 
-    If joints at rest share forces with sliding points, the solutions form a polygon or polyhedron, and each of them
-    moves differently. Newton's method ends in a corner, where a joint is at its bound and a point on its cone, and
-    neither moves: the next change of forces ends that, and modes would be chosen again endlessly. The forces before the
-    event belong to this set or are next to it, and solutions near them move as before.
+    If joints at rest share forces with sliding points, the solutions form a polygon or polyhedron, and each solution
+    has a different motion. Newton's method ends in a corner of it: a joint is at its bound and a point is on its cone,
+    but neither moves. The next change of forces would end this state, and modes would be chosen again endlessly. The
+    forces before the event are in this set or next to it, and solutions near them continue the previous motion.
     """
     number, search, chosen, not_unique = system.unilateral.number, ku.FROM_ZERO, False, run.clock[ki.NOT_UNIQUE]
     while search <= ku.LAST:
@@ -252,9 +258,9 @@ def search_modes(system: System, ws: Workspace, run: Run, rule):
 
 @noinline_kernel
 def note_forces(system: System, ws: Workspace):
-    """Record the present forces of everything that touches or rubs in ``shares``, right after :func:`evaluate`.
+    """Record the present contact, stop and friction forces in ``shares``; call right after :func:`evaluate`.
 
-    A choice of modes may start near them, and then overwrites them.
+    A choice of modes may start near these forces, and then overwrites them.
     """
     unilateral, rows, state = system.unilateral, ws.rows, ws.contacts
     shares, first = unilateral.shares, system.couplings.joint.shape[0] + unilateral.stop_table.shape[0]
@@ -286,7 +292,7 @@ def sliding_parts(system: System, ws: Workspace, k):
 
 @internal_kernel
 def restore_touching(unilateral: UnilateralArrays):
-    """Restore which candidates and stops touched before a rejected choice."""
+    """Restore the marks of candidates and stops that touched before a rejected choice."""
     mode, stops = unilateral.mode, unilateral.stop_table
     for k in range(mode.shape[0]):
         mode[k, ku.TOUCHING] = mode[k, ku.TOUCHED]
@@ -296,10 +302,10 @@ def restore_touching(unilateral: UnilateralArrays):
 
 @noinline_kernel
 def choose_modes(system: System, ws: Workspace, run: Run, rule):
-    """Choose modes with one rule to hold joints with dry friction; False, with rates unchanged, if it is rejected.
+    """Choose modes with one rule for holding joints by dry friction; return False if the rule is rejected.
 
-    HOLD_COMPATIBLE is rejected if the slow rates of the held joints contradict other closed rows, or could only be
-    zero if other joints stopped too.
+    The rates are then unchanged. HOLD_COMPATIBLE is rejected if the slow rates of the held joints contradict other
+    closed rows, or could only be zero if other joints stopped as well.
     """
     unilateral = system.unilateral
     mode = unilateral.mode
@@ -329,9 +335,10 @@ def choose_modes(system: System, ws: Workspace, run: Run, rule):
     for i in range(size):
         slot = share_slot(unilateral, ws, unilateral.index[ku.TABLE_ROW, i])
         unilateral.shares[slot] = unilateral.vector[ku.SOLUTION, i]
-    # Remove residual rates after an impact that was allowed to settle, and of points that were solved as if at rest: a
-    # point that begins to slip could otherwise move against its direction, stop, and begin again. A point that moves
-    # along it keeps its rate: otherwise it would never start to move if events of other points were too frequent.
+    # Remove residual rates after an impact that was allowed to settle, and of points that were solved as if at rest;
+    # otherwise a point that begins to slip could move against its direction, stop, and begin again. A point that moves
+    # along its direction keeps its rate; otherwise it would never start to move if events of other points were
+    # frequent.
     for k in range(mode.shape[0]):
         starts = mode[k, ku.WANTED] == ka.SLIDING and unilateral.slide[k, ku.FROZEN] == 1.0
         rests = starts and slip_speed(ws, k) <= least and slip_along(unilateral, ws, k) <= -RATE_TOLERANCE
@@ -353,7 +360,7 @@ def choose_modes(system: System, ws: Workspace, run: Run, rule):
     for k in range(mode.shape[0]):
         rubs = mode[k, ku.WANTED] == ka.SLIDING and system.contacts.law[k, ka.STATIC] > 0.0
         if rubs and unilateral.slide[k, ku.FROZEN] == 0.0 and slip_speed(ws, k) < unilateral.number[ku.SLOW]:
-            # Rows of other contacts have stopped it too, and its friction keeps its direction.
+            # Rows of other contacts have stopped this point too; its friction keeps its direction.
             unilateral.slide[k, ku.FROZEN], mode[k, ku.BEGINS] = 1.0, 1
         if mode[k, ku.WANTED] == ka.SLIDING and mode[k, ku.BEGINS] == 1:
             aim(unilateral, ws, k)
@@ -381,7 +388,7 @@ def choose_modes(system: System, ws: Workspace, run: Run, rule):
         unilateral.stop[k, ku.HIT_AT] = ku.DEPTH + max(0.0, -stop_gap(unilateral, ws, k))
     for k in range(mode.shape[0]):
         if mode[k, ku.WANTED] == ka.OPEN:
-            # A point that leaves may move below its surface as other points come down; this is not another landing.
+            # A point that leaves may move below its surface as other points come down; this is not a new landing.
             deepest = ku.AT_ROOT + max(0.0, -ws.contacts[k, ka.GAP])
             unilateral.slide[k, ku.LANDS_AT] = max(unilateral.slide[k, ku.LANDS_AT], deepest)
         starts = mode[k, ku.WANTED] == ka.SLIDING and unilateral.slide[k, ku.FROZEN] == 1.0
@@ -391,16 +398,16 @@ def choose_modes(system: System, ws: Workspace, run: Run, rule):
 
 @noinline_kernel
 def solve_accelerations(system: System, ws: Workspace, run: Run, largest, least, slides_on):
-    """Solve for forces that agree with the law; a point that slips slower than ``least`` [m/s] counts as at rest.
+    """Solve for forces that agree with the law; a point that slips more slowly than ``least`` [m/s] is at rest.
 
-    With ``slides_on``, a point that already slides does not count as at rest, see :func:`keeps_sliding`.
+    With ``slides_on``, a point that already slides is not treated as at rest, see :func:`keeps_sliding`.
 
     Returns
     -------
     solved : bool
-        Whether there are such forces.
+        Whether such forces exist.
     size : int
-        Size of their problem.
+        Size of the problem.
     """
     unilateral, mode, size = system.unilateral, system.unilateral.mode, 0
     for k in range(mode.shape[0]):
@@ -408,7 +415,7 @@ def solve_accelerations(system: System, ws: Workspace, run: Run, largest, least,
             slides = (slides_on and keeps_sliding(unilateral, ws, k)) or begins_sliding(system, ws, k, least)
             mode[k, ku.WANTED] = ka.SLIDING if slides else ka.STICKING
             mode[k, ku.KINETIC_ONLY] = 1 if mode[k, ku.KINETIC_ONLY] == 1 and friction_drops(system, k) else 0
-    # If static friction drops to a smaller kinetic value, the forces of the other contacts change.
+    # When static friction drops to a smaller kinetic value, the forces of the other contacts change.
     for _ in range(1 + mode.shape[0]):
         size = reduce_rows(system, ws, run)
         if run.count[ki.STATUS] == ki.FORCES_REVERSED:
@@ -422,13 +429,13 @@ def solve_accelerations(system: System, ws: Workspace, run: Run, largest, least,
 
 @internal_kernel
 def joint_rests(unilateral: UnilateralArrays, ws: Workspace, k):
-    """True if dry-friction joint k does not move, to the accuracy of projected rates."""
+    """Return whether dry-friction joint k is at rest within the accuracy of projected rates."""
     return abs(ws.joints[unilateral.dry_table[k, ku.DRY_JOINT], ka.QD]) <= RATE_TOLERANCE
 
 
 @internal_kernel
 def holds_moving_joint(unilateral: UnilateralArrays, ws: Workspace):
-    """True if dry friction holds a joint that still moves."""
+    """Return whether dry friction holds a joint that still moves."""
     for k in range(unilateral.dry_table.shape[0]):
         if unilateral.dry_table[k, ku.DRY_HOLDS] == 1 and not joint_rests(unilateral, ws, k):
             return True
@@ -445,7 +452,7 @@ def release_moving_joints(unilateral: UnilateralArrays, ws: Workspace):
 
 @noinline_kernel
 def rates_contradict(unilateral: UnilateralArrays, ws: Workspace):
-    """True if no change of joint rates brings the rates of all active rows to zero, right after :func:`evaluate`."""
+    """Return whether no change of joint rates brings all active row rates to zero; call after :func:`evaluate`."""
     left = unilateral.vector[2]
     projection_residual(ws, ws.small, ka.ROW_RATE, left)
     for r in range(ws.counts[ka.ROWS]):
@@ -457,7 +464,7 @@ def rates_contradict(unilateral: UnilateralArrays, ws: Workspace):
 
 @internal_kernel
 def stops_others(unilateral: UnilateralArrays, ws: Workspace):
-    """True if holding slow joints changes rates by far more than theirs, right after :func:`project_level`."""
+    """Return whether holding slow joints changes rates by far more than their own; call after `project_level`."""
     slowly, change = 0.0, 0.0
     for k in range(unilateral.dry_table.shape[0]):
         if unilateral.dry_table[k, ku.DRY_HOLDS] == 1:
@@ -469,13 +476,13 @@ def stops_others(unilateral: UnilateralArrays, ws: Workspace):
 
 @internal_kernel
 def hold_slow_joints(unilateral: UnilateralArrays, ws: Workspace, rule):
-    """Hold joints that do not move in position, by dry friction; the others keep sliding as they move.
+    """Hold joints that do not move in position by dry friction; the other joints keep sliding in their directions.
 
-    A joint that slides in its direction, however slowly, keeps its rate, as a point does: nothing strikes it, and other
-    joints would have to stop with it.
+    A joint that slides in its direction, however slowly, keeps its rate, as a point does, because nothing strikes it
+    and other joints would have to stop with it.
 
-    A joint with a closed brake rests without friction: the brake carries all of its load. A friction row would reach
-    its bound and break loose although the joint would not move.
+    A joint with a closed brake rests without friction, because the brake carries all of its load. A friction row would
+    reach its bound and break loose although the joint does not move.
     """
     table, dry = unilateral.dry_table, unilateral.dry
     for k in range(table.shape[0]):
@@ -490,7 +497,7 @@ def hold_slow_joints(unilateral: UnilateralArrays, ws: Workspace, rule):
 
 @internal_kernel
 def note_headway(unilateral: UnilateralArrays, ws: Workspace, k):
-    """Record the speed against its side with which dry-friction joint k begins to slide."""
+    """Record the speed against DRY_SIDE with which dry-friction joint k begins to slide."""
     rate = ws.joints[unilateral.dry_table[k, ku.DRY_JOINT], ka.QD]
     unilateral.dry[k, ku.DRY_HEADWAY] = max(0.0, -unilateral.dry[k, ku.DRY_SIDE] * rate)
 
@@ -499,9 +506,10 @@ def note_headway(unilateral: UnilateralArrays, ws: Workspace, k):
 def acceleration_left(unilateral: UnilateralArrays, ws: Workspace, k):
     """Return the acceleration of held dry-friction joint k if its row alone were released, after :func:`evaluate`.
 
-    For rows J v̇ = b that contradict each other along one combination w, wᵀ J = 0, least squares leave the
-    accelerations r = w (w·b) / |w|²: the joint has only a share, which may be small if a point has most of it. If the
-    joint slides, as in a choice of modes, all other rows hold, and it takes the whole: w·b / w_k = |r|² / r_k.
+    If rows J v̇ = b contradict each other along one combination w with wᵀ J = 0, least squares leaves the accelerations
+    r = w (w·b) / |w|². The joint has only a share of them, which may be small if a point has most of it. If the joint
+    slides, as in a choice of modes, all other rows are satisfied, and the joint takes all of it:
+    w·b / w_k = |r|² / r_k.
     """
     rows, p, squares, largest = ws.rows, ws.counts[ka.ROWS], 0.0, 0.0
     for r in range(p):
@@ -516,7 +524,7 @@ def acceleration_left(unilateral: UnilateralArrays, ws: Workspace, k):
 
 @internal_kernel
 def let_joints_slide(system: System, size, largest):
-    """Write the joints that dry friction still holds into DRY_NEXT, and the directions of the others into DRY_SIDE."""
+    """Write joints that dry friction still holds to DRY_NEXT, and the directions of the other joints to DRY_SIDE."""
     unilateral, i = system.unilateral, system.couplings.joint.shape[0]
     table, f = unilateral.dry_table, unilateral.vector[ku.SOLUTION]
     for k in range(table.shape[0]):
@@ -540,10 +548,10 @@ def slip_along(unilateral: UnilateralArrays, ws: Workspace, k):
 
 @internal_kernel
 def keeps_sliding(unilateral: UnilateralArrays, ws: Workspace, k):
-    """True if candidate k slides in its direction, however slowly, with the friction of the right-hand side.
+    """Return whether candidate k slides in its direction, however slowly, with the friction of the right-hand side.
 
-    It keeps its slip, and thus its friction: at rest its friction could change, and the forces of the modes would not
-    be the forces of the choice.
+    Such a candidate keeps its slip and thus its friction. If it were treated as at rest, its friction could change, and
+    the forces of the right-hand side would differ from the forces of the choice.
     """
     if unilateral.mode[k, ku.BEFORE] != ka.SLIDING:
         return False
@@ -554,9 +562,9 @@ def keeps_sliding(unilateral: UnilateralArrays, ws: Workspace, k):
 
 @internal_kernel
 def begins_sliding(system: System, ws: Workspace, k, least):
-    """True if candidate k slides faster than ``least`` [m/s], or without friction; sets its direction."""
+    """Set the direction of candidate k if it slides faster than ``least`` [m/s] or without friction; return whether."""
     unilateral = system.unilateral
-    # An impact may have turned the slip.
+    # The slip may have been turned by an impact.
     if slip_on(unilateral, ws, k, least):
         return True
     if system.contacts.law[k, ka.STATIC] == 0.0:
@@ -567,7 +575,7 @@ def begins_sliding(system: System, ws: Workspace, k, least):
 
 @internal_kernel
 def slip_on(unilateral: UnilateralArrays, ws: Workspace, k, least):
-    """Let candidate k slide along its slip, v_t/|v_t|, if this is faster than ``least`` [m/s]; True if it is."""
+    """Let candidate k slide along v_t/|v_t| if its slip exceeds ``least`` [m/s]; return whether it does."""
     slide, speed = unilateral.slide, slip_speed(ws, k)
     if speed > least:
         slide[k, ku.FROZEN] = 0.0
@@ -578,9 +586,10 @@ def slip_on(unilateral: UnilateralArrays, ws: Workspace, k, least):
 
 @internal_kernel
 def reduce_rows(system: System, ws: Workspace, run: Run):
-    """Write the problem of accelerations into ``unilateral``, with only normal rows of sliding points; return its size.
+    """Write the acceleration problem to ``unilateral``, with only the normal rows of sliding points; return its size.
 
-    Column of such a row: W (n − μ t). Sets STATUS if a row's own force would accelerate it against itself (Painlevé).
+    The column of such a row is W (n − μ t). STATUS is set if the force of a row would accelerate the row against this
+    force (Painlevé).
     """
     unilateral, W = system.unilateral, ws.small[0]
     index, vector, mode = unilateral.index, unilateral.vector, unilateral.mode
@@ -612,7 +621,7 @@ def acceleration(unilateral: UnilateralArrays, i, size):
 
 @internal_kernel
 def slips(system: System, k, i, size, largest):
-    """True if candidate k, at row i of the reduced problem, is on its cone and accelerates along its surface."""
+    """Return whether candidate k, row i of the reduced problem, is on its cone and accelerates along its surface."""
     unilateral = system.unilateral
     f = unilateral.vector[ku.SOLUTION]
     friction = math.sqrt(f[i + 1] * f[i + 1] + f[i + 2] * f[i + 2])
@@ -626,7 +635,7 @@ def slips(system: System, k, i, size, largest):
 
 @internal_kernel
 def begin_slip(system: System, ws: Workspace, k, fx, fy):
-    """Start slip of candidate k against (fx, fy) along its two tangents: its friction force or its acceleration."""
+    """Start slip of candidate k against (fx, fy) on its two tangents: its friction force or negative acceleration."""
     slide, state = system.unilateral.slide, ws.contacts
     size = math.sqrt(fx * fx + fy * fy)
     slide[k, ku.FROZEN] = 1.0
@@ -640,11 +649,11 @@ def begin_slip(system: System, ws: Workspace, k, fx, fy):
 
 @internal_kernel
 def aim(unilateral: UnilateralArrays, ws: Workspace, k):
-    """Turn the reference of candidate k so that its friction at its slip v is along d, its present REFERENCE.
+    """Change REFERENCE of candidate k so that friction at its slip v is along d, the previous value of REFERENCE.
 
-    A point that was solved as at rest begins to slip along d, but may still have some slip across d, which turns its
-    friction, see ``slide_direction``. That friction would differ from the choice: a joint that it drives the other way
-    would stop at once and begin again, endlessly. With v = a d + b and b across d, the reference is
+    A point that was solved as if at rest begins to slip along d, but may still have some slip across d, which turns its
+    friction (see ``slide_direction``). This friction would differ from the choice, and a joint that it drives the other
+    way would stop at once and begin again, endlessly. With v = a d + b and b normal to d, the reference is
     r = (u d − b)/√(u² + b²), and v + (s − v·r) r, with s = SLOW, is along d if (a + u) u = s √(u² + b²).
     """
     slide, state = unilateral.slide, ws.contacts
@@ -669,16 +678,16 @@ def aim(unilateral: UnilateralArrays, ws: Workspace, k):
 
 @internal_kernel
 def friction_drops(system: System, k):
-    """True if the friction of candidate k drops from a static to a smaller kinetic coefficient when it slips."""
+    """Return whether the friction of candidate k drops to a smaller kinetic coefficient when it slips."""
     law = system.contacts.law
     return law[k, ka.STRIBECK] == 0.0 and law[k, ka.STATIC] > law[k, ka.MU]
 
 
 @internal_kernel
 def give_way(system: System, ws: Workspace, size, largest):
-    """Give points that exceed static friction and slip the smaller kinetic coefficient; True if there are any.
+    """Give points that exceed static friction and slip the smaller kinetic coefficient; return whether any did.
 
-    The constraint stays a cone: the point does not begin to slip in the direction of the larger force, unless its
+    The constraint remains a cone: the point need not begin to slip in the direction of the larger force, unless its
     mobility is the same in all directions.
     """
     unilateral = system.unilateral
@@ -698,7 +707,7 @@ def give_way(system: System, ws: Workspace, size, largest):
 
 @internal_kernel
 def take_solution(system: System, ws: Workspace, size, largest):
-    """Write modes from the forces of the reduced problem into WANTED; open stops that carry no force."""
+    """Write the modes that follow from the forces of the reduced problem to WANTED; open stops that carry no force."""
     unilateral = system.unilateral
     index, mode, f = unilateral.index, unilateral.mode, unilateral.vector[ku.SOLUTION]
     strongest = 0.0
@@ -718,12 +727,12 @@ def take_solution(system: System, ws: Workspace, size, largest):
         while index[ku.TABLE_ROW, i] != ws.active[k, ka.FIRST_ROW]:
             i += 1
         if not f[i] > FORCE_TOLERANCE * strongest:
-            # It touches without force, possibly slightly below its surface: it lands only if it moves deeper.
+            # The point touches without force, possibly slightly below its surface; it lands only if it moves deeper.
             mode[k, ku.WANTED], unilateral.slide[k, ku.LANDS_AT] = ka.OPEN, ku.DEPTH
         elif mode[k, ku.WANTED] == ka.STICKING and slips(system, k, i, size, largest):
             fx, fy = f[i + 1], f[i + 2]
             if fx == 0.0 and fy == 0.0:
-                # Kinetic friction is zero: nothing holds the point once static friction is exceeded.
+                # Kinetic friction is zero, so nothing holds the point once static friction is exceeded.
                 fx, fy = -acceleration(unilateral, i + 1, size), -acceleration(unilateral, i + 2, size)
             begin_slip(system, ws, k, fx, fy)
             mode[k, ku.WANTED], mode[k, ku.BEGINS] = ka.SLIDING, 1

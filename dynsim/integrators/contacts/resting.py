@@ -1,8 +1,9 @@
 """Joints at rest that dry friction holds by a constant force instead of a row, because other rows hold them too.
 
-The equations of motion do not determine how such a joint and the others share the load. The choice of modes gives one
-solution; the joint gets its force from the solution with the same motion and the largest worst margin. If another
-joint were at its bound, the next change of forces would end the share, and modes would be chosen again endlessly.
+The equations of motion do not determine how such a joint and the other rows share the load. The choice of modes gives
+one solution; the joint gets its force from the solution with the same motion and the best worst-case margin. If another
+joint were at its bound, the next change of forces would end this load sharing, and modes would be chosen again
+endlessly.
 """
 
 from __future__ import annotations
@@ -25,10 +26,11 @@ from dynsim.integrators.contacts.impacts import FORCE_TOLERANCE, take_modes
 from dynsim.integrators.run import Run, project_level
 from dynsim.jit.kernel import internal_kernel, noinline_kernel
 
-# Largest share of its friction that a joint at rest may have: 1 but for rounding, to distinguish it from sliding.
+# Largest fraction of its friction bound that a joint at rest may carry: slightly below 1, to distinguish it from
+# sliding.
 NEARLY_ALL = 1.0 - 1e-15
-# Share of a joint's mobility that other rows leave: below NEARLY_DEPENDENT no friction could hold the joint by a row;
-# below ROUNDING, or below its rounding error, its row depends on the other rows.
+# Fraction of a joint's mobility that other rows leave. Below NEARLY_DEPENDENT, no friction could hold the joint by a
+# row; below ROUNDING, or below its rounding error, the row of the joint depends on the other rows.
 NEARLY_DEPENDENT, ROUNDING = 1e-6, 1e-12
 # Relative rounding error of mobilities, which are sums over joints.
 ROUNDINGS = 1e-15
@@ -38,13 +40,13 @@ RELEASED = 2
 
 @internal_kernel
 def release_dependent_joints(system: System, ws: Workspace, size):
-    """Hold joints at rest, if sliding contacts or stops hold them too, by the force of the solution instead of a row.
+    """Hold joints at rest that sliding contacts or stops also hold by the force of the solution instead of a row.
 
-    Such a row depends on the normal rows, and how they share a force changes the friction of sliding points: no split
-    of the right-hand side equals the solution. At rest Coulomb's law admits any force within the bound. Rows that
-    depend only on rows of sticking points and other joints remain, see :mod:`dynsim.dynamics.contact.delassus`, unless
-    they depend on them only nearly: holding such a joint would take unbounded forces, and the order of pivots would
-    decide whether it is held.
+    The row of such a joint depends on the normal rows, and the way they share a force changes the friction of sliding
+    points, so that no split in the right-hand side would equal the solution. At rest, Coulomb's law admits any force
+    within the bound. Rows that depend only on rows of sticking points and other joints remain, see
+    :mod:`dynsim.dynamics.contact.delassus`. Rows that depend on them only nearly do not remain: holding such a joint
+    would take unbounded forces, and the order of pivots would decide whether it is held.
 
     Parameters
     ----------
@@ -54,7 +56,7 @@ def release_dependent_joints(system: System, ws: Workspace, size):
     Returns
     -------
     margin : float
-        Worst margin of the solution taken, as a share of its largest force; infinite if no joint was released.
+        Worst margin of the chosen solution, as a fraction of its largest force; infinite if no joint was released.
     """
     unilateral, W = system.unilateral, ws.small[0]
     table, mode, bare, whole = unilateral.dry_table, unilateral.mode, 0, 0
@@ -99,11 +101,12 @@ def release_dependent_joints(system: System, ws: Workspace, size):
 
 @noinline_kernel
 def take_widest_split(system: System, ws: Workspace, size):
-    """Replace the solution by the one with the same motion and the largest worst margin.
+    """Replace the solution by the solution with the same motion and the best worst-case margin.
 
-    It has ``size`` rows. Forces that act only on each other may change: of joints at rest, closed stops and sticking
-    points within their bounds, of sliding points along their whole force. Friction that slides, or begins to, keeps its
-    ratio to the normal force. Returns the margin as a share of the largest force.
+    The problem has ``size`` rows. Forces that only act against each other may change: forces of joints at rest, closed
+    stops and sticking points within their bounds, and forces of sliding points along their total force. Sliding
+    friction keeps its ratio to the normal force, also if slip only begins. Returns the margin as a fraction of the
+    largest force.
     """
     unilateral, table = system.unilateral, system.unilateral.dry_table
     vector, kinds, N = unilateral.vector, unilateral.index[ku.KINDS], unilateral.room[ku.NULL_SPACE]
@@ -160,14 +163,14 @@ def take_widest_split(system: System, ws: Workspace, size):
 
 @internal_kernel
 def mobility_along_forces(unilateral: UnilateralArrays, ws: Workspace, i, j):
-    """Return the mobility between rows i and j of the solved problem along whole forces, with sliding friction."""
+    """Return the mobility between rows i and j of the solved problem along total forces, including sliding friction."""
     vector, total = unilateral.vector, 0.0
     a, b = unilateral.index[ku.TABLE_ROW, i], unilateral.index[ku.TABLE_ROW, j]
     for s in range(3):
         x = 1.0 if s == 0 else vector[ku.FIRST_PART + s - 1, i]
         for t in range(3):
             y = 1.0 if t == 0 else vector[ku.FIRST_PART + t - 1, j]
-            # Rows without parts may be the last of the table.
+            # Rows without tangential parts may be the last rows of the table.
             if x != 0.0 and y != 0.0:
                 total += x * y * ws.small[0, a + s, b + t]
     return total
@@ -175,7 +178,7 @@ def mobility_along_forces(unilateral: UnilateralArrays, ws: Workspace, i, j):
 
 @internal_kernel
 def sticks(unilateral: UnilateralArrays, ws: Workspace, i):
-    """True if row i of the solved problem is the normal row of a candidate that sticks in the chosen modes."""
+    """Return whether row i of the solved problem is the normal row of a candidate that sticks in the chosen modes."""
     for k in range(unilateral.mode.shape[0]):
         if unilateral.mode[k, ku.TOUCHING] == 1 and ws.active[k, ka.FIRST_ROW] == unilateral.index[ku.TABLE_ROW, i]:
             return unilateral.mode[k, ku.WANTED] == ka.STICKING
@@ -184,7 +187,7 @@ def sticks(unilateral: UnilateralArrays, ws: Workspace, i):
 
 @internal_kernel
 def rest_without_row(unilateral: UnilateralArrays, k):
-    """Keep dry-friction joint k at rest with its constant force in the solution."""
+    """Keep dry-friction joint k at rest by a constant force, taken from the solution."""
     # Rows of joints come first, so their numbers are the same in the reduced problem.
     share = -unilateral.vector[ku.SOLUTION, unilateral.dry_table[k, ku.DRY_ROW]] / dry_bound(unilateral, k)
     unilateral.dry_table[k, ku.DRY_NEXT] = 0
@@ -193,10 +196,11 @@ def rest_without_row(unilateral: UnilateralArrays, k):
 
 @noinline_kernel
 def hold_free_joints(system: System, ws: Workspace, run: Run, begins):
-    """Give rows to joints that rest with a constant force and that contacts and stops no longer hold.
+    """Give rows to joints that rest by a constant force and that contacts and stops no longer hold.
 
-    Call after single modes have changed, at the end of an accepted step. If slip ``begins`` somewhere, a joint at its
-    friction bound moves with the contact or stop that held it: with a row it would stick and break loose at once.
+    Call this function after single modes have changed, at the end of an accepted step. If slip ``begins`` somewhere, a
+    joint at its friction bound moves with the contact or stop that held it; if it had a row, it would stick and break
+    loose at once.
     """
     unilateral, y = system.unilateral, run.y
     table, dry = unilateral.dry_table, unilateral.dry
@@ -211,7 +215,7 @@ def hold_free_joints(system: System, ws: Workspace, run: Run, begins):
     take_modes(system, ws, run)
     p, count = ws.counts[ka.ROWS], 0
     row_mobilities(ws, W)
-    # Rows of the joints in question come last.
+    # The rows of the joints to be tested come last.
     for r in range(p):
         index = -1
         for k in range(table.shape[0]):
@@ -222,7 +226,7 @@ def hold_free_joints(system: System, ws: Workspace, run: Run, begins):
     for k in range(table.shape[0]):
         if table[k, ku.DRY_NEXT] == 1:
             r = table[k, ku.DRY_ROW]
-            # The same limit as for the release of a row, see release_dependent_joints().
+            # This is the limit below which a row is released, see release_dependent_joints().
             free = mobility_left(factor, W, row, count, r) > NEARLY_DEPENDENT * W[r, r]
             table[k, ku.DRY_HOLDS] = 1 if free else 0
             count = extended(factor, W, row, count, r) if free else count
@@ -232,7 +236,7 @@ def hold_free_joints(system: System, ws: Workspace, run: Run, begins):
 
 @internal_kernel
 def some_rest_without_row(unilateral: UnilateralArrays):
-    """True if a joint rests with a constant force."""
+    """Return whether any joint rests by a constant force."""
     resting = 0
     for k in range(unilateral.dry_table.shape[0]):
         resting += 1 if rests_without_row(unilateral, k) else 0
@@ -241,14 +245,14 @@ def some_rest_without_row(unilateral: UnilateralArrays):
 
 @internal_kernel
 def rests_without_row(unilateral: UnilateralArrays, k):
-    """True if dry-friction joint k rests with a constant force and without a closed brake."""
+    """Return whether dry-friction joint k rests by a constant force and without a closed brake."""
     table = unilateral.dry_table
     return table[k, ku.DRY_HOLDS] == 0 and table[k, ku.DRY_BRAKE] != ku.CLOSED and dry_rests(unilateral, k)
 
 
 @internal_kernel
 def extended(factor, W, row, count, r):
-    """Extend a Cholesky factor of rows ``row[:count]`` of W by row r, unless it depends on them; return the count."""
+    """Extend a Cholesky factor of rows ``row[:count]`` of W by row r, unless r depends on them; return the count."""
     square = mobility_left(factor, W, row, count, r)
     if not square > max(RANK_TOLERANCE * W[r, r], rounding_left(factor, W, row, count, r)):
         return count
@@ -258,7 +262,7 @@ def extended(factor, W, row, count, r):
 
 @internal_kernel
 def mobility_left(factor, W, row, count, r):
-    """Return the mobility W along row r that the rows of a factor leave; write row ``count`` of the factor."""
+    """Return the mobility along row r that the rows of a Cholesky factor leave; write row ``count`` of the factor."""
     square = W[r, r]
     for i in range(count):
         total = W[r, row[i]]
@@ -271,11 +275,12 @@ def mobility_left(factor, W, row, count, r):
 
 @internal_kernel
 def rounding_left(factor, W, row, count, r):
-    """Return how far rounding may change the result of the preceding call of :func:`mobility_left`.
+    """Return the possible rounding error in the result of the preceding call of :func:`mobility_left`.
 
-    That result is w·W w of the combination w = (−x, 1) of the rows and row r; forces x along the rows cancel the effect
-    of a unit force along row r on them. An error δ √(W_ii W_jj) of each entry changes it by δ (Σ |w_i| √W_ii)²: much if
-    the rows nearly depend on each other, because x is large then. The part of the factor above its diagonal is scratch.
+    That result is w·W w for the combination w = (−x, 1) of the rows and row r; forces x along the rows cancel the
+    effect of a unit force along row r on them. An error δ √(W_ii W_jj) of each entry changes it by δ (Σ |w_i| √W_ii)²,
+    which is large if the rows nearly depend on each other, because x is then large. The part of the factor above its
+    diagonal is scratch.
     """
     size = math.sqrt(W[r, r])
     for i in range(count - 1, -1, -1):
@@ -291,7 +296,7 @@ def rounding_left(factor, W, row, count, r):
 def projection_residual(ws: Workspace, small, column, errors):
     """Write the residual that projection leaves in a column of the rows (gaps or rates), right after ``derivative``.
 
-    RHS and FORCE of the rows, and ``small``, serve as scratch.
+    RHS and FORCE of the rows, and ``small``, are used as scratch.
     """
     rows, p = ws.rows, ws.counts[ka.ROWS]
     for r in range(p):

@@ -1,1 +1,1 @@
-"""Radau IIA of order 5: step, Newton iteration, linear systems, end of a step, tables."""
+"""Radau IIA method of order 5: step, Newton iteration, linear systems, end of a step, tables."""

@@ -1,17 +1,19 @@
-"""RADAU5, Radau IIA of order 5 with three stages: one step by simplified Newton, circuits and positions eliminated.
+"""One step of RADAU5 (Radau IIA, order 5, three stages) by simplified Newton with eliminated circuits and positions.
 
-Stages Z_i = h Σ a_ij f(t + c_j h, y + Z_j), and y_new = y + Z_3 (Hairer, Wanner: Solving Ordinary Differential
-Equations II, IV.8). With W = T⁻¹ Z the linear systems of Newton's method decouple into a real and a complex one of the
-size of the state, g I − J with g = γ/h or (α + iβ)/h, and each of these reduces to one of the size of the rates. In
+The stages are Z_i = h Σ a_ij f(t + c_j h, y + Z_j), and y_new = y + Z_3 (Hairer, Wanner: Solving Ordinary Differential
+Equations II, IV.8). With W = T⁻¹ Z, the linear systems of Newton's method decouple into a real and a complex system of
+the size of the state, g I − J with g = γ/h or (α + iβ)/h, and each of these reduces to a system of the size of the
+rates. In
 
     q̇ = N v,    v̇ = f(q, v, i),    di/dt = a q + b v + c i + …
 
-the first and the last rows are eliminated, u_q = (r_q + N u_v)/g and u_i = (r_i + a u_q + b u_v)/(g − c), so
+the first and the last rows are eliminated, u_q = (r_q + N u_v)/g and u_i = (r_i + a u_q + b u_v)/(g − c), which gives
 
     (g − ∂f/∂v − ∂f/∂θ/g − ∂f/∂i (a/g + b)/(g − c)) u_v = r_v + ∂f/∂θ N⁺ r_q/g + ∂f/∂i (r_i + a r_q/g)/(g − c),
 
 where θ are displacements along the rates. The Jacobian neglects the change of N with q: if bodies rotate in space,
-Newton's method converges more slowly, to the same solution. Jacobian and factors are kept as long as it converges.
+Newton's method converges more slowly, but to the same solution. The Jacobian and the factors are kept as long as
+Newton's method converges.
 """
 
 from __future__ import annotations
@@ -59,7 +61,7 @@ def factor_both(system: System, r: NewtonArrays, h):
 
 @internal_kernel
 def solve_both(system: System, ws: Workspace, y, r: NewtonArrays, h):
-    """Replace right sides ``r.one`` and ``r.two``, (s,) real and complex, by solutions; after :func:`factor_both`."""
+    """Replace the right-hand sides ``r.one`` (real) and ``r.two`` (complex), (s,), by solutions, see `factor_both`."""
     solve_newton(system, y, r, GAMMA_RADAU / h, r.real_inverse, r.one, r.real_room)
     solve_newton(system, y, r, complex(ALPHA_RADAU / h, BETA_RADAU / h), r.complex_inverse, r.two, r.complex_room)
 
@@ -106,7 +108,7 @@ def reduced_inverse(system: System, r: NewtonArrays, g, A):
 
 @internal_kernel
 def solve_newton(system: System, y, r: NewtonArrays, g, A, x, room):
-    """Replace x (s,) by (g I − J)⁻¹ x, from the inverse A of the reduced matrix; ``room`` (2, s) is scratch."""
+    """Replace x (s,) by (g I − J)⁻¹ x, using the inverse A of the reduced matrix; ``room`` (2, s) is scratch."""
     along, block, table, layout = r.along, r.linear, system.drives.table, system.layout
     n, q, v, current, angle, u = A.shape[0], layout.q, layout.v, layout.current, room[0], room[1]
     first = 2 * n  # first row of the circuits
@@ -146,14 +148,14 @@ def solve_newton(system: System, y, r: NewtonArrays, g, A, x, room):
             x[j] = x[j] / g
 
 
-# End of a RADAU5 step: derivative, constraint and uniqueness checks, and samples on lanes.
+# End of a RADAU5 step: derivative, constraint and uniqueness checks, and samples on SIMD lanes.
 
 
 @internal_kernel
 def evaluate_end(newton: NewtonArrays, system: System, ws: Workspace, run: Run):
     """Evaluate the derivatives at the three stages into ``f``, and copy the last one, at y_new, into stage[6].
 
-    Not the other way round: entries that no derivative writes are zero in ``f`` but scratch in stage[6].
+    The order matters: entries that no derivative writes are zero in ``f`` but scratch in stage[6].
     """
     for s in range(2):
         for j in range(newton.kept.shape[1]):
@@ -175,13 +177,13 @@ def end_workspace(newton: NewtonArrays | None, system: System, ws: Workspace, ru
 
 @internal_kernel
 def end_accepted(newton: NewtonArrays | None, system: System, ws: Workspace, run: Run):
-    """Project y_new if it is off the constraints, and watch the forces; False, and STATUS, on failure."""
+    """Project y_new if it is off the constraints, and check the forces; on failure, set STATUS and return False."""
     return end_settled(system, ws, run, off_surface(ws)) and end_watched(system, ws, run)
 
 
 @internal_kernel
 def end_settled(system: System, ws: Workspace, run: Run, off):
-    """True if y_new is on the constraints; if it was ``off`` them, it is projected and ``ws`` is evaluated there."""
+    """Return whether y_new is on the constraints; if it was ``off``, first project it and evaluate ``ws`` there."""
     if not off or settle(system, run.clock[ki.TIME] + run.clock[ki.STEP], run.y_new, ws, run.stage[6], run):
         return True
     run.count[ki.STATUS] = ki.NOT_PROJECTED
@@ -190,7 +192,7 @@ def end_settled(system: System, ws: Workspace, run: Run, off):
 
 @internal_kernel
 def end_watched(system: System, ws: Workspace, run: Run):
-    """True if the forces at y_new are unique; ``ws`` right after ``derivative`` there."""
+    """Return whether the forces at y_new are unique; ``ws`` must be the result of ``derivative`` at y_new."""
     h = run.clock[ki.STEP]
     if not (clearly_unique(ws) or forces_unique(system, ws, run, run.clock[ki.TIME] + h)):
         return False
@@ -198,25 +200,26 @@ def end_watched(system: System, ws: Workspace, run: Run):
     return True
 
 
-# Newton's method: most iterations, and the contraction below which the Jacobian stays.
+# Newton's method: maximum number of iterations, and contraction below which the Jacobian is kept.
 MOST_ITERATIONS, GOOD_CONTRACTION = 8, 0.05
-# In steps shorter than this [s], errors of rates and currents near zero count by their effect until the end of the
-# step. This slack is smaller if rtol is below SLACK_RTOL, because then all steps are short.
+# In steps shorter than SHORT [s], errors of rates and currents near zero are weighted by their effect until the end of
+# the step. This slack is smaller if rtol is below SLACK_RTOL, because then all steps are short.
 SHORT, SLACK_RTOL = 0.005, 1e-6
-# Change of rates for differences, as a fraction of the slowest slip: its square is rounding of slip at 1e-7 m/s.
+# Change of rates for finite differences, as a fraction of the slowest slip; its square is the rounding error of slip at
+# 1e-7 m/s.
 SMALL = 1e-4
-# Error norm assigned to a step whose Newton iteration diverges: half of the step is tried next.
+# Error norm assigned to a step whose Newton iteration diverges; half of the step is then tried next.
 NO_STAGES = 10.5
 
 
 @noinline_kernel
 def differentiate(system: System, ws: Workspace, run: Run):
-    """Compute finite differences of v̇ along the rates' displacements, the rates and the currents, at (TIME, y).
+    """Compute finite differences of v̇ with respect to displacements along the rates, rates and currents, at (TIME, y).
 
-    The stiff electrical rows come from the drives instead; v̇ is linear in the currents.
+    The stiff electrical rows are computed from the drives instead; v̇ is linear in the currents.
     """
     t, y, x, base, r = run.clock[ki.TIME], run.y, run.stage[6], run.stage[7], run.newton
-    # The workspace may still hold a sample or a rejected step.
+    # The workspace may still contain a sample or a rejected step.
     derivative(system, t, y, ws, base)
     for a in range(ws.motors.shape[0]):
         drive_block(system.drives, ws, a, segment_of(system.drives, system.reference, t, ws, a), r.linear[a])
@@ -231,11 +234,12 @@ def differentiate(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def largest_change(unilateral: UnilateralArrays | None, ws: Workspace):
-    """Return the largest change of rates for differences, right after ``derivative`` [rad/s or m/s].
+    """Return the largest change of rates for finite differences [rad/s or m/s]; call right after ``derivative``.
 
-    A change δ along a slip v and across it turns its friction, and differences have a relative error of δ/2v
-    in directions in which friction does not change: with 1/τ of friction that turns within τ, Newton's method diverges
-    beyond steps of some 2v/δ τ. For a point that slides slowly the change is SMALL of its slip, far above rounding.
+    A change δ along and across a slip v turns its friction, and the differences have a relative error of δ/2v in
+    directions in which friction does not change. If friction turns within a time τ, with the rate 1/τ, Newton's method
+    then diverges for steps longer than about 2v/δ τ. For a point that slides slowly, the change is SMALL times its
+    slip, which is far above rounding.
     """
     change = math.inf
     if unilateral is None:  # resolved at compile time
@@ -248,9 +252,9 @@ def largest_change(unilateral: UnilateralArrays | None, ws: Workspace):
 
 @internal_kernel
 def displaced(system: System, ws: Workspace, y, s, x, change):
-    """Write x = y with entry s changed, counting the rates' displacements, the rates, then the currents.
+    """Write x = y with entry s changed; s counts the displacements along the rates, then the rates, then the currents.
 
-    ``change`` limits changes of rates. Returns the change.
+    ``change`` limits changes of rates. Returns the change of the entry.
     """
     n, layout = ws.joints.shape[0], system.layout
     for j in range(y.shape[0]):
@@ -290,7 +294,7 @@ def evaluate_stages(lanes: StageLanes | None, system: System, ws: Workspace, t, 
 
 @internal_kernel
 def keep_stages(run: Run):
-    """Save the stages of the last accepted step as a polynomial for the first guess of the next ones, and its error."""
+    """Save the stages of the last accepted step, as a polynomial for the next initial guess, and their error."""
     r, c0, c1 = run.newton, NODE_RADAU[0], NODE_RADAU[1]
     if r.count[kn.SEEN] == run.count[ki.STEPS]:
         return
@@ -311,11 +315,11 @@ def collocation_error(x):
 
 @internal_kernel
 def guess_stages(run: Run, h):
-    """Guess the stages by extrapolating the last ones, corrected for the errors of both steps.
+    """Guess the stages by extrapolating those of the last step, corrected for the errors of both steps.
 
-    Stages are of order 3. With P(x) = ∫ Π (s − c_i) ds from 0 to x, and D = h⁴ y⁗/6, the collocation polynomial of the
-    last step is y − D P(x), with x = 1 + c ρ in the next step, ρ times as long, whose stages are y − ρ⁴ D P(c). The
-    error estimate of the last step was −D/(10 γ), so its stages give the next ones up to h⁵.
+    The stages are of order 3. With P(x) = ∫ Π (s − c_i) ds from 0 to x and D = h⁴ y⁗/6, the collocation polynomial of
+    the last step is y − D P(x), with x = 1 + c ρ in the next step, which is ρ times as long and has the stages
+    y − ρ⁴ D P(c). The error estimate of the last step was −D/(10 γ), so its stages give the next stages up to h⁵.
     """
     r, c0, c1 = run.newton, NODE_RADAU[0], NODE_RADAU[1]
     ahead = h / r.clock[kn.KEPT] if r.count[kn.EXTRAPOLATES] == 1 else 0.0
@@ -336,7 +340,7 @@ def guess_stages(run: Run, h):
 
 @noinline_kernel
 def solve_stages(system: System, ws: Workspace, run: Run, h):
-    """Solve for the stages of a step of length h by Newton's method; True if it has converged."""
+    """Solve for the stages of a step of length h by Newton's method; return whether it has converged."""
     t, y, x, r = run.clock[ki.TIME], run.y, run.y_new, run.newton
     tracked, before, contraction = r.kept.shape[1], 0.0, 0.0
     g, c = GAMMA_RADAU / h, complex(ALPHA_RADAU / h, BETA_RADAU / h)
@@ -378,7 +382,7 @@ def solve_stages(system: System, ws: Workspace, run: Run, h):
             r.w[2, j] += r.two[j].imag
             for s in range(3):
                 r.z[s, j] = T_RADAU[s, 0] * r.w[0, j] + T_RADAU[s, 1] * r.w[1, j] + T_RADAU[s, 2] * r.w[2, j]
-        # The ledger adds up the derivatives of the last iterate but one: steps without a guess do one more iteration.
+        # The ledger sums the derivatives of the last iterate but one, so steps without a guess do one more iteration.
         if lever * change <= r.clock[kn.CLOSE] and k >= least:
             r.clock[kn.LEVER] = lever
             return True
@@ -387,13 +391,13 @@ def solve_stages(system: System, ws: Workspace, run: Run, h):
 
 @internal_kernel
 def slack(system: System, h, rtol):
-    """Return the factor on atol for rates and currents in a step of length h.
+    """Return the factor by which atol is multiplied for rates and currents in a step of length h.
 
-    An error e of a rate moves a joint by h e within the step. Circuits that ring after a start do so for milliseconds
-    in steps of 0.1 ms: there, an error of 50 atol in a rate moves its joint no further than an error of atol in a step
-    of 5 ms, and motors damp it. Without motors the error would stay. The effect of impacts on it would stay for a
-    while, and steps after impacts are even shorter: below an rtol of 1e-6 the slack is smaller, and almost none remains
-    at 1e-8.
+    An error e of a rate moves a joint by h e within the step. Circuits that ring after a start do so for milliseconds,
+    in steps of 0.1 ms. There, an error of 50 atol in a rate moves its joint no further than an error of atol in a step
+    of 5 ms, and motors damp this error. Without motors the error would persist. Its effect on impacts would also
+    persist for a while, and steps after impacts are even shorter. For an rtol below 1e-6, the slack is therefore
+    smaller, and at 1e-8 almost no slack remains.
     """
     if system.layout.circuits == 0:
         return 1.0
@@ -402,7 +406,7 @@ def slack(system: System, h, rtol):
 
 @internal_kernel
 def estimate(system: System, ws: Workspace, run: Run, h, slope):
-    """Compute the norm of the error (γ/h − J)⁻¹ (f + Σ e_s Z_s / h), of order 3, in stage[7]; f is ``slope``."""
+    """Write the error (γ/h − J)⁻¹ (f + Σ e_s Z_s / h), of order 3, to stage[7]; f is ``slope``. Returns its norm."""
     r, error = run.newton, run.stage[7]
     for j in range(r.one.shape[0]):
         r.one[j] = slope[j] + (ERROR_RADAU[0] * r.z[0, j] + ERROR_RADAU[1] * r.z[1, j] + ERROR_RADAU[2] * r.z[2, j]) / h
@@ -417,7 +421,7 @@ def estimate(system: System, ws: Workspace, run: Run, h, slope):
 
 @internal_kernel
 def energy_error(system: System, run: Run, h):
-    """Return the error norm of electrical energy and Joule heat, by the formula of `estimate` without Jacobian."""
+    """Return the error norm of the electrical energy and Joule heat by the formula of `estimate` without a Jacobian."""
     r, largest = run.newton, 0.0
     for j in (system.layout.ledger + kst.ELECTRICAL, system.layout.ledger + kst.JOULE):
         error = h * run.stage[0, j]
@@ -484,7 +488,7 @@ def add_up(run: Run, h):
 
 @internal_kernel
 def after_step(run: Run, h):
-    """Decide whether Jacobian and factors are kept after an accepted step of length h."""
+    """Decide whether to keep the Jacobian and the factors after an accepted step of length h."""
     r, clock = run.newton, run.clock
     if r.clock[kn.CONTRACTION] > GOOD_CONTRACTION:
         r.count[kn.STALE] = 1

@@ -1,4 +1,4 @@
-"""Coefficients of RADAU5, and the data that it keeps between steps: Jacobian, factors, stages, counters."""
+"""Coefficients of RADAU5, and the data that it keeps between steps: Jacobian, factors, stages and counters."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from dynsim.dynamics import tables as ka
 from dynsim.integrators.simd.forms import StageLanes, aligned
 from dynsim.jit.kernel import internal_kernel
 
-# Radau IIA of order 5, coefficients of Hairer and Wanner (Solving Ordinary Differential Equations II, IV.8): T⁻¹ A⁻¹ T
-# has γ, and [[α, −β], [β, α]], on its diagonal. ERROR_RADAU: weights of the stages in h times the right side of the
-# error estimate.
+# Coefficients of Radau IIA of order 5 from Hairer and Wanner (Solving Ordinary Differential Equations II, IV.8). The
+# diagonal blocks of T⁻¹ A⁻¹ T are γ and [[α, −β], [β, α]]. ERROR_RADAU: weights of the stages in h times the right-hand
+# side of the error estimate.
 _ROOT = math.sqrt(6.0)
 A_RADAU = np.array(
     [
@@ -40,49 +40,49 @@ T_INVERSE_RADAU = np.array(
 )
 ERROR_RADAU = np.array([-(13 + 7 * _ROOT) / 3, (-13 + 7 * _ROOT) / 3, -1 / 3])
 
-# NewtonArrays.clock: step of the factors, step of the stages, step of the extrapolation [s]; contraction of Newton's
-# method, and its bound on the error of the last iterate; admissible error of the last iterate, relative to the
-# tolerance; largest change of rates for the differences of a Jacobian [rad/s or m/s].
+# NewtonArrays.clock: step sizes of the factors, the stages and the extrapolation [s]; contraction of Newton's method,
+# and the resulting bound on the error of the last iterate; admissible error of the last iterate, relative to the
+# tolerance; largest change of rates for the finite differences of a Jacobian [rad/s or m/s].
 FACTORED, TRIED, KEPT, CONTRACTION, LEVER, CLOSE, CHANGE = 0, 1, 2, 3, 4, 5, 6
 NEWTON_CLOCK_SIZE = 7
-# Without circuits nothing may damp the remaining error, and it adds up over the steps.
+# Without circuits, the remaining error may be undamped and accumulate over the steps.
 CLOSE_ENOUGH, CLOSE_UNDAMPED = 0.03, 0.003
-# NewtonArrays.count, int: the Jacobian must be recomputed; accepted steps when it was computed, and when the stages
-# were saved for extrapolation; stages are saved; Jacobians, factorisations, Newton iterations, steps in which they
-# diverged; samples whose states are there and that are not recorded yet; columns of Jacobians, which show an observer
-# that a large Jacobian progresses.
+# NewtonArrays.count, int: flag that the Jacobian must be recomputed; numbers of accepted steps when it was computed and
+# when the stages were saved for extrapolation; flag that stages are saved; numbers of Jacobians, factorisations, Newton
+# iterations and steps in which these diverged; number of samples whose states are known but not yet recorded; number of
+# computed Jacobian columns, which shows an observer that a large Jacobian is progressing.
 STALE, MADE_AT, SEEN, EXTRAPOLATES, JACOBIANS, FACTORS, ITERATIONS, DIVERGED, WAITING = 0, 1, 2, 3, 4, 5, 6, 7, 8
 COLUMNS = 9
 NEWTON_COUNT_SIZE = 10
 
 
 class NewtonArrays(NamedTuple):
-    """Working arrays of RADAU5: n rates, na motors, k circuits, s entries of the state with a tolerance, m in all."""
+    """Working arrays of RADAU5: n rates, na motors, k circuits, m state entries, of which s have a tolerance."""
 
-    along: np.ndarray  # (2 n + k, n) ∂v̇/∂(θ, v, i), θ being displacements along the rates
+    along: np.ndarray  # (2 n + k, n) ∂v̇/∂(θ, v, i), where θ are displacements along the rates
     linear: np.ndarray  # (na, BLOCK_SIZE) linear blocks of the drives
-    real_inverse: np.ndarray  # (n, n) inverse of the real reduced matrix; without lanes, as the next three
+    real_inverse: np.ndarray  # (n, n) inverse of the real reduced matrix; used without lanes, like the next three
     complex_inverse: np.ndarray  # (n, n) complex
     real_room: np.ndarray  # (2, s)
     complex_room: np.ndarray  # (2, s) complex
     pivot: np.ndarray  # (n,) int
-    z: np.ndarray  # (3, m) stages of the step tried, from y on
-    w: np.ndarray  # (3, s) the same, T⁻¹ z
+    z: np.ndarray  # (3, m) stages of the step being tried, relative to y
+    w: np.ndarray  # (3, s) transformed stages T⁻¹ z
     f: np.ndarray  # (3, m) derivatives at the stages
     kept: np.ndarray  # (4, s) coefficients of the polynomial of the accepted stages, and error estimate of their step
-    error: np.ndarray  # (s,) error estimate of the step tried
+    error: np.ndarray  # (s,) error estimate of the step being tried
     weight: np.ndarray  # (s,) 1 / tolerance
-    one: np.ndarray  # (s,) right side and solution of the real system
-    two: np.ndarray  # (s,) complex
-    direct: np.ndarray  # (n, n, 4) inverses of both matrices on lanes, as the next five, see simd.radau5
+    one: np.ndarray  # (s,) right-hand side and solution of the real system
+    two: np.ndarray  # (s,) right-hand side and solution of the complex system
+    direct: np.ndarray  # (n, n, 4) inverses of both matrices on lanes; used like the next five, see simd.radau5
     crossed: np.ndarray  # (n, n, 4)
     over: np.ndarray  # (2, 4) 1/g
-    circuit: np.ndarray  # (na, 2, 4) and 1/(g − ∂(di/dt)/∂i)
+    circuit: np.ndarray  # (na, 2, 4) 1/(g − ∂(di/dt)/∂i)
     x: np.ndarray  # (s, 4)
     room: np.ndarray  # (3, s, 4)
     clock: np.ndarray  # (NEWTON_CLOCK_SIZE,)
     count: np.ndarray  # (NEWTON_COUNT_SIZE,) int
-    lanes: StageLanes | None = None  # None: right-hand sides one by one
+    lanes: StageLanes | None = None  # None: right-hand sides are evaluated one by one
 
 
 def newton_arrays(n: int, na: int, circuits: int, tracked: int, m: int) -> NewtonArrays:
@@ -120,7 +120,7 @@ def newton_arrays(n: int, na: int, circuits: int, tracked: int, m: int) -> Newto
 
 @internal_kernel
 def discard_history(newton: NewtonArrays | None, steps):
-    """Discard data about the right-hand side as of ``steps`` accepted steps, because it has jumped."""
+    """Discard data about the right-hand side after ``steps`` accepted steps, because it has jumped."""
     if newton is None:  # resolved at compile time
         return
     newton.count[STALE], newton.count[SEEN], newton.count[EXTRAPOLATES] = 1, steps, 0

@@ -1,1 +1,1 @@
-"""SIMD lanes: variants of scalar kernels that evaluate four states, or two linear systems, at once."""
+"""SIMD variants of scalar kernels, which evaluate four states, or two linear systems, at once."""

@@ -1,7 +1,7 @@
 """The right-hand side on SIMD lanes: tables with lanes, variants of kernels, and ``derivative`` of four states at once.
 
-The compiler uses a variant instead of its kernel for arguments with lanes only: for kernels that branch on data, with
-selects or lane by lane. All other kernels are compiled for lanes from their own source.
+A variant replaces its kernel only for arguments with lanes. Variants exist for kernels that branch on data; they use
+selects or run lane by lane. All other kernels are compiled for lanes from their own source.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ from dynsim.jit.compiler import Tables, build_tuple, form_of, parts_of
 from dynsim.jit.kernel import every, internal_kernel, noinline_kernel
 from dynsim.jit.simd import INT32, Lanes, all_lanes, lanes_of, select
 
-# Tables for SIMD: float tables whose last axis is the lanes, as tables of Lanes, and single lanes of them.
+# Tables for SIMD: views of float tables, whose last axis is the lanes, as tables of Lanes, and access to single lanes.
 
 
-# Number of lanes: four doubles are one register of AVX2.
+# Number of lanes: an AVX2 register holds four doubles.
 WIDTH = 4
-# Tables of a workspace with lanes, as an additional last axis; rows and modes are the same for all lanes.
+# Workspace tables that have lanes as an additional last axis; rows and modes are the same for all lanes.
 WITH_LANES = ("links", "joints", "trig", "motors", "contacts", "rows", "column", "small")
 
 
 def aligned(*shape: int) -> np.ndarray:
-    """Return zeros of this shape that begin at a cache line, from which whole vectors load fastest."""
+    """Return an array of zeros that begins at a cache line, so that whole vectors load fastest."""
     size = math.prod(shape)
     room = np.zeros(size + 8)
     start = (-room.__array_interface__["data"][0] % 64) // 8
@@ -68,7 +68,7 @@ def lane_count(typingctx: Any, value: Any) -> Any:
 
 @intrinsic
 def lane(typingctx: Any, value: Any, k: Any) -> Any:
-    """Return lane k of a value; a view for tables; part by part for tuples. A value without lanes is returned as is."""
+    """Return lane k of a value: a view of a table, or a tuple of lanes; a value without lanes is returned unchanged."""
     result = _lane_type(value)
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -105,7 +105,7 @@ def _lane(context: Any, builder: Any, value: Any, kind: Any, index: Any) -> Any:
 
 @intrinsic
 def with_lane(typingctx: Any, value: Any, k: Any, x: Any) -> Any:
-    """Return the value with its lane k replaced by the number x."""
+    """Return the value with lane k replaced by the number x."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         index = builder.trunc(context.cast(builder, args[1], sig.args[1], types.intp), INT32)
@@ -166,12 +166,12 @@ def tables_as_lanes(typingctx: Any, ws: Any) -> Any:
 
 
 def any_lanes(*kinds):
-    """True if any argument has lanes."""
+    """Return whether any argument has lanes."""
     return lanes_of(*kinds) > 0
 
 
 def times(*kinds):
-    """True if t, the third argument, has lanes."""
+    """Return whether t, the third argument, has lanes."""
     return lanes_of(kinds[2]) > 0
 
 
@@ -194,7 +194,7 @@ def servo_circuit_lanes(motor, a, mode, command, v):
 
 @form_of(surface_distance, any_lanes)
 def surface_distance_lanes(value, slope, curvature):
-    """Return the distance; lanes without a root along the normal use the first-order distance."""
+    """Return the distance; lanes without a root along the normal get the first-order distance."""
     inner = 1.0 - 2.0 * curvature * value / (slope * slope)
     return select(inner <= 0.0, value / slope, 2.0 * value / (slope * (1.0 + math.sqrt(inner))))
 
@@ -265,7 +265,7 @@ def check_forces_lanes(model, contacts, unilateral, ws):
 
 @form_of(sign_changed, any_lanes)
 def sign_changed_lanes(ws, passes):
-    """True if the signs of any lane have changed. Lanes whose signs agree keep them, and still agree afterwards."""
+    """Return whether the signs of any lane have changed; lanes whose signs agree with their forces keep them."""
     one_way = False
     for k in range(ws.counts[ka.ROWS]):
         if ws.active[k, ka.LAW] == ka.FRICTION_DISSIPATIVE:
@@ -280,14 +280,14 @@ def sign_changed_lanes(ws, passes):
 
 @form_of(evaluate_reference, times)
 def evaluate_reference_lanes(drives, reference, t, ws):
-    """Evaluate at several times, which may be in different segments."""
+    """Evaluate the references at several times, which may be in different segments."""
     for k in range(lane_count(t)):
         evaluate_reference(drives, reference, lane(t, k), lane(ws, k))
 
 
 @form_of(fed_forward, times)
 def fed_forward_lanes(voltage, grid, t, a, asked):
-    """Add planned voltages at several times."""
+    """Add the planned voltages at several times, one per lane."""
     if voltage.shape[0] == 0:
         return asked
     for k in range(lane_count(t)):
@@ -297,20 +297,20 @@ def fed_forward_lanes(voltage, grid, t, a, asked):
 
 @form_of(add_loads, times)
 def add_loads_lanes(model, loads, t, ws, power, start):
-    """Add external wrenches at several times."""
+    """Add the external wrenches at several times, one per lane."""
     for k in range(lane_count(t)):
         add_loads(model, loads, lane(t, k), lane(ws, k), lane(power, k), start)
 
 
-# Evaluation: ``derivative`` of four states at four times, and its tables.
+# Evaluation of ``derivative`` for four states at four times, and its tables.
 
 
-# Parts of a system whose kernels have no variants for lanes.
+# Parts of a system whose kernels do not have variants for lanes.
 _WITHOUT_FORMS = ("dense", "shapes")
 
 
 def has_forms(system: System) -> bool:
-    """True for points on quadrics with the articulated solve: only these right-hand sides compile for lanes."""
+    """Return whether the right-hand side compiles for lanes: only points on quadrics, with the articulated solve."""
     return all(getattr(system, name) is None for name in _WITHOUT_FORMS)
 
 
@@ -332,13 +332,13 @@ def stage_lanes(ws: Workspace, m: int, columns: int) -> StageLanes:
 
 @noinline_kernel
 def evaluate_four(lanes: StageLanes, system: System):
-    """Call ``derivative`` for all lanes; one compiled program for all callers."""
+    """Call ``derivative`` for all lanes; all callers share one compiled program."""
     derivative(system, as_lanes(lanes.t)[()], as_lanes(lanes.y), tables_as_lanes(lanes.ws), as_lanes(lanes.f))
 
 
 @internal_kernel
 def take_rows(ws: Workspace, lanes: Workspace):
-    """Copy rows, modes and anchors of a workspace to all lanes of another one."""
+    """Copy the rows, modes and anchors of a workspace to all lanes of another workspace."""
     for r in range(ws.active.shape[0]):
         for s in range(ws.active.shape[1]):
             lanes.active[r, s] = ws.active[r, s]
@@ -351,7 +351,7 @@ def take_rows(ws: Workspace, lanes: Workspace):
                 lanes.contacts[c, s, k] = ws.contacts[c, s]
     for s in range(ws.counts.shape[0]):
         lanes.counts[s] = ws.counts[s]
-    # As after solves with other rows: entries of joints that no row involves are zero.
+    # As after solves with other rows, entries of joints that no row involves must be zero.
     for i in range(ws.column.shape[0]):
         for s in range(ws.column.shape[1]):
             for k in range(4):

@@ -1,7 +1,7 @@
-"""RADAU5 on SIMD lanes: both linear systems of Newton's method together, stages, Jacobian columns, ends and samples.
+"""RADAU5 on SIMD lanes: linear systems of Newton's method, stages, Jacobian columns, step ends and samples.
 
 Each function is a variant of the scalar kernel named in its decorator. The compiler uses it if ``newton.lanes`` is set,
-which depends on the system only, see :func:`dynsim.integrators.simd.forms.has_forms`.
+which depends only on the system; see :func:`dynsim.integrators.simd.forms.has_forms`.
 """
 
 from __future__ import annotations
@@ -45,20 +45,20 @@ def has_lanes(*kinds: Any) -> bool:
 
 
 def _on_lanes(*kinds: Any) -> bool:
-    """True if samples are taken on lanes and the law is bilateral, so that only samples use the forces at the end."""
+    """Return whether samples use lanes and the law is bilateral, so that only samples need the forces at the end."""
     _, system, *_ = kinds
     return has_lanes(*kinds) and bool(system[system.fields.index("unilateral")] == types.none)
 
 
 @internal_kernel
 def pair(real, z):
-    """Return the factors by which x ∘ (p, m) multiplies by a real and a complex number."""
+    """Return factors with which x ∘ (p, m) is a multiplication by a real and a complex number at once."""
     return four(real, z.real, z.real, real), four(0.0, -z.imag, z.imag, 0.0)
 
 
 @form_of(factor_both, has_lanes)
 def invert_on_lanes(system, r, h):
-    """Invert both by Gauss–Jordan elimination, with pivots that are large in both."""
+    """Invert both reduced matrices by Gauss–Jordan elimination, with pivots that are large in both."""
     along, block, table = r.along, r.linear, system.drives.table
     p, m = as_lanes(r.direct), as_lanes(r.crossed)
     over, circuit = as_lanes(r.over), as_lanes(r.circuit)
@@ -176,7 +176,7 @@ def multiply_on_lanes(system, ws, y, r, h):
 
 @internal_kernel
 def may_wait(unilateral: UnilateralArrays | None, run: Run):
-    """True if only steps happen between two samples, so that modes, commands and loads do not change."""
+    """Return whether only steps occur between two samples, so that modes, commands and loads do not change."""
     if unilateral is None:  # resolved at compile time
         return run.event.shape[0] + run.tick.shape[0] + run.breaks.shape[0] == 0
     return False
@@ -184,7 +184,7 @@ def may_wait(unilateral: UnilateralArrays | None, run: Run):
 
 @internal_kernel
 def has_stops(unilateral: UnilateralArrays | None):
-    """True if joints have stops or dry friction, whose forces are stored for a single state only."""
+    """Return whether joints have stops or dry friction, whose forces are stored for a single state only."""
     if unilateral is None:  # resolved at compile time
         return False
     return unilateral.stop.shape[0] + unilateral.dry.shape[0] > 0
@@ -192,10 +192,10 @@ def has_stops(unilateral: UnilateralArrays | None):
 
 @form_of(write_samples, has_lanes)
 def write_samples_on_lanes(newton, system, ws, run, more):
-    """Record four samples at a time, fewer if they cannot wait; a single sample is cheaper without lanes."""
+    """Record four samples at a time, or fewer if they cannot wait; a single sample is cheaper without lanes."""
     newton.count[kn.WAITING] += more
     wait = may_wait(system.unilateral, run)
-    # The ground reaction is also computed for a single state only.
+    # The ground reaction, too, is only computed for a single state.
     alone = has_stops(system.unilateral) or run.support.index.shape[0] > 0
     while newton.count[kn.WAITING] >= 4 or (newton.count[kn.WAITING] > 0 and not wait):
         if alone or newton.count[kn.WAITING] == 1:
@@ -207,9 +207,9 @@ def write_samples_on_lanes(newton, system, ws, run, more):
 
 @form_of(write_waiting, has_lanes)
 def write_waiting_on_lanes(newton, system, ws, run):
-    """Write even a single sample from lanes: its value must not depend on when control returns to a caller.
+    """Write waiting samples from lanes, even a single one, so that values do not depend on when calls return.
 
-    The first lane keeps the end of a pending step.
+    The first lane still contains the end of a pending step.
     """
     if newton.count[kn.WAITING] > 0:
         write_together(newton, system, ws, run, 1)
@@ -226,7 +226,7 @@ def write_together(newton: NewtonArrays, system: System, ws: Workspace, run: Run
 
 @internal_kernel
 def load_samples(newton: NewtonArrays, run: Run, begin):
-    """Load waiting samples into the lanes from ``begin`` on; return their number."""
+    """Load waiting samples into the lanes, starting at ``begin``; return their number."""
     lanes, first, count = newton.lanes, run.count[ki.SAMPLE], min(newton.count[kn.WAITING], 4 - begin)
     for k in range(count):
         lanes.t[begin + k] = run.sample_time[first + k]
@@ -237,7 +237,7 @@ def load_samples(newton: NewtonArrays, run: Run, begin):
 
 @internal_kernel
 def fill_lanes(lanes: StageLanes, run: Run, begin):
-    """Copy the first lane into the unused lanes from ``begin`` on."""
+    """Copy the first lane into the unused lanes, starting at ``begin``."""
     for k in range(begin, 4):
         lanes.t[k] = lanes.t[0]
         for j in range(run.y.shape[0]):
@@ -246,7 +246,7 @@ def fill_lanes(lanes: StageLanes, run: Run, begin):
 
 @internal_kernel
 def take_samples(newton: NewtonArrays, system: System, ws: Workspace, run: Run, begin, count):
-    """Record ``count`` samples from the lanes from ``begin`` on; a sample off its surfaces is projected separately."""
+    """Record ``count`` samples from the lanes, starting at ``begin``; project samples off their surfaces separately."""
     if count == 0:
         return
     lanes = newton.lanes
@@ -266,7 +266,7 @@ def take_samples(newton: NewtonArrays, system: System, ws: Workspace, run: Run, 
 
 @form_of(evaluate_end, _on_lanes)
 def evaluate_end_on_lanes(newton, system, ws, run):
-    """Evaluate y_new on the first lane, the two inner stages on the next, and a waiting sample on the last."""
+    """Evaluate y_new on the first lane, the two inner stages on the next two, and a waiting sample on the last."""
     lanes, t, h = newton.lanes, run.clock[ki.TIME], run.clock[ki.STEP]
     lanes.t[0], lanes.t[1], lanes.t[2] = t + h, t + kn.NODE_RADAU[0] * h, t + kn.NODE_RADAU[1] * h
     for j in range(run.y.shape[0]):
@@ -290,7 +290,7 @@ def evaluate_end_on_lanes(newton, system, ws, run):
 
 @form_of(end_accepted, _on_lanes)
 def end_accepted_on_lanes(newton, system, ws, run):
-    """Check the end in the first lane, unless it must be projected."""
+    """Check the end of the step in the first lane, unless it must be projected."""
     end = lane(tables_as_lanes(newton.lanes.ws), 0)
     if not off_surface(end):
         return end_watched(system, end, run)
@@ -299,7 +299,7 @@ def end_accepted_on_lanes(newton, system, ws, run):
 
 @form_of(end_workspace, _on_lanes)
 def end_workspace_on_lanes(newton, system, ws, run):
-    """Return the first lane."""
+    """Return the first lane, which contains the end of the step."""
     return lane(tables_as_lanes(newton.lanes.ws), 0)
 
 
@@ -322,7 +322,7 @@ def columns_on_lanes(lanes, system, ws, t, y, x, base, r):
 
 @form_of(evaluate_stages, has_lanes)
 def stages_on_lanes(lanes, system, ws, t, h, y, x, r):
-    """Evaluate three lanes, and the last of them again."""
+    """Evaluate the three stages on three lanes, and the last stage again on the fourth lane."""
     for j in range(r.kept.shape[1]):
         z0, z1, z2 = y[j] + r.z[0, j], y[j] + r.z[1, j], y[j] + r.z[2, j]
         lanes.y[j, 0], lanes.y[j, 1], lanes.y[j, 2], lanes.y[j, 3] = z0, z1, z2, z2

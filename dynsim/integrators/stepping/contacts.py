@@ -1,18 +1,20 @@
-"""The contact law of time stepping: Coulomb's cone on the rates at the end of a step, with the rows at that end.
+"""Contact law of time stepping: Coulomb's law for the rates at the end of a step, with the rows at the end.
 
-The rows J of a step belong to its midpoint. On a surface of curvature κ, J(q_m) v' = 0 would take the energy
-½ m (h κ v²)² in each step from a body that only follows the surface. The rows at the end are extrapolated without
-another sweep: with the same rates v the rows of this step give r = J_k v, those of the last step s = J_{k−1} v, so that
-J(q') v' = J_k v' + c h/(h + h_last) up to O(h²), with c = r − s. The law is on
+The rows J of a step belong to its midpoint. On a surface of curvature κ, the law J(q_m) v' = 0 would remove the energy
+½ m (h κ v²)² in each step from a body that only follows the surface. The rows at the end are therefore extrapolated,
+without another sweep. With the same rates v, the rows of this step give r = J_k v, and the rows of the last step give
+s = J_{k−1} v, so that J(q') v' = J_k v' + c h/(h + h_last) up to O(h²), with c = r − s. The law is applied to
 
     w = J_k v' + a,    a = c h/(h + h_last),    0 ≤ p_n ⟂ w_n ≥ 0,  |p_t| ≤ μ p_n,  w_t = −λ p_t
 
-W = J M⁻¹ Jᵀ stays symmetric, and each step solves one contact problem. For a contact that slides and cannot stop within
-the step friction is along the mean slip: w_t = u_t + u_t'. A contact that lands has no earlier rows: a = 0, or e u_n by
-Newton's restitution, unless that and friction would create energy together. Its penetration is removed slowly, and only
-to the extent that the energy lost in the landing allows; a joint that has passed its stop is moved back likewise.
+W = J M⁻¹ Jᵀ remains symmetric, and each step solves one contact problem. For a contact that slides and cannot stop
+within the step, friction is along the mean slip: w_t = u_t + u_t'. A contact that lands has no earlier rows: a = 0, or
+a = e u_n by Newton's restitution, unless restitution and friction together would create energy. The penetration is
+removed slowly, and only to the extent that the energy lost in the landing allows; a joint that has passed its stop is
+moved back in the same way.
 
-The law on mean rates, J (v + v') = 0, would be simpler but multiplies disturbances by −1: rates alternate undamped.
+A law for mean rates, J (v + v') = 0, would be simpler, but it multiplies disturbances by −1, so that rates alternate
+undamped.
 """
 
 from __future__ import annotations
@@ -55,23 +57,24 @@ from dynsim.integrators.stepping import tables as kt
 from dynsim.integrators.stepping.tables import SteppingArrays, geometry, place_state
 from dynsim.jit.kernel import internal_kernel
 
-# Compliant rows in time stepping: springs and dampers of contacts, and ties between bodies.
+# Compliant rows of time stepping: springs and dampers of contacts, and ties between bodies.
 
 
-# A force is at its bound if less than this share of it is missing.
+# A force counts as at its bound if it differs from the bound by less than this fraction.
 AT_BOUND = 1e-12
-# Time in which unresolved springs return to rest, in steps.
+# Number of steps in which springs that the step size does not resolve return to rest.
 COMPLIANT_RETURN_STEPS = 2.0
-# ε of the tangents of a compliant contact, as a multiple of their mobility: a spring 1/(h² ε) that no step resolves,
-# some 1e9 N/m if it holds a kilogram.
+# ε of the tangents of a compliant contact, as a multiple of their mobility. It corresponds to a spring 1/(h² ε) that no
+# step resolves, of about 1e9 N/m if it holds one kilogram.
 TANGENTIAL = 1e-4
-# How often the first step of a run is solved again with its tangential impulses taken as impulses of the last step.
+# Maximum number of times that the first step of a run is solved again with its tangential impulses as the impulses of
+# the last step.
 MOST_LOADED = 30
 
 
 @internal_kernel
 def compliant_row(k, c, w, x, u, h, theta):
-    """Return φ, compliance ε and addition a to the end rate of a row with mobility w that is at x with rate u."""
+    """Return φ, the compliance ε, and the addition a to the end rate for a row with mobility w at x with rate u."""
     resolved = 1.0 / max(1.0, h * h * k * w)
     phi = 1.0 - (1.0 - theta) * resolved
     K = phi * h * k + c + (1.0 - resolved) * COMPLIANT_RETURN_STEPS * h * k
@@ -80,10 +83,11 @@ def compliant_row(k, c, w, x, u, h, theta):
 
 @internal_kernel
 def soften_contact(law, s: SteppingArrays, ws: Workspace, k, h):
-    """Add compliance to the rows of listed candidate k, if it has any, in W, ``s.b`` and ``s.turn``.
+    """Add the compliance of listed candidate k, if it has any, to its rows in W, ``s.b`` and ``s.turn``.
 
-    Tangents are relative to the impulses of the last step, ``s.f``: u' + a + ε (p − p_last) = 0 if the contact sticks.
-    If rigid, nearly straight chains of wheels would jam: lateral forces of hundreds of newtons from rates of 1e-8 m/s.
+    The tangents are relative to the impulses of the last step, ``s.f``: u' + a + ε (p − p_last) = 0 if the contact
+    sticks. If the tangents were rigid, nearly straight chains of wheels would jam, with lateral forces of hundreds of
+    newtons from rates of 1e-8 m/s.
     """
     stiffness, damping = law[k, ka.CONTACT_STIFFNESS], law[k, ka.CONTACT_DAMPING]
     if stiffness == 0.0:
@@ -102,10 +106,11 @@ def soften_contact(law, s: SteppingArrays, ws: Workspace, k, h):
 
 @internal_kernel
 def load_tangents(law, s: SteppingArrays, ws: Workspace):
-    """Take tangential impulses of compliant contacts as those of the last step; True if this changes the law.
+    """Use the tangential impulses of compliant contacts as those of the last step; return whether this changes the law.
 
-    At a start there is no last step. With p_last = 0 all static friction would first have to deflect the tangents, so
-    that a body at rest would accelerate by ε p/h. The loads of the tangents at a start are assumed to be old.
+    At a start, no last step exists. With p_last = 0, all static friction would first have to deflect the tangents, so
+    that a body at rest would accelerate by ε p/h. The loads of the tangents at a start are therefore assumed to have
+    acted before.
     """
     changes = False
     for k in range(ws.contacts.shape[0]):
@@ -113,7 +118,7 @@ def load_tangents(law, s: SteppingArrays, ws: Workspace):
             continue
         for m in range(1, ka.MOST_ROWS):
             i = ws.active[k, ka.FIRST_ROW] + m
-            # W includes ε already.
+            # W already includes ε.
             more = TANGENTIAL / (1.0 + TANGENTIAL) * ws.small[0, i, i] * (s.f[i] - s.impulse[3 * k + m])
             s.b[i] -= more
             s.impulse[3 * k + m] = s.f[i]
@@ -123,15 +128,16 @@ def load_tangents(law, s: SteppingArrays, ws: Workspace):
 
 @internal_kernel
 def spring_energy(stiffness, x):
-    """Return ½ k x² of a one-sided spring compressed by −x [J]."""
+    """Return the energy ½ k x² of a one-sided spring that is compressed by −x [J]."""
     return 0.5 * stiffness * min(x, 0.0) ** 2
 
 
 @internal_kernel
 def book_soft_contact(law, layout, s: SteppingArrays, ws: Workspace, k, work, y_new, h):
-    """Book the energy stored and lost by the normal force of candidate k, whose work is ``work``.
+    """Record the energy stored and lost by the normal force of candidate k, whose work is ``work``.
 
-    The remainder belongs to the scheme. Without force the surface recovers by itself, and its damper takes all energy.
+    The remainder is counted as scheme energy. Without a force, the surface recovers by itself, and its damper absorbs
+    all of its energy.
     """
     now, last, stiffness = s.memory[kt.NOW, k], s.memory[kt.LAST, k], law[k, ka.CONTACT_STIFFNESS]
     lost = last[kt.STORED]
@@ -147,7 +153,7 @@ def book_soft_contact(law, layout, s: SteppingArrays, ws: Workspace, k, work, y_
 
 @internal_kernel
 def book_spring(layout, stored, lost, work, y_new):
-    """Book energy ``stored`` in a spring and ``lost`` in its damper, which together receive −``work`` [J]."""
+    """Record the energy ``stored`` in a spring and ``lost`` in its damper, which together receive −``work`` [J]."""
     y_new[layout.elastic + kst.STORED] += stored
     y_new[layout.elastic + kst.DAMPED] += lost
     y_new[layout.scheme] -= work + stored + lost
@@ -156,7 +162,10 @@ def book_spring(layout, stored, lost, work, y_new):
 
 @internal_kernel
 def list_ties(unilateral: UnilateralArrays, ws: Workspace):
-    """Start and end ties according to their kinds; True if one has changed. A rest of NaN becomes the present pose."""
+    """Start and end ties according to their kinds; return whether any has changed.
+
+    A rest value of NaN is set to the present pose.
+    """
     table, tie, changed = unilateral.tie_table, unilateral.tie, False
     for k in range(table.shape[0]):
         holds = 1 if table[k, ku.TIE_KIND] >= 0 else 0
@@ -173,7 +182,7 @@ def list_ties(unilateral: UnilateralArrays, ws: Workspace):
 
 @internal_kernel
 def begin_tie(unilateral: UnilateralArrays, ws: Workspace, k):
-    """Set the rest of tie k, if it is NaN, to the present pose of its bodies."""
+    """Set the rest value of tie k, if it is NaN, to the present pose of its bodies."""
     table, tie = unilateral.tie_table, unilateral.tie
     if tie[k, ku.TIE_REST] == tie[k, ku.TIE_REST]:
         return
@@ -202,7 +211,7 @@ def relative_attitude(ws: Workspace, a, b):
 
 @internal_kernel
 def tie_deflection(unilateral: UnilateralArrays, ws: Workspace, k):
-    """Return how far A of tie k is ahead of B along the axis, or is turned about it by rotation vector [m or rad]."""
+    """Return the deflection of tie k: displacement of A from B along the axis, or rotation about it [m or rad]."""
     table, tie = unilateral.tie_table, unilateral.tie
     a, b, axis = table[k, ku.TIE_A], table[k, ku.TIE_B], vector(tie, k, ku.TIE_AXIS)
     if table[k, ku.TIE_TURNS] == 1:
@@ -216,7 +225,7 @@ def tie_deflection(unilateral: UnilateralArrays, ws: Workspace, k):
 
 @internal_kernel
 def tie_turn(unilateral: UnilateralArrays, ws: Workspace, k):
-    """Return the rotation vector of B relative to A since tie k began, in axes of A, at most half a turn long [rad]."""
+    """Return the rotation vector of B relative to A since tie k began, in the axes of A, at most half a turn [rad]."""
     table, R = unilateral.tie_table, rotation(unilateral.tie, k, ku.TIE_ATTITUDE)
     E = compose(
         relative_attitude(ws, table[k, ku.TIE_A], table[k, ku.TIE_B]),
@@ -232,9 +241,9 @@ def tie_turn(unilateral: UnilateralArrays, ws: Workspace, k):
 def turning_axis(axis, turn):
     """Return the direction along which angular velocity changes the ``axis`` component of rotation vector ``turn``.
 
-    With the rotation vector φ it is a + ½ φ × a + c φ × (φ × a), c = 1/φ² − (1 + cos φ)/(2 φ sin φ): the axis itself
-    if the bodies turn about it only. Otherwise a torque along the axis would not be the gradient of ½ k x², and
-    turning back and forth would create energy.
+    With the rotation vector φ and the axis a, the direction is a + ½ φ × a + c φ × (φ × a) with
+    c = 1/φ² − (1 + cos φ)/(2 φ sin φ), which is the axis itself if the bodies only turn about it. Otherwise, a torque
+    along the axis would not be the gradient of ½ k x², and turning back and forth would create energy.
     """
     square = dot_vector(turn, turn)
     size = math.sqrt(square)
@@ -253,7 +262,7 @@ def turning_axis(axis, turn):
 
 @internal_kernel
 def place_ties(unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace):
-    """Write rows of active ties at the geometry of the sweep: the motion of A relative to B at the point of B."""
+    """Write the rows of active ties at the poses of the sweep: the motion of A relative to B at the point of B."""
     table, tie, rows = unilateral.tie_table, unilateral.tie, ws.rows
     for k in range(table.shape[0]):
         if table[k, ku.TIE_HOLDS] == 0:
@@ -265,7 +274,7 @@ def place_ties(unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace):
             put_vector(rows, r, ka.ROW, rotate(A, turning_axis(axis, turn)))
             put_vector(rows, r, ka.ROW + 3, ZERO_VECTOR)
             x = -dot_vector(axis, turn)
-            # Rotation vectors are at most half a turn long and jump to the opposite side; the rest angle jumps too.
+            # Rotation vectors are at most half a turn long and then jump to the opposite side; so must the rest angle.
             if abs(x - tie[k, ku.TIE_TURNED]) > math.pi:
                 tie[k, ku.TIE_REST] += math.copysign(2.0 * math.pi, x - tie[k, ku.TIE_TURNED])
             tie[k, ku.TIE_TURNED] = x
@@ -281,7 +290,7 @@ def place_ties(unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace):
 
 @internal_kernel
 def soften_ties(unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace, h):
-    """Add compliance to the rows of ties, within their bounds; start from their last impulses."""
+    """Add the compliance of ties to their rows, set their bounds, and start from their last impulses."""
     table, tie, W = unilateral.tie_table, unilateral.tie, ws.small[0]
     for k in range(table.shape[0]):
         if table[k, ku.TIE_HOLDS] == 0:
@@ -299,7 +308,7 @@ def soften_ties(unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace, 
 
 @internal_kernel
 def book_ties(unilateral: UnilateralArrays, layout, s: SteppingArrays, ws: Workspace, y_new, h):
-    """Book the energy stored and lost by ties, and compute their rests for the case that the step is accepted."""
+    """Record the energy stored and lost by ties, and compute their rest values in case the step is accepted."""
     table, tie = unilateral.tie_table, unilateral.tie
     for k in range(table.shape[0]):
         row, stored = tie[k], tie[k, ku.TIE_STORED]
@@ -328,40 +337,42 @@ def book_ties(unilateral: UnilateralArrays, layout, s: SteppingArrays, ws: Works
 
 @internal_kernel
 def accept_ties(unilateral: UnilateralArrays):
-    """Accept the rests and energies of ties at the end of the step."""
+    """Accept the rest values and energies of ties at the end of the step."""
     for k in range(unilateral.tie.shape[0]):
         tie = unilateral.tie[k]
         tie[ku.TIE_GIVEN] += abs(tie[ku.TIE_REST_NOW] - tie[ku.TIE_REST])
         tie[ku.TIE_REST], tie[ku.TIE_STORED] = tie[ku.TIE_REST_NOW], tie[ku.TIE_STORED_NOW]
 
 
-# Share of the energy that passes through the rows of a step, below which a gain is rounding: restitution of 1 has no
-# gain.
+# Fraction of the energy transmitted by the rows of a step below which a gain is due to rounding; a restitution of 1 has
+# no gain.
 NO_GAIN = 1e-6
-# cos of the largest angle by which a row turns in a step; beyond it the contact is at a kink, an edge or another point.
+# cos of the largest angle by which a row may turn in a step; if it turns more, the contact has reached a kink, an edge
+# or another point.
 SAME_ROW = 0.95
-# A contact point that has moved by more than this multiple of the body's path is another point; if it has moved by less
-# than the second value, which the body may have covered while reversing, it is the same [m].
+# A contact point that has moved by more than the first value times the path of the body is a different point. If it has
+# moved by less than the second value [m], which the body may have covered while reversing, it is the same point.
 SAME_PLACE, SHORT_WAY = 4.0, 1e-4
 # Distance from the end of an axis, as a fraction of its length, up to which a point counts as the end.
 AT_END = 1e-9
-# Gap up to which a point touches when a run begins or its rates have jumped [m].
+# Gap up to which a point counts as touching when a run begins or its rates have jumped [m].
 TOUCHES = 1e-9
-# Gaps are closed, and depths removed, within this time and at least this number of steps [s]; no faster than this
-# speed [m/s]. Shorter times bounce.
+# Gaps are closed, and penetrations removed, within RETURN_TIME [s] but at least RETURN_STEPS steps, and no faster than
+# RETURN_SPEED [m/s]. With shorter times, contacts would bounce.
 RETURN_TIME, RETURN_STEPS, RETURN_SPEED = 0.02, 10.0, 0.02
-# Limit of impulses that do not solve their problem, each times its mobility, as a multiple of the largest rate.
+# Limit of each impulse times its mobility, as a multiple of the largest rate, if the impulses do not solve the problem.
 MOST_UNSOLVED = 1e3
-# Gaps due to oscillation of the scheme itself, in units of h |a_n|, count as zero: feedback on them would add energy.
+# Gaps of up to this multiple of h |a_n| are due to oscillations of the scheme and count as zero, because feedback on
+# them would add energy.
 SWAY = 2.0
 
 
 @internal_kernel
 def restart_memory(system, s: SteppingArrays, ws: Workspace, y):
-    """Restart with the contacts touching at y if the rates of y are not the rates at the end of the last step.
+    """Restart with the contacts that touch at y if the rates of y are not the rates at the end of the last step.
 
-    Their rows at y, half a step before the midpoint, replace the rows of the last step, with h/(h + 0) of the change of
-    turning rows. Sweeps.
+    The rows of these contacts at y, half a step before the midpoint, replace the rows of the last step; the change of
+    turning rows then counts with the factor h/(h + 0). The function performs a sweep.
     """
     layout = system.layout
     if s.grid[kt.LENGTH_LAST] > 0.0 and not rates_jumped(s, y, layout.v):
@@ -393,7 +404,7 @@ def restart_memory(system, s: SteppingArrays, ws: Workspace, y):
 
 @internal_kernel
 def rates_jumped(s: SteppingArrays, y, first):
-    """True if the rates, from ``first`` on in y, are not those at the end of the last step."""
+    """Return whether the rates in y, from index ``first`` on, differ from those at the end of the last step."""
     jumped = False
     for i in range(s.before.shape[1]):
         jumped = jumped or s.before[kt.V_LAST, i] != y[first + i]
@@ -402,7 +413,7 @@ def rates_jumped(s: SteppingArrays, y, first):
 
 @internal_kernel
 def note_place(system, state, k, note):
-    """Record directions and location of candidate k, by which the next step recognises its rows."""
+    """Record the directions and location of candidate k, so that the next step can recognise its rows."""
     for m in range(3):
         note[kt.NORMAL_THEN + m], note[kt.TANGENT_THEN + m] = state[ka.NORMAL + m], state[ka.FIRST_TANGENT + m]
     note[kt.CENTRE], note[kt.CENTRE + 1], note[kt.CENTRE + 2] = centre(system.shapes, state, k)
@@ -426,7 +437,8 @@ def remember(unilateral: UnilateralArrays, s: SteppingArrays, y, first, h):
 def list_contacts(system, s: SteppingArrays, ws: Workspace, h):
     """Mark the candidates that touch; if they change, rebuild the table of rows and return True.
 
-    A closed contact stays listed while its contact point is the same: over convex surfaces the midpoint is above them.
+    A closed contact stays listed while its contact point remains the same, because the midpoint of a step over a convex
+    surface is above the surface.
     """
     stops, ties = close_stops(system.model, system.unilateral, ws), list_ties(system.unilateral, ws)
     changed = stops or ties
@@ -436,7 +448,7 @@ def list_contacts(system, s: SteppingArrays, ws: Workspace, h):
         s.turn[k, kt.KNOWN] = 1.0 if known else 0.0
         listed = ws.contacts[k, ka.GAP] <= kt.MARGIN or (known and last[kt.CLOSED] == 1.0)
         listed = listed and not at_axis_end(system, ws, k)
-        # Depth does not matter: it is removed slowly.
+        # The depth does not matter, because it is removed slowly.
         listed = listed and moves_along_normal(system.model, system.contacts, ws, k, 0.0)
         mode = ka.STICKING if listed else ka.OPEN
         changed = changed or mode != s.modes[k]
@@ -448,9 +460,10 @@ def list_contacts(system, s: SteppingArrays, ws: Workspace, h):
 
 @internal_kernel
 def at_axis_end(system, ws: Workspace, k):
-    """True if candidate k is the nearest point of an axis and an end of it, which has a separate candidate.
+    """Return whether candidate k, the nearest point of an axis, is at an end, which has a separate candidate.
 
-    Its radius is smaller, but a step lets points penetrate by more than that: both would carry load.
+    The radius of candidate k is smaller, but points penetrate by more than this difference within a step, so that both
+    candidates would carry load.
     """
     shapes = system.shapes
     if shapes is None:  # resolved at compile time
@@ -469,7 +482,7 @@ def at_axis_end(system, ws: Workspace, k):
 
 @internal_kernel
 def is_same_contact(system, last, ws: Workspace, k, h):
-    """True if the normal of candidate k has turned little and its contact point has moved about as far as its body."""
+    """Return whether candidate k has turned its normal little and moved its contact point about as far as its body."""
     state, turned = ws.contacts[k], 0.0
     for m in range(3):
         turned += state[ka.NORMAL + m] * last[kt.NORMAL_THEN + m]
@@ -502,9 +515,9 @@ def centre(shapes, state, k):
 
 @internal_kernel
 def close_stops(model: ModelArrays, unilateral: UnilateralArrays, ws: Workspace):
-    """Close joint stops whose gap is not open, open the others; True if one has changed.
+    """Close joint stops whose gap is not positive, and open the other stops; return whether any has changed.
 
-    A closed brake carries all of the load of its joint, and a stop none.
+    A closed brake carries the entire load of its joint, so that the stop carries no load.
     """
     table, changed = unilateral.stop_table, False
     for k in range(table.shape[0]):
@@ -524,7 +537,7 @@ def tangent_rows(system, s: SteppingArrays, ws: Workspace):
     """
     state, rows, active = ws.contacts, ws.rows, ws.active
     for r in range(ws.counts[ka.COUPLED]):
-        # Couplings are followed by dry frictions, then by joint stops.
+        # Couplings are followed by joints with dry friction, then by joint stops.
         s.kind[r] = kc.BOTH_WAYS if r < system.couplings.joint.shape[0] else kc.ONE_WAY
         s.mu[r], rows[r, ka.TARGET] = 0.0, 0.0
     for k in range(system.unilateral.dry.shape[0]):
@@ -546,16 +559,17 @@ def tangent_rows(system, s: SteppingArrays, ws: Workspace):
 
 @internal_kernel
 def slip_of_rates(law, k, x, y):
-    """Return the slip of candidate k from the rates x, y of its tangents [m/s]."""
+    """Return the slip speed of candidate k from the rates x, y along its tangents [m/s]."""
     x = x / law[k, ka.GRIP] if law[k, ka.GRIP] > 0.0 else 0.0
     return math.sqrt(x * x + y * y)
 
 
 @internal_kernel
 def friction_of(law, s: SteppingArrays, k, r):
-    """Return the friction coefficient of candidate k, first row r, at the slip with which the step begins.
+    """Return the friction coefficient of candidate k, with first row r, at the slip at the start of the step.
 
-    A sticking point also has tangential rates if its rows turn: whether it has slid decides.
+    The coefficient depends on whether the point has slid, because a sticking point also has tangential rates if its
+    rows turn.
     """
     last, speed = s.memory[kt.LAST, k], slip_of_rates(law, k, s.rate[0, r + 1], s.rate[0, r + 2])
     if speed <= kt.BAD or (last[kt.CLOSED] == 1.0 and last[kt.SLID] == 0.0):
@@ -565,7 +579,7 @@ def friction_of(law, s: SteppingArrays, k, r):
 
 @internal_kernel
 def turn_rows(law, s: SteppingArrays, ws: Workspace, k, h):
-    """Write the additions of the law to the end rates of listed candidate k to ``s.turn``; friction is in ``s.mu``."""
+    """Write the law's additions to the end rates of listed candidate k to ``s.turn``; its friction is in ``s.mu``."""
     turn, last, state, r = s.turn[k], s.memory[kt.LAST, k], ws.contacts[k], ws.active[k, ka.FIRST_ROW]
     share = h / (h + s.grid[kt.LENGTH_LAST]) if turn[kt.KNOWN] == 1.0 else 0.0
     along = 0.0
@@ -588,7 +602,7 @@ def turn_rows(law, s: SteppingArrays, ws: Workspace, k, h):
         turn[kt.ADDED] -= turn[kt.PUSH]
     if last[kt.SLID] == 1.0:
         slip = math.sqrt(s.rate[0, r + 1] ** 2 + s.rate[0, r + 2] ** 2)
-        # At a start no impulse is known.
+        # At a start, no impulse is known.
         impulse = s.mu[r] * last[kt.NORMAL_IMPULSE]
         if impulse > 0.0:
             impulse *= h / s.grid[kt.LENGTH_LAST]
@@ -599,16 +613,16 @@ def turn_rows(law, s: SteppingArrays, ws: Workspace, k, h):
 
 @internal_kernel
 def return_rate(gap, turned, budget, h):
-    """Return the rate at which a closed contact is brought back onto its surface; positive out of it [m/s].
+    """Return the rate at which a closed contact is moved back to its surface [m/s]; positive out of the surface.
 
     Parameters
     ----------
     gap : float
         Gap at the midpoint [m].
     turned : float
-        Part of its normal rate due to rows that turn [m/s].
+        Part of the contact's normal rate that is due to turning rows [m/s].
     budget : float
-        Energy that it may take [J].
+        Energy that the motion back may use [J].
     """
     gap -= 0.25 * h * turned
     off = max(0.0, abs(gap) - SWAY * h * abs(turned))
@@ -620,9 +634,10 @@ def return_rate(gap, turned, budget, h):
 
 @internal_kernel
 def stop_return(unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace, k, h):
-    """Return the rate at which closed joint stop k moves its joint back, limited by the losses of its hits.
+    """Return the rate at which closed joint stop k moves its joint back [rad/s or m/s].
 
-    Unit: rad/s or m/s. The impulse of the last step, ``s.f`` of its row, shows how much energy this rate needs.
+    The rate is limited by the energy lost when the joint hit the stop. The impulse of the last step, ``s.f`` of the
+    stop's row, shows how much energy this rate requires.
     """
     loss, rate, row = unilateral.stop[k, ku.STOP_LOSS], 0.0, unilateral.stop_table[k, ku.STOP_ROW]
     if loss > 0.0:
@@ -635,7 +650,7 @@ def stop_return(unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace, 
 
 @internal_kernel
 def largest_mobility(W, r):
-    """Return the larger eigenvalue of the block of W of the two tangents that follow row r."""
+    """Return the larger eigenvalue of the block of W for the two tangents that follow row r."""
     a, b, c = W[r + 1, r + 1], W[r + 1, r + 2], W[r + 2, r + 2]
     return 0.5 * (a + c) + math.sqrt(0.25 * (a - c) ** 2 + b * b)
 
@@ -644,9 +659,10 @@ def largest_mobility(W, r):
 def solve_contacts(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace, h):
     """Solve for the impulses of all rows, starting from the last ones, and write their mean forces to ``ws.rows``.
 
-    Also updates ``s.impulse``. If the slip of a contact that was to slide on ends or reverses, the law of the end
-    applies after all: at most once for each contact. A problem without solution is solved without the additions of the
-    law to the rates, and an impact that would create energy is solved without restitution: at most once each.
+    The function also updates ``s.impulse``. If a contact that was expected to continue sliding stops or reverses, the
+    law for the end of the step is applied to it after all, at most once per contact. A problem without a solution is
+    solved again without the additions of the law to the rates, and an impact that would create energy is solved again
+    without restitution, at most once each.
     """
     p, coupled, rows = ws.counts[ka.ROWS], ws.counts[ka.COUPLED], ws.rows
     start = 3 * ws.contacts.shape[0]
@@ -657,7 +673,7 @@ def solve_contacts(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Wor
         s.right[r] = s.b[r]
         s.f[r] = s.impulse[start + r] if r < coupled else 0.0
     for k in range(unilateral.dry.shape[0]):
-        # A closed brake carries all of the load of its joint.
+        # A closed brake carries the entire load of its joint.
         bound = 0.0 if unilateral.dry_table[k, ku.DRY_BRAKE] == ku.CLOSED else dry_bound(unilateral, k)
         s.mu[unilateral.dry_table[k, ku.DRY_ROW]] = h * bound
     for k in range(unilateral.stop_table.shape[0]):
@@ -709,7 +725,7 @@ def solve_contacts(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Wor
 
 @internal_kernel
 def scale_impulses(s: SteppingArrays, h):
-    """Scale the impulses of the last step to the impulses of the same forces in a step of length h."""
+    """Scale the impulses of the last step so that they belong to the same forces in a step of length h."""
     before = s.grid[kt.IMPULSE_STEP]
     if before > 0.0 and before != h:
         for j in range(s.impulse.shape[0]):
@@ -719,7 +735,7 @@ def scale_impulses(s: SteppingArrays, h):
 
 @internal_kernel
 def solve_problem(s: SteppingArrays, W, p, rigid):
-    """Solve W f + ``s.right`` for impulses f and law rates w; if f is not unique, select f of least norm.
+    """Solve w = W f + ``s.right`` for impulses f and law rates w; if f is not unique, select the f of least norm.
 
     Parameters
     ----------
@@ -746,10 +762,11 @@ def solve_problem(s: SteppingArrays, W, p, rigid):
 
 @internal_kernel
 def drop_turns(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace, p):
-    """Zero the additions of the law to rates of rigid contacts and stops, and all impulses; False if they were zero.
+    """Zero the law's additions to the rates of rigid contacts and stops, and all impulses; return whether any changed.
 
-    If W is rank-deficient, the additions need not be a motion of the system, and then there may be no solution. The
-    rates without impulses are a motion, so with these only a solution exists. Compliant contacts keep their springs.
+    If W is rank-deficient, the additions need not be a possible motion of the system, and then the problem may have no
+    solution. The rates without impulses are a possible motion, so a solution exists for these rates alone. Compliant
+    contacts keep their springs.
     """
     dropped = False
     for k in range(unilateral.stop_table.shape[0]):
@@ -766,7 +783,7 @@ def drop_turns(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspa
             turn[kt.PUSH], turn[kt.MEAN] = 0.0, 0.0
     if dropped:
         s.statistics[kt.DROPPED] += 1.0
-        # The last impulses may be huge.
+        # Do not start from the last impulses, because they may be huge.
         for r in range(p):
             s.f[r] = 0.0
     return dropped
@@ -774,7 +791,7 @@ def drop_turns(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspa
 
 @internal_kernel
 def bounces(law, s: SteppingArrays, ws: Workspace, k):
-    """True if the law adds the restitution of candidate k, which lands, to its normal rate."""
+    """Return whether candidate k lands and the law adds its restitution to the normal rate."""
     lands = ws.active[k, ka.MODE] == ka.STICKING and s.memory[kt.LAST, k, kt.CLOSED] == 0.0
     rigid = law[k, ka.CONTACT_STIFFNESS] == 0.0
     return lands and rigid and law[k, ka.RESTITUTION] > 0.0 and s.rate[0, ws.active[k, ka.FIRST_ROW]] < 0.0
@@ -782,9 +799,10 @@ def bounces(law, s: SteppingArrays, ws: Workspace, k):
 
 @internal_kernel
 def gains_energy(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace):
-    """True if contacts and stops together would add energy, p·(u + u')/2 > 0.
+    """Return whether contacts and stops together would add energy, p·(u + u')/2 > 0.
 
-    u' is without the additions of extrapolated rows and returns to the surface: for closed rows the law rate w itself.
+    u' excludes the additions for extrapolated rows and for returns to the surface; for closed rows it is the law rate
+    w.
     """
     gain, passed = 0.0, 0.0
     for k in range(unilateral.stop_table.shape[0]):
@@ -817,7 +835,7 @@ def drop_restitution(law, s: SteppingArrays, ws: Workspace):
 def limit_energy(s: SteppingArrays, W, p):
     """Scale impulses that do not solve their problem by the factor in [0, 1] that minimises ½ fᵀ W f + f·b.
 
-    This is the energy that they add. A scaled f stays in its cones and takes energy, whatever f is.
+    This expression is the energy that the impulses add. A scaled f remains in its cones and removes energy for any f.
     """
     linear, square, strongest, fastest = 0.0, 0.0, 0.0, 0.0
     for k in range(p):
@@ -834,7 +852,10 @@ def limit_energy(s: SteppingArrays, W, p):
 
 @internal_kernel
 def slip_ends(s: SteppingArrays, ws: Workspace):
-    """Apply the law of the end to contacts that were to slide on and have not; True if there are any."""
+    """Apply the law for the end of the step to contacts that did not continue sliding as expected.
+
+    Returns whether any such contact exists.
+    """
     ends = False
     for k in range(ws.contacts.shape[0]):
         if ws.active[k, ka.MODE] != ka.STICKING or s.turn[k, kt.MEAN] == 0.0:
@@ -851,9 +872,9 @@ def slip_ends(s: SteppingArrays, ws: Workspace):
 
 @internal_kernel
 def strikes(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace, elsewhere):
-    """True if a rigid contact or a joint stop has struck in this step.
+    """Return whether a rigid contact or a joint stop has been struck in this step.
 
-    With ``elsewhere``, closed contacts whose contact point has moved to another part of the body also count.
+    With ``elsewhere``, closed contacts whose contact point has jumped to another part of the body also count.
     """
     for k in range(unilateral.stop_table.shape[0]):
         closes = unilateral.stop_table[k, ku.STOP_CLOSED] > unilateral.stop_table[k, ku.STOP_BEFORE]
@@ -869,7 +890,7 @@ def strikes(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace,
 
 @internal_kernel
 def is_stopped(s: SteppingArrays, r):
-    """True if row r approached at the start of the step, and its force has stopped or reversed that."""
+    """Return whether row r approached at the start of the step and its force has stopped or reversed this approach."""
     return s.rate[0, r] < -kt.BAD and s.f[r] > 0.0
 
 
@@ -877,7 +898,7 @@ def is_stopped(s: SteppingArrays, r):
 def note_contacts(system, s: SteppingArrays, ws: Workspace):
     """Write the state of each candidate after the step to ``s.memory`` and ``s.motion``; end rates are in ``s.rate``.
 
-    A contact that presses or does not leave is closed: a force that merely becomes zero is not an event.
+    A contact that presses or does not leave counts as closed, because a force that merely becomes zero is not an event.
     """
     for k in range(ws.contacts.shape[0]):
         now, last, state = s.memory[kt.NOW, k], s.memory[kt.LAST, k], ws.contacts[k]

@@ -1,4 +1,4 @@
-"""One step of time stepping, its ledger, samples and driver; equations in dynsim.integrators.stepping.tables."""
+"""Time stepping: one step, its ledger, samples and driver; the equations are in dynsim.integrators.stepping.tables."""
 
 from __future__ import annotations
 
@@ -44,11 +44,11 @@ from dynsim.integrators.stepping.tables import (
 from dynsim.integrators.steps import choose_step, finished, finite, stalled
 from dynsim.jit.kernel import free_kernel, internal_kernel
 
-# Drives within a time-stepping step: implicit linear blocks, with limits decided at x_θ.
+# Drives within a time-stepping step: implicit linear blocks, whose active limits are determined at x_θ.
 
 
-# Most repetitions of a step to find the segments of its drives; after ALL_AT_ONCE of them one drive changes at a time,
-# because simultaneous changes may undo each other.
+# Maximum number of repetitions of a step to find the active limits of its drives; after ALL_AT_ONCE repetitions, only
+# one drive changes at a time, because simultaneous changes may undo each other.
 MOST_TRIES, ALL_AT_ONCE = 16, 4
 
 
@@ -56,8 +56,8 @@ MOST_TRIES, ALL_AT_ONCE = 16, 4
 def eliminate_currents(system: System, ws: Workspace, run: Run):
     """Write torques of drives and damping to APPLIED, and their implicit part to the ARMATURE of ``s.body``.
 
-    The joints must be at (q + h θ v, v), and APPLIED must have all other torques. With Δ = v' − v, i' − i
-    is a + c Δ, and the torque at x_θ is τ + ∂τ/∂i θ a + (∂τ/∂q h θ² + ∂τ/∂v θ + ∂τ/∂i θ c) Δ.
+    The joints must be at (q + h θ v, v), and APPLIED must contain all other torques. With Δ = v' − v, i' − i is
+    a + c Δ, and the torque at x_θ is τ + ∂τ/∂i θ a + (∂τ/∂q h θ² + ∂τ/∂v θ + ∂τ/∂i θ c) Δ.
     """
     s, h, body, joints, motors = run.stepping, run.clock[ki.STEP], system.model.body, ws.joints, ws.motors
     theta, drives = s.theta, system.drives
@@ -83,7 +83,7 @@ def eliminate_currents(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def drive_at_theta(system: System, ws: Workspace, run: Run):
-    """Evaluate the drives at x_θ of the step into y_new by their own laws; APPLIED then has only their torques."""
+    """Evaluate the drive laws at x_θ of the step to y_new; APPLIED then contains only the torques of the drives."""
     s, h, y, y_new, layout = run.stepping, run.clock[ki.STEP], run.y, run.y_new, system.layout
     between, theta = run.stage[2], s.theta
     for j in range(y.shape[0]):
@@ -98,11 +98,12 @@ def drive_at_theta(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def limits_agree(system: System, ws: Workspace, run: Run, tries):
-    """True if the drives at x_θ, after :func:`drive_at_theta`, are on their segments; otherwise moves them there.
+    """Return whether the active limits of the drives agree with their state at x_θ; if not, change the limits.
 
-    From one limit to the opposite limit a drive passes through the unlimited segment between them: a light wheel
-    crosses it within a step under either limit, and each limit would call for the other. Between the current limits of
-    a motor with inductance are the limits of its voltage instead.
+    Call this function after :func:`drive_at_theta`. On the way from one limit to the opposite limit, a drive passes
+    through the unlimited segment between them. A light wheel would cross this segment within a step under either limit,
+    so that each limit would lead to the other. For a motor with inductance, the voltage limits are between its current
+    limits instead.
     """
     s, agree = run.stepping, True
     t = run.clock[ki.TIME] + s.theta * run.clock[ki.STEP]
@@ -116,12 +117,12 @@ def limits_agree(system: System, ws: Workspace, run: Run, tries):
     return agree
 
 
-# Energy error of time-stepping discretisation, a term of the ledger: ``loss_scheme``.
+# Energy error of the time-stepping discretisation, which is the ledger term ``loss_scheme``.
 
 
 @internal_kernel
 def stored_energy(system: System, ws: Workspace, y, out):
-    """Write the energy of bodies and rotors, and of coils, at y [J] to out, (2,). Sweeps there."""
+    """Write the energies of bodies with rotors, and of coils, at y [J] to out, (2,), after a sweep at y."""
     layout, motor = system.layout, system.drives.motor
     place_state(system, ws, y)
     forward_sweep(system.model, ws, 1.0, 0.0, 1.0)
@@ -135,11 +136,11 @@ def stored_energy(system: System, ws: Workspace, y, out):
 
 @internal_kernel
 def begin_energy(system: System, ws: Workspace, run: Run):
-    """Set the energy at the start of a step: the energy at the end of the last one, unless the state has changed."""
+    """Set the energy at the start of a step: the energy at the end of the last step, unless the state has changed."""
     energy, same = run.stepping.energy, True
     for j in range(system.layout.tracked):
         same = same and run.y[j] == run.y_new[j]
-    # NaN before the first step.
+    # The energy is NaN before the first step.
     if same and energy[kt.STOP, kt.MECHANICAL] == energy[kt.STOP, kt.MECHANICAL]:
         for m in range(energy.shape[1]):
             energy[kt.START, m] = energy[kt.STOP, m]
@@ -151,7 +152,7 @@ def begin_energy(system: System, ws: Workspace, run: Run):
 def midpoint_work(model: ModelArrays, ws: Workspace, v, vdot, h):
     """Return v̄·M Δ + h v̄·(c + g) at the midpoint [J], whose sweep is still in ``ws``.
 
-    Leaves the links' velocities of v̄ in V.
+    The link velocities for v̄ are left in V.
 
     Parameters
     ----------
@@ -182,7 +183,10 @@ def midpoint_work(model: ModelArrays, ws: Workspace, v, vdot, h):
 
 @internal_kernel
 def drive_work(system: System, ws: Workspace, run: Run):
-    """Return the energy made by linear drives and by where their power acts [J]; ``drive`` at x_θ is in APPLIED."""
+    """Return the energy created by linearising the drives and by evaluating their power at x_θ [J].
+
+    APPLIED must contain the torques of the drives at x_θ.
+    """
     s, h, y, y_new, layout = run.stepping, run.clock[ki.STEP], run.y, run.y_new, system.layout
     joints, motors, motor, body, theta = ws.joints, ws.motors, system.drives.motor, system.model.body, s.theta
     v, vdot, applied = s.before[kt.V_START], s.before[kt.ACCELERATION], s.before[kt.APPLIED_THEN]
@@ -207,7 +211,7 @@ def drive_work(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def step_moreau(system: System, ws: Workspace, run: Run):
-    """Take one step from y to y_new; mean accelerations and forces stay in the workspace."""
+    """Take one step from y to y_new; mean accelerations and forces are left in the workspace."""
     s, y, layout = run.stepping, run.y, system.layout
     v0, v_bias, last = s.before[kt.V_START], s.before[kt.V_BIAS], s.before[kt.ACCELERATION]
     model = ModelArrays(system.model.tree, s.body, system.model.gravity)
@@ -222,7 +226,7 @@ def step_moreau(system: System, ws: Workspace, run: Run):
         take_drives(system, ws, run)
         place_midpoint(system, model, ws, run)
         if tries == 1 and list_contacts(system, s, ws, run.clock[ki.STEP]):
-            # The last acceleration does not predict the next one.
+            # The last acceleration does not predict the acceleration of this step.
             for i in range(ws.joints.shape[0]):
                 v_bias[i], ws.joints[i, ka.QD] = v0[i], v0[i]
             geometry(system, model, ws)
@@ -238,10 +242,10 @@ def step_moreau(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def take_drives(system: System, ws: Workspace, run: Run):
-    """Evaluate the drives at (q + h θ v, v) for the step; torques without loads stay in ``s.before``."""
+    """Evaluate the drives at (q + h θ v, v) for the step; the torques without loads are left in ``s.before``."""
     s, y, layout, joints, body = run.stepping, run.y, system.layout, ws.joints, system.model.body
     place_joints(system, ws, y)
-    if layout.extra > 0:  # rolling bases move along their heading; the last sweep may have been elsewhere
+    if layout.extra > 0:  # rolling bases move along their heading; the last sweep may have been at another state
         sine_cosine(joints, ws.trig)
     for i in range(joints.shape[0]):
         v = s.before[kt.V_START, i]
@@ -255,7 +259,7 @@ def take_drives(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def place_midpoint(system: System, model: ModelArrays, ws: Workspace, run: Run):
-    """Compute geometry at q + h v/2, and velocity products of the rates that the last acceleration predicts."""
+    """Compute the geometry at q + h v/2, and the velocity products for rates predicted from the last acceleration."""
     moved(system, ws, run.y, 0.5 * run.clock[ki.STEP], run.y_new)
     place_joints(system, ws, run.y_new)
     for i in range(ws.joints.shape[0]):
@@ -265,7 +269,7 @@ def place_midpoint(system: System, model: ModelArrays, ws: Workspace, run: Run):
 
 @internal_kernel
 def solve_step(system: System, model: ModelArrays, ws: Workspace, run: Run):
-    """Solve for impulses and accelerations at the midpoint, and write the resulting state to y_new."""
+    """Solve for the impulses and accelerations at the midpoint, and write the resulting state to y_new."""
     s, t, h, y, y_new, layout = run.stepping, run.clock[ki.TIME], run.clock[ki.STEP], run.y, run.y_new, system.layout
     joints, v0, last = ws.joints, s.before[kt.V_START], s.before[kt.ACCELERATION]
     if system.loads.table.shape[0] > 0:
@@ -298,14 +302,14 @@ def solve_step(system: System, model: ModelArrays, ws: Workspace, run: Run):
 
 @internal_kernel
 def book(system: System, ws: Workspace, run: Run):
-    """Book the ledger of the step into y_new, after :func:`drive_at_theta`: power at x_θ, and work of contacts."""
+    """Add the step's ledger to y_new, after :func:`drive_at_theta`: the power at x_θ, and the work of contacts."""
     s, t, h, y_new, layout = run.stepping, run.clock[ki.TIME], run.clock[ki.STEP], run.y_new, system.layout
     start = system.layout.ledger
-    # From the sweep at the midpoint, before it is overwritten.
+    # Use the sweep at the midpoint before it is overwritten.
     stored = -midpoint_work(system.model, ws, s.before[kt.V_START], s.before[kt.ACCELERATION], h)
     stored += drive_work(system, ws, run)
     if system.loads.table.shape[0] > 0:
-        # Again, for their powers at the mean velocities that the links have now.
+        # Add the loads again to get their powers at the mean velocities that the links have now.
         add_loads(system.model, system.loads, t + s.theta * h, ws, run.stage[1], layout.load)
     gear, joint = damping_powers(system.model, ws)
     electrical, drawn, joule, mechanical, drag = drive_powers(system.drives, ws)
@@ -342,7 +346,7 @@ def work_of_row(s: SteppingArrays, ws: Workspace, r, h):
 
 @internal_kernel
 def book_stops(unilateral: UnilateralArrays, system: System, s: SteppingArrays, ws: Workspace, y_new, h):
-    """Book the work of joint stops as a loss, not as an error of the constraints."""
+    """Record the work of joint stops as a loss, not as a constraint error."""
     for k in range(unilateral.stop.shape[0]):
         if unilateral.stop_table[k, ku.STOP_CLOSED] == 0:
             continue
@@ -353,14 +357,14 @@ def book_stops(unilateral: UnilateralArrays, system: System, s: SteppingArrays, 
 
 @internal_kernel
 def book_dry(unilateral: UnilateralArrays, system: System, s: SteppingArrays, ws: Workspace, y_new, h):
-    """Book dry friction as a loss of gear and joint in the ratio of their bounds; write its forces to the tables."""
+    """Record dry friction as losses of gear and joint in the ratio of their bounds; write its forces to the tables."""
     ledger = system.layout.ledger
     for k in range(unilateral.dry.shape[0]):
         dry, r, a = unilateral.dry[k], unilateral.dry_table[k, ku.DRY_ROW], unilateral.dry_table[k, ku.DRY_DRIVE]
         dry[ku.DRY_FORCE], work = ws.rows[r, ka.FORCE], work_of_row(s, ws, r, h)
         share = dry[ku.OF_GEAR] / (dry[ku.OF_GEAR] + dry[ku.OF_JOINT])
-        # If the motion reverses within a step, its force may be along the mean motion: an error of the step, as for
-        # contacts.
+        # If the motion reverses within a step, the friction force may be along the mean motion. This is an error of the
+        # step, as for contacts.
         lost = min(work, 0.0)
         y_new[system.layout.scheme] -= work - lost
         y_new[ledger + kst.GEAR] -= share * lost
@@ -373,10 +377,11 @@ def book_dry(unilateral: UnilateralArrays, system: System, s: SteppingArrays, ws
 
 @internal_kernel
 def book_contacts(system: System, s: SteppingArrays, ws: Workspace, y_new, h):
-    """Book the work of contacts: all of landings as impact loss, tangents that slide or begin to stick as friction.
+    """Record the work of contacts: landings as impact loss, tangents that slide or begin to stick as friction.
 
-    In a landing, friction may return energy that the normal impulse takes: only their sum is a loss. The rest of the
-    work of closed rows belongs to the scheme; pushing out of the surface is paid from the impact losses.
+    In a landing, friction may return energy that the normal impulse takes, so only their sum is a loss. The remaining
+    work of closed rows is counted as scheme energy. The energy for pushing a point out of its surface is deducted from
+    the impact losses.
     """
     layout, first = system.layout, system.layout.contact
     for k in range(ws.contacts.shape[0]):
@@ -395,8 +400,8 @@ def book_contacts(system: System, s: SteppingArrays, ws: Workspace, y_new, h):
                 if now[kt.SLID] == 0.0 and last[kt.SLID] == 0.0:
                     friction = 0.0
             slips = friction != 0.0 or now[kt.SLID] == 1.0
-            # If slip ends or reverses within a step, the mean force may be along its mean motion. Friction returns no
-            # energy: this is an error of the step.
+            # If slip ends or reverses within a step, the mean force may be along the mean motion. Since friction cannot
+            # return energy, this is an error of the step.
             friction = min(friction, 0.0)
             if last[kt.CLOSED] == 0.0 and not soft:
                 struck, friction = normal + tangential, 0.0
@@ -420,14 +425,14 @@ def book_contacts(system: System, s: SteppingArrays, ws: Workspace, y_new, h):
 
 @internal_kernel
 def count_step(unilateral: UnilateralArrays, law, s: SteppingArrays, ws: Workspace, h):
-    """Count times, depths and losses of candidates and joint stops in the accepted step."""
+    """Update times, depths and losses of candidates and joint stops for the accepted step."""
     for k in range(unilateral.stop.shape[0]):
         if unilateral.stop_table[k, ku.STOP_CLOSED] == 1:
             unilateral.stop[k, ku.CLOSED_TIME] += h
             unilateral.stop[k, ku.STOP_LOSS] -= work_of_row(s, ws, unilateral.stop_table[k, ku.STOP_ROW], h)
     for k in range(ws.contacts.shape[0]):
         tally = unilateral.tally[k]
-        tally[s.motion[k]] += h  # the times in the order of the modes
+        tally[s.motion[k]] += h  # the times are in the order of the modes
         if s.memory[kt.NOW, k, kt.LISTED] == 1.0:
             tally[ku.LOSS] += s.turn[k, kt.STRUCK]
             tally[ku.DEEPEST] = max(tally[ku.DEEPEST], -ws.contacts[k, ka.GAP])
@@ -437,10 +442,11 @@ def count_step(unilateral: UnilateralArrays, law, s: SteppingArrays, ws: Workspa
 
 @internal_kernel
 def keep_torques(system: System, ws: Workspace, run: Run):
-    """Record shaft torques of the accepted step, at x_θ, unless it has an impact; before its samples and ``remember``.
+    """Record the shaft torques of the accepted step, at x_θ, unless it has an impact.
 
-    The mean acceleration of an impact is Δv/h, which diverges as steps become shorter. The same is true of the next
-    step, which corrects for landed rows that turned within the step of the landing.
+    Call this function before the samples of the step and before ``remember``. The mean acceleration of an impact is
+    Δv/h, which diverges as steps become shorter. The same applies to the next step, which corrects for rows that turned
+    within the step of the landing.
     """
     s, motor, y, y_new, layout = run.stepping, system.drives.motor, run.y, run.y_new, system.layout
     impact = strikes(system.contacts.law, system.unilateral, s, ws, False)
@@ -463,7 +469,7 @@ def keep_torques(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def log_step_changes(unilateral: UnilateralArrays, s: SteppingArrays, run: Run):
-    """Log and count the changes of the accepted step, at its end; True if the caller must empty the log.
+    """Log and count the changes of the accepted step at its end; return whether the caller must empty the log.
 
     The initial state of a contact is not an event.
     """
@@ -488,16 +494,16 @@ def log_step_changes(unilateral: UnilateralArrays, s: SteppingArrays, run: Run):
 
 @internal_kernel
 def save_directions(s: SteppingArrays, ws: Workspace):
-    """Copy the wrenches of unit forces of all active rows, with which the step was solved."""
+    """Save the wrenches of unit forces of all active rows, with which the step was solved."""
     for r in range(ws.counts[ka.ROWS]):
         put_six(s.direction, r, 0, six(ws.rows, r, ka.DIRECTION))
 
 
 @internal_kernel
 def restore_directions(s: SteppingArrays, ws: Workspace):
-    """Undo changes of the directions by ``geometry``: the forces of the step belong to its own rows only.
+    """Undo the changes of the directions by ``geometry``, because the forces of the step belong to its own rows.
 
-    ``geometry`` gives the rows of sticking contacts different tangents, without the factor of the grip.
+    ``geometry`` gives the rows of sticking contacts different tangents, without the grip factor.
     """
     for r in range(ws.counts[ka.ROWS]):
         put_six(ws.rows, r, ka.DIRECTION, six(s.direction, r, 0))
@@ -505,10 +511,10 @@ def restore_directions(s: SteppingArrays, ws: Workspace):
 
 @internal_kernel
 def sample_moreau(system: System, ws: Workspace, run: Run):
-    """Record every sample time within the step, with the state linear in between.
+    """Record all samples within the step, with a state that is linear in time.
 
-    Forces are means over the step, also as vectors: along the normal and the tangents at its midpoint, so that the sum
-    of all forces is the change of momentum.
+    Forces are means over the step. As vectors, they are along the normal and the tangents at the midpoint, so that the
+    sum of all forces is the change of momentum.
     """
     t, h, last = run.clock[ki.TIME], run.clock[ki.STEP], run.count[ki.SAMPLE]
     s = run.stepping
@@ -526,14 +532,14 @@ def sample_moreau(system: System, ws: Workspace, run: Run):
         geometry(system, system.model, ws)
         restore_directions(s, ws)
         write_output(system, ws, run, last)
-        # Between the ends of a step the state is linear, but energy is not.
+        # Within a step the state is linear in time, but the energy is not.
         between = -(1.0 - x) * (s.energy[kt.START, kt.MECHANICAL] + s.energy[kt.START, kt.MAGNETIC])
         between -= x * (s.energy[kt.STOP, kt.MECHANICAL] + s.energy[kt.STOP, kt.MAGNETIC])
         for k in range(kst.ENERGIES):
             between += run.output[last, run.columns.energy + k]
         row[system.layout.scheme] -= between
         for k in range(ws.contacts.shape[0]):
-            # The rows are sticking rows even if the contact slides.
+            # The contact has sticking rows even if it slides, so its mode must be written separately.
             run.output[last, run.columns.contact + k * kst.OUTPUTS_PER_CONTACT + kst.OUT_MODE] = s.motion[k]
         last += 1
     run.count[ki.SAMPLE] = last
@@ -541,7 +547,7 @@ def sample_moreau(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def commands_due(system: System, ws: Workspace, run: Run):
-    """Take sampled commands if due; True if control must return to the caller."""
+    """Sample commands if they are due; return whether control must return to the caller."""
     due = take_ticks(run)
     if due & ki.TAKE_COMMANDS:
         place_state(system, ws, run.y)
@@ -558,10 +564,10 @@ def commands_due(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def rewrite_sample(system: System, ws: Workspace, run: Run):
-    """Update drives in a sample at TIME, recorded at the end of the last step, for the commands from now on.
+    """Update the drives in a sample at TIME, which was recorded at the end of the last step, to the new commands.
 
-    If a brake has closed since, the state of the sample is updated too. Accelerations and forces are still the means of
-    that step.
+    If a brake has closed since then, the state of the sample is updated too. Accelerations and forces remain the means
+    of the last step.
     """
     if not sampled_now(run):
         return
@@ -585,9 +591,9 @@ def rewrite_sample(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def advance_time(s: SteppingArrays, clock):
-    """Set TIME to the end of the accepted step: start of the equal steps plus their number times the step size.
+    """Set TIME to the end of the accepted step: the start of the equal steps plus their number times the step size.
 
-    This avoids summing roundings. The count restarts after a trimmed step and at a tick.
+    This avoids accumulating rounding errors. The count restarts after a trimmed step and at a tick.
     """
     grid, whole = s.grid, clock[ki.PROPOSED]
     if grid[kt.GRID_START] + grid[kt.GRID_STEPS] * whole != clock[ki.TIME]:

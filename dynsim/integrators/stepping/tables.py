@@ -1,18 +1,19 @@
-"""Time stepping: its equations, tables and workspace, and the geometry of a step.
+"""Time stepping: equations, tables and workspace, and the geometry of a step.
 
-Moreau's and Jean's θ method for the whole coupled system. From (q, v, i) over a step h, with geometry at the midpoint
-q_m = q + h v / 2 and x_θ = x + θ (x' − x):
+The method is Moreau's and Jean's θ method for the whole coupled system. It advances (q, v, i) by a step h, with the
+geometry at the midpoint q_m = q + h v / 2 and x_θ = x + θ (x' − x):
 
     M (v' − v) = h (τ_θ + Q − bias) + Jᵀ p,    L (i' − i) = h (u_θ − R i_θ − K_m v_θ),    q' = q + h v_θ
 
-Drives are implicit by their linear blocks: i' is eliminated, which adds the effect of voltage loops, back-EMF and
-damping to the diagonal of M (``stepping.drives``). The impulses p solve one contact problem over all candidates that
-touch at q_m; its law is on the rates at the end, with the rows of the end (``stepping.contacts``).
+Drives are treated implicitly by their linear blocks: i' is eliminated, which adds the effect of voltage loops, back-EMF
+and damping to the diagonal of M (``stepping.step``). The impulses p solve one contact problem for all candidates that
+touch at q_m; its law applies to the rates at the end, with the rows at the end (``stepping.contacts``).
 
-θ = 1 damps and is of first order; θ = 1/2 is of second order between events and, contacts aside, conserves the energy
-of linear systems to rounding. A landing leaves a penetration of up to h times its speed, which is removed afterwards.
+θ = 1 adds damping and is of first order; θ = 1/2 is of second order between events and, apart from contacts, conserves
+the energy of linear systems up to rounding. A landing leaves a penetration of up to h times its speed, which is removed
+afterwards.
 
-The ledger has the discrete works: power at x_θ, friction −p_t·(u + u')/2, and p_n (u_n + u_n')/2 of closed rows.
+The ledger contains discrete work: the power at x_θ, friction −p_t·(u + u')/2, and p_n (u_n + u_n')/2 of closed rows.
 """
 
 from __future__ import annotations
@@ -31,47 +32,48 @@ from dynsim.dynamics.tree.spatial import cross, dot, dot_vector, put_vector, rot
 from dynsim.dynamics.tree.sweep import forward_sweep
 from dynsim.jit.kernel import integers, internal_kernel, reals
 
-# Residuals of contact problems [m/s]: goal of a search, acceptable residual, and residual above which a solve counts as
-# capped. Below the last value a point that touches does not leave, and a point that sticks does not slip.
+# Residuals of contact problems [m/s]: target of a search, acceptable residual, and residual above which a solve counts
+# as capped. Below the last value, a touching point does not count as leaving, and a sticking point not as slipping.
 GOOD, FAIR, BAD = 1e-11, 1e-10, 1e-8
-# Starts of the last search, and starts in all searches together.
+# Number of starts in the last search, and total number of starts in all searches.
 LAST_ROUNDS = 12
 MOST_ROUNDS = 1 + kc.NEAR_STEPS + LAST_ROUNDS
-# Gap that counts as closed: far above rounding [m].
+# Gap that counts as closed [m]; it is far above rounding.
 MARGIN = 1e-10
 # SteppingArrays.memory: the last accepted step, and the step being tried; columns for each candidate
 LAST, NOW = 0, 1
-LISTED = 0  # 1: it had rows
-CLOSED = 1  # 1: it pressed, or touched without leaving
-SLID = 2  # 1: it slid
+LISTED = 0  # 1: the candidate had rows
+CLOSED = 1  # 1: the candidate pressed, or touched without leaving
+SLID = 2  # 1: the candidate slid
 NORMAL_IMPULSE = 3  # [N s]
-END_RATE = 4  # 3: end rates of its rows in that step
-NORMAL_THEN, TANGENT_THEN = 7, 10  # 3 each: directions of its first two rows
+END_RATE = 4  # 3: rates of the candidate's rows at the end of the step
+NORMAL_THEN, TANGENT_THEN = 7, 10  # 3 each: directions of the first two rows
 CENTRE = 13  # 3: centre of the touching sphere [m]
-BUDGET = 16  # energy dissipated by its landing, which pushing it out of its surface may return [J]
-STORED = 17  # energy in its spring [J]
+BUDGET = 16  # energy dissipated by the landing [J], which may be used to push the point out of its surface
+STORED = 17  # energy in the contact's spring [J]
 MEMORY_SIZE = 18
 # SteppingArrays.turn, for a candidate with rows
-ADDED = 0  # 3: additions of the law to the end rates of its rows [m/s]
-TURNED = 3  # 3: part of these additions due to rows that turn
-PUSH = 6  # rate at which it is pushed out of its surface; negative: let into it [m/s]
-MEAN = 7  # 1: it slides on, along the mean of its rates
-KNOWN = 8  # 1: its rows continue the rows of the last step
-STRUCK = 9  # impact loss booked by the step [J]
+ADDED = 0  # 3: additions of the law to the end rates of the candidate's rows [m/s]
+TURNED = 3  # 3: part of these additions due to turning rows
+PUSH = 6  # rate at which the point is pushed out of its surface [m/s]; negative: allowed to move into it
+MEAN = 7  # 1: the point continues to slide, along the mean of its rates
+KNOWN = 8  # 1: the rows continue the rows of the last step
+STRUCK = 9  # impact loss recorded in the step [J]
 PRESSED_IN, IMPLICIT = 10, 11  # compliant contacts: gap at the start [m], and φ of the law
 TURN_SIZE = 12
-# SteppingArrays.statistics: largest residual [m/s], solves above BAD, largest penetration [m]; solves, and solves with
-# more than one start; largest scheme energy at any time, taken (positive) or made (negative) [J]; steps in which limits
-# of drives contradict each other; change of energy if everything came half a step later [J]; solves without the
-# additions of the law to the rates, because with them there was no solution.
+# SteppingArrays.statistics: largest residual [m/s]; number of solves above BAD; largest penetration [m]; number of
+# solves, and of solves with more than one start; largest scheme energy at any time, removed (positive) or created
+# (negative) [J]; number of steps in which drive limits contradict each other; change of energy if everything occurred
+# half a step later [J]; number of solves without the additions of the law to the rates, because no solution existed
+# with them.
 WORST, CAPPED, PENETRATION, SOLVES, LONG_SOLVES, TAKEN, UNSETTLED, HALF_STEP, DROPPED = 0, 1, 2, 3, 4, 5, 6, 7, 8
-# Largest energy taken by steps up to any time, and largest energy made since then [J].
+# Largest energy removed by steps up to any time, and largest energy created since then [J].
 MOST_TAKEN, MADE = 9, 10
 STIFFEST = 11  # largest stiffness times mobility of a compliant row [1/s²]
 STATISTICS_SIZE = 12
-# SteppingArrays.before: rates at the start; rates of the velocity products; acceleration of the last step, replaced by
-# the acceleration of this one; applied torques at the start, without loads; rates at the end of the last accepted step;
-# acceleration of the last step without an impact.
+# SteppingArrays.before: rates at the start; rates used for the velocity products; acceleration of the last step, which
+# the acceleration of this step replaces; applied torques at the start, without loads; rates at the end of the last
+# accepted step; acceleration of the last step without an impact.
 V_START, V_BIAS, ACCELERATION, APPLIED_THEN, V_LAST, SMOOTH = 0, 1, 2, 3, 4, 5
 BEFORE_SIZE = 6
 # SteppingArrays.eliminated
@@ -79,10 +81,10 @@ FREE, PER, DIDT_THEN = 0, 1, 2
 # SteppingArrays.energy
 START, STOP = 0, 1
 MECHANICAL, MAGNETIC = 0, 1
-# SteppingArrays.grid: time from which steps of equal length are counted [s], number of such steps since; length of the
-# last accepted step [s], power of drives and loads in it, and in the step being tried [W]; number of steps for which
-# motors keep their torques because of an impact, including the last step; 1: the last accepted step had an impact;
-# length of the step that ``impulse`` belongs to, zero before the first one [s].
+# SteppingArrays.grid: time from which steps of equal length are counted [s], and number of such steps since then;
+# length of the last accepted step [s]; power of drives and loads in this step, and in the step being tried [W]; number
+# of steps for which motors keep their torques because of an impact, including the last step; 1 if the last accepted
+# step had an impact; length of the step to which ``impulse`` belongs, zero before the first step [s].
 GRID_START, GRID_STEPS, LENGTH_LAST, POWER_LAST, POWER_NOW, HELD_STEPS, IMPACT_LAST, IMPULSE_STEP = range(8)
 GRID_SIZE = 8
 
@@ -94,17 +96,17 @@ class SteppingArrays(NamedTuple):
     body: np.ndarray  # (n, BODY_SIZE) body of the model with the implicit terms added to ARMATURE
     linear: np.ndarray  # (na, BLOCK_SIZE)
     segment: np.ndarray  # (na,) int: active limit of each drive, see dynsim.dynamics.drive.law.segment_of
-    torque: np.ndarray  # (na,) shaft torque in the last accepted step without an impact [N m or N]; NaN: none yet
-    eliminated: np.ndarray  # (na, 3) i' − i at v' = v; its change with v' − v; di/dt at the start
+    torque: np.ndarray  # (na,) shaft torque in the last accepted step without an impact [N m or N]; NaN before it
+    eliminated: np.ndarray  # (na, 3) i' − i at v' = v; derivative of i' − i by v' − v; di/dt at the start
     before: np.ndarray  # (BEFORE_SIZE, n) see V_START and following
     energy: np.ndarray  # (2, 2) at START and STOP of the step: MECHANICAL and MAGNETIC [J]
     rate: np.ndarray  # (2, p) row rates at the start and the end
     direction: np.ndarray  # (p, 6) wrenches of unit forces of the rows, saved while a sample is swept
-    impulse: np.ndarray  # (p,) next start: rows of candidate k at 3 k, then couplings
+    impulse: np.ndarray  # (p,) initial impulses of the next solve: rows of candidate k at 3 k, then couplings
     f: np.ndarray  # (p,)
     b: np.ndarray  # (p,) row rates at the end without impulses
     w: np.ndarray  # (p,) rates in the contact law
-    right: np.ndarray  # (p,) of the contact problem
+    right: np.ndarray  # (p,) right-hand side of the contact problem
     mu: np.ndarray  # (p,)
     kind: np.ndarray  # (p,) int
     modes: np.ndarray  # (c,) int: OPEN, or STICKING for three rows
@@ -158,7 +160,7 @@ def stepping_arrays(
 
 @internal_kernel
 def moved(system, ws: Workspace, y, scale, out):
-    """Write positions of y moved by ``scale`` times the ka.QDD column to out; other entries as in y."""
+    """Write y to out, with its positions moved by ``scale`` times the ka.QDD column."""
     layout = system.layout
     for j in range(y.shape[0]):
         out[j] = y[j]
@@ -195,8 +197,8 @@ def place_state(system, ws: Workspace, y):
 def geometry(system, model: ModelArrays, ws: Workspace):
     """Compute poses, gaps and rows at the positions and rates in ``ws.joints``.
 
-    Tangents are along and across the grip axis. Without an axis they depend on the normal only: isotropic friction does
-    not turn with the body.
+    Tangents are along and across the grip axis. Without a grip axis, they depend only on the normal, because isotropic
+    friction does not turn with the body.
     """
     forward_sweep(model, ws, 1.0, 0.0, 1.0)
     contact_rows(model, system.contacts, system.unilateral, ws)
@@ -208,7 +210,7 @@ def geometry(system, model: ModelArrays, ws: Workspace):
         across = dot_vector(t, n)
         t = t[0] - across * n[0], t[1] - across * n[1], t[2] - across * n[2]
         length = math.sqrt(dot_vector(t, t))
-        if not length > 1e-6:  # no axis, or along the normal: any direction will do
+        if not length > 1e-6:  # no axis, or an axis along the normal: any direction is suitable
             t = (0.0, n[2], -n[1]) if abs(n[0]) < 0.7 else (-n[2], 0.0, n[0])
             length = math.sqrt(dot_vector(t, t))
         t = t[0] / length, t[1] / length, t[2] / length
@@ -218,7 +220,10 @@ def geometry(system, model: ModelArrays, ws: Workspace):
 
 @internal_kernel
 def constraint_rates(model: ModelArrays, ws: Workspace, y, first, out):
-    """Write J v of all rows to out; v starts at ``first`` in y. The rate of a row sums from its link to the world."""
+    """Write J v of all rows to out, where v starts at index ``first`` in y.
+
+    The rate of a row is summed over the joints from its link to the world.
+    """
     rows, active = ws.rows, ws.active
     for r in range(ws.counts[ka.ROWS]):
         a, b = active[r, ka.BODY_A], active[r, ka.BODY_B]

@@ -19,20 +19,20 @@ class Config(StrictConfig):
 
     type: Literal["arc"]
     radius_m: float = Field(
-        description="radius; positive: centre on the left, negative: centre on the right, 0: turn on the spot"
+        description="radius of the arc; positive: centre on the left, negative: on the right, 0: turn on the spot"
     )
     angle_deg: float = Field(
-        description="turn of the heading, positive to the left; with the sign opposite to radius_m the base reverses"
+        description="change of heading, positive to the left; the base reverses if its sign differs from radius_m"
     )
     duration_s: Positive = Field(description="duration of the motion")
     start_s: NonNegative = default(0.0, "start time of the motion")
 
     def motion(self, t: Array) -> Array:
-        """Return distance R ψ [m] and turn ψ = α s(x) [rad] at times t [s], shape (T, 2)."""
+        """Return distance R ψ [m] and turn ψ = α s [rad] at times t [s], shape (T, 2); s is the minimum-jerk curve."""
         turn = np.deg2rad(self.angle_deg) * minimum_jerk(t, self.start_s, self.duration_s)
         return np.stack([self.radius_m * turn, turn], axis=1)
 
 
 def build(config: Config, context: BuildContext) -> BasePath:
-    """Return the configuration, which implements the path."""
+    """Return the configuration itself, which implements the `BasePath` interface."""
     return config

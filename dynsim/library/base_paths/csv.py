@@ -20,14 +20,14 @@ from dynsim.record.csv_rows import read_table
 
 PLACES = ("t_s", "x_m", "y_m")
 RATES = ("t_s", "V_m_s", "omega_rad_s")
-# Rows closer than this to the last point of the curve determine the speed along it, not its shape [m].
+# Rows closer than this [m] to the previous point of the curve affect the speed along the curve, but not its shape.
 SPACING = 1e-3
-# Maximum turn between rows of a smooth path; larger turns are corners [rad].
+# Maximum turn between rows of a smooth path [rad]; larger turns count as corners.
 TURN_LIMIT = np.deg2rad(15.0)
 
 
 class Config(StrictConfig):
-    """Motion through the positions, or with the rates, in `file`; at rest before the first and after the last row."""
+    """Motion through the positions, or at the rates, in `file`; at rest before the first and after the last row."""
 
     type: Literal["csv"]
     file: str = Field(
@@ -37,7 +37,7 @@ class Config(StrictConfig):
     frame: Literal["world", "start"] | None = default(
         None, "frame of x_m and y_m: `world`, or `start` (the base at its start, x ahead); default: world"
     )
-    # Read once: an edit of the file does not change a loaded scenario.
+    # The file is read only once, so that later edits do not change a loaded scenario.
     _rows: Array = PrivateAttr()
     _are_rates: bool = PrivateAttr()
 
@@ -50,18 +50,18 @@ class Config(StrictConfig):
         if not np.abs(self._rows).max() < 1e9 or np.diff(self._rows[:, 0]).min() < 1e-9:
             raise ValueError(f"{self.file}: cannot be interpolated: numbers too large, or rows too close in time")
         if self._are_rates and self.frame is not None:
-            raise error_at("frame", "has no effect on rates; remove it")
+            raise error_at("frame", "has no effect on a file with rates; remove it")
         return self
 
 
 @dataclass(frozen=True)
 class Rates:
-    """Motion with the rates V and ω as shape-preserving cubics of time."""
+    """Motion with rates V and ω that are shape-preserving cubic functions of time."""
 
     rates: PchipInterpolator
 
     def motion(self, t: Array) -> Array:
-        """Return the integrals of V and ω, distance [m] and turn [rad], at times t [s], shape (T, 2)."""
+        """Return distance [m] and turn [rad], the integrals of V and ω, at times t [s], shape (T, 2)."""
         return np.asarray(self.rates.antiderivative()(np.clip(t, *self.rates.x[[0, -1]])))
 
 
@@ -71,7 +71,7 @@ def build(config: Config, context: BuildContext) -> BasePath:
     Raises
     ------
     ModelError
-        If the positions start away from the base or sideways, or have a corner; the message names the row.
+        If the path does not start at the base and along its heading, or has a corner; the message names the row.
     """
     times, rows = config._rows[:, 0], config._rows[:, 1:]
     if config._are_rates:
@@ -91,7 +91,7 @@ def build(config: Config, context: BuildContext) -> BasePath:
 
 
 def _along(points: Array) -> tuple[list[int], Array]:
-    """Return the rows that define the curve, and the chord length at every row [m], which never decreases."""
+    """Return the rows that define the curve, and the non-decreasing cumulative chord length at every row [m]."""
     kept = [0]
     begin, *others = points.tolist()
     for k, point in enumerate(others, 1):

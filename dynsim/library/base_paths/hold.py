@@ -13,7 +13,7 @@ from dynsim.model.description import Array
 
 
 class Config(StrictConfig):
-    """Wheels that hold their position, as without a path."""
+    """Stationary base: the wheels hold their position, as they do if no path is set."""
 
     type: Literal["hold"]
 
@@ -23,5 +23,5 @@ class Config(StrictConfig):
 
 
 def build(config: Config, context: BuildContext) -> BasePath:
-    """Return the configuration, which implements the path."""
+    """Return the configuration itself, which implements the `BasePath` interface."""
     return config

@@ -1,4 +1,4 @@
-"""Straight line of a mobile base, forward or backward, from rest to rest with minimum jerk."""
+"""Straight motion of a mobile base, forward or backward, from rest to rest with minimum jerk."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ class Config(StrictConfig):
     start_s: NonNegative = default(0.0, "start time of the motion")
 
     def motion(self, t: Array) -> Array:
-        """Return distance d s(x) [m] and zero turn at times t [s], shape (T, 2)."""
+        """Return distance d s [m] and zero turn at times t [s], shape (T, 2); s is the minimum-jerk profile."""
         distance = self.distance_m * minimum_jerk(t, self.start_s, self.duration_s)
         return np.stack([distance, np.zeros_like(distance)], axis=1)
 
 
 def build(config: Config, context: BuildContext) -> BasePath:
-    """Return the configuration, which implements the path."""
+    """Return the configuration itself, which implements the `BasePath` interface."""
     return config

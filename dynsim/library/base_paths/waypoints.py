@@ -28,20 +28,20 @@ class Config(StrictConfig):
     def _check(self) -> Self:
         check_waypoints(self.times_s, self.points_m, "points_m")
         if not np.hypot(*np.diff(self.points_m, axis=0).T).min() > 0.0:
-            raise ValueError("points_m has two equal neighbouring points; for a base that waits use csv with V_m_s")
+            raise ValueError("points_m has two equal consecutive points; to make the base wait, use csv with V_m_s")
         return self
 
 
 def build(config: Config, context: BuildContext) -> BasePath:
-    """Build the curve: a cubic spline r(u) over the chords that starts along the heading, and quintics u(t).
+    """Build the curve: a cubic spline r(u) in the chord length u that starts along the heading, and quintics u(t).
 
-    At the points u(t) has zero acceleration, and its rate is the harmonic mean of the mean speeds before and after.
-    So the base never reverses, and with only two points the motion is minimum jerk.
+    At the points, u(t) has zero acceleration, and its rate is the harmonic mean of the mean speeds before and after
+    the point. The base therefore never reverses, and with only two points the motion has minimum jerk.
 
     Raises
     ------
     ModelError
-        If the path starts away from the base or sideways, or has a corner; the message names the point.
+        If the path does not start at the base and along its heading, or has a corner; the message names the point.
     """
     points = seen_from_start(context.model.robot, config.points_m, config.frame)
     entries = enumerate(zip(config.points_m, config.times_s, strict=True))

@@ -1,1 +1,1 @@
-"""Controllers, one file each: ``Config``, ``build(config, context)``, and ``ENGINE``, the engine of its plants."""
+"""Controllers, one file each: ``Config``, ``build(config, context)``, and ``ENGINE``, the engine for its plants."""

@@ -1,4 +1,4 @@
-"""Joint PD control by voltage, continuous or sampled (Wang and Minami, eq 56): u = k_p (q_d − q) + k_d (v_d − v)."""
+"""PD voltage control of joints, continuous or sampled (Wang and Minami, eq 56): u = k_p (q_d − q) + k_d (v_d − v)."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ ENGINE = "dynamics"
 PathChoice: Any = families.union("path")
 BasePathChoice: Any = families.union("base_path")
 
-# Maximum number of segments of the reference splines: half a gigabyte per joint.
+# Maximum number of segments of the reference splines; this many segments take half a gigabyte per joint.
 SEGMENTS_MAX = 10_000_000
-# Minimum number of knots from one waypoint to the next; maximum factor by which they are finer than ``knot_spacing_s``.
+# Minimum number of knots between waypoints; maximum factor by which they may be closer than ``knot_spacing_s``.
 KNOTS_BETWEEN, MOST_FINER = 5.0, 100.0
 # Maximum turn of a base between two knots [rad]; beyond it the spline would deviate from the path.
 TURN_MAX = 0.2
@@ -52,26 +52,26 @@ class Orientation(StrictConfig):
 
 
 class HandReference(StrictConfig):
-    """Hand path that inverse kinematics converts to references of `joints`."""
+    """Hand path, which inverse kinematics converts to references for `joints`."""
 
     path: PathChoice = Field(description="path of the hand")
     orientation: Orientation | None = default(None, "constant attitude of the hand's body or frame; default: free")
     joints: list[str] = Field(
-        description="joints that follow the path, while the other joints hold; an empty list if `controller.joints` "
-        "moves the hand along the path"
+        description="joints that follow the path, while the other joints hold; empty if the waypoints in "
+        "`controller.joints` move the hand along the path"
     )
     braces: list[str] = default([], "contact points that the joints keep on their surfaces")
     tolerance_m: Positive = default(1e-6, "maximum position error; a larger error means that the path is out of reach")
 
 
 class BaseReference(StrictConfig):
-    """Path of the mobile base, converted to references of its wheels."""
+    """Path of the mobile base, which is converted to references for its wheels."""
 
     path: BasePathChoice = Field(description="path of the base")
 
 
 class JointPath(StrictConfig):
-    """Waypoints of one joint: a cubic spline with zero rate at both ends, constant beyond them."""
+    """Waypoints of one joint, joined by a cubic spline with zero rate at both ends; the joint holds beyond them."""
 
     times_s: list[float] = Field(min_length=2, description="times of the waypoints, increasing")
     angles_deg: list[float] | None = default(None, "angles of a revolute joint", min_length=2)
@@ -99,10 +99,10 @@ class JointPath(StrictConfig):
 
 
 class TorquePath(StrictConfig):
-    """Waypoints of one torque: a cubic spline with zero slope at both ends, constant beyond them."""
+    """Waypoints of one torque, joined by a cubic spline with zero slope at both ends and constant beyond them."""
 
     times_s: list[float] = Field(min_length=2, description="times of the waypoints, increasing")
-    torques_N_m: list[float] = Field(min_length=2, description="torques; N at a prismatic joint")
+    torques_N_m: list[float] = Field(min_length=2, description="torques at the waypoints; N at a prismatic joint")
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -149,7 +149,7 @@ class Config(StrictConfig):
     @field_validator("brace", mode="before")
     @classmethod
     def _check_brace(cls, value: Any) -> Any:
-        """Raise one error for a value of an invalid type, and another that names the invalid force."""
+        """Raise one error for a value of an invalid type, and a different error that names an invalid force."""
         if isinstance(value, Mapping) and value:
             for name, force in value.items():
                 if isinstance(force, bool) or not isinstance(force, int | float) or not 0.0 < force < np.inf:
@@ -180,7 +180,7 @@ class Config(StrictConfig):
 
 
 def build(config: Config, context: BuildContext) -> JointControl:
-    """Resolve gains and references for the model of the context; inverse kinematics report to its ``progress``.
+    """Resolve gains and references for the context's model; inverse kinematics reports to ``context.progress``.
 
     Raises
     ------
@@ -275,7 +275,7 @@ def _contact(context: BuildContext, name: str, key: str) -> Contact:
 
 
 def _check_names(config: Config, model: Model) -> None:
-    """Raise ModelError if a reference names an unknown joint, or one without a motor or with another kind of motor."""
+    """Raise ModelError if a reference names an unknown joint, or a joint without a motor or with an unsuitable one."""
     robot = model.robot
     driven = [motor.joint for motor in robot.motors]
     in_hand = config.hand.joints if config.hand else config.operator.joints if config.operator else []
@@ -329,7 +329,7 @@ def _check_base(robot: Robot, keys: tuple[str, ...]) -> None:
 def _spacing(config: Config) -> float:
     """Return the knot spacing [s]: ``knot_spacing_s``, or less if waypoints are closer together.
 
-    A spline with knots as far apart as the waypoints misses the waypoints by up to half of the change between them.
+    A spline whose knots are as far apart as the waypoints misses the waypoints by up to half the change between them.
     """
     waypoints = [path.times_s for path in config.joints.values()] + [path.times_s for path in config.torques.values()]
     nearest = min((float(np.diff(times).min()) for times in waypoints if len(times) > 1), default=np.inf)
@@ -337,7 +337,7 @@ def _spacing(config: Config) -> float:
 
 
 def _knots(spacing: float, duration: float) -> Array:
-    """Return the times of the samples of the reference splines [s]."""
+    """Return the sampling times of the reference splines [s]."""
     segments = duration / spacing
     if segments > SEGMENTS_MAX:
         raise ModelError(
@@ -349,7 +349,7 @@ def _knots(spacing: float, duration: float) -> Array:
 
 
 def _wheel_angles(robot: Robot, path: BasePath, times: Array) -> dict[str, Array]:
-    """Return references of the two wheels [rad]; empty if the base does not move, so that the wheels hold."""
+    """Return references for the two wheels [rad]; empty if the base does not move, so that the wheels hold."""
     assert robot.base is not None
     keys = ("controller", "base", "path")
     motion = np.asarray(path.motion(times), dtype=np.float64)
@@ -362,7 +362,7 @@ def _wheel_angles(robot: Robot, path: BasePath, times: Array) -> dict[str, Array
         raise ModelError(
             f"controller.base.path: at t = {times[turns.argmax()]:.3f} s the heading turns by {turns.max():.3g} rad "
             f"between two knots of the references, {times[1]:.3g} s apart (limit {TURN_MAX:g} rad); slow down, "
-            "round the path off, or lower controller.knot_spacing_s",
+            "round off the path, or lower controller.knot_spacing_s",
             keys=keys,
         )
     first, _ = base_row(robot)
@@ -384,18 +384,18 @@ def _base_coordinates(robot: Robot, positions: dict[str, Array], times: Array) -
     return np.hstack([angles, np.vstack([start[2:], ways[:, -1]])])
 
 
-# Keys and defaults of the gains. The schema has no default because for servos the key would be an error.
+# Keys and defaults of the gains. The schema has no defaults because setting these keys for servos is an error.
 _GAINS = {"k_p": ("k_p_V_per_rad", 500.0), "k_d": ("k_d_V_s_per_rad", 20.0)}
 
 
 def _gains(config: Config, robot: Robot, name: str) -> Array:
-    """Return one gain per motor, shape (na,): from the controller for DC motors, from a servo, 0 for torque sources."""
+    """Return one gain per motor, (na,): the controller's for a DC motor, its own for a servo, 0 for a torque source."""
     (key, default), motors = _GAINS[name], robot.motors
     gain, circuits = getattr(config, key), [isinstance(motor, Motor) for motor in motors]
     if gain is None:
         gain = default
     elif motors and not any(circuits):
-        raise ModelError(f"controller: {key} requires DC motors (servos use the gains of their motors); remove it")
+        raise ModelError(f"controller: {key} requires DC motors (servos have their own gains); remove it")
     if isinstance(gain, list) and len(gain) != sum(circuits):
         kind = "motors" if all(circuits) else "DC motors"
         raise ModelError(f"controller: {key} has {len(gain)} values for {sum(circuits)} {kind}; use one per motor")

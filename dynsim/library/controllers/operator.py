@@ -13,7 +13,7 @@ from dynsim.config.base import NonNegative, Pair, Positive, StrictConfig, Vector
 
 
 class Velocity(StrictConfig):
-    """Velocity command of an operator; omitted velocities do not change."""
+    """Velocity command of an operator; omitted velocities remain unchanged."""
 
     at_s: NonNegative = Field(description="time of the command")
     hand: Vector3 | None = default(
@@ -26,7 +26,7 @@ class Velocity(StrictConfig):
 
 
 class OperatorConfig(StrictConfig):
-    """References that follow commanded velocities, from a scenario or a live operator, updated at every tick."""
+    """References that follow velocity commands from a scenario or a live operator, and are updated at every tick."""
 
     rate_hz: Positive = default(100.0, "tick rate, at which the references are updated")
     joints: list[str] = default([], "joints that follow the hand velocity; the other joints hold")

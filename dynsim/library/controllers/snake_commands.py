@@ -25,7 +25,7 @@ STATES = {"switching": SWITCHING, "fixing": FIXING}
 
 
 class SnakeCommand(StrictConfig):
-    """Command of an operator; omitted values do not change."""
+    """Command of an operator; omitted values remain unchanged."""
 
     at_s: NonNegative = Field(description="time of the command")
     velocity: Coordinates | None = default(
@@ -39,7 +39,7 @@ class SnakeCommand(StrictConfig):
     @field_validator("mode", mode="before")
     @classmethod
     def _state_or_number(cls, value: Any) -> Any:
-        """Accept a state or an integer; the controller checks that its table has the mode."""
+        """Accept a state or an integer; the controller checks that its mode table contains the number."""
         text = value if isinstance(value, str) else ""
         if value is None or text in STATES or (isinstance(value, int) and not isinstance(value, bool)):
             return value
@@ -55,7 +55,7 @@ class TargetMotion(StrictConfig):
 
 
 class Ramp(TargetMotion):
-    """Straight displacement of the target in its six coordinates."""
+    """Displacement of the target along a straight line in its six coordinates."""
 
     type: Literal["ramp"]
     displacement: Coordinates = Field(description="displacement in x, y, z [m] and alpha, beta, gamma [rad]")
@@ -67,7 +67,7 @@ class Ramp(TargetMotion):
 
 
 class Circle(TargetMotion):
-    """Circle of the target in world axes: in the horizontal plane, starting along +x, or in the vertical yz plane."""
+    """Circular motion of the target in the horizontal xy plane, starting along +x, or in the vertical yz plane."""
 
     type: Literal["circle"]
     radius_m: Positive = Field(description="radius")
@@ -95,7 +95,7 @@ class Circle(TargetMotion):
 
 
 class DoorArc(TargetMotion):
-    """Arc of a door knob about the hinge, with the yaw perpendicular to the door ([T] V.D.3).
+    """Arc of a door knob about the hinge; the yaw stays perpendicular to the door ([T] V.D.3).
 
     The robot faces the door along +x; the hinge is `radius_m` to the left or right of the target's start.
     """
@@ -122,7 +122,7 @@ Path = Annotated[Ramp | Circle | DoorArc, Field(discriminator="type")]
 
 
 class Script(StrictConfig):
-    """Operator commands and target paths of a scenario; their velocities add."""
+    """Operator commands and target paths of a scenario; their velocities are added."""
 
     commands: list[SnakeCommand] = Field(default_factory=list, description="operator commands, sorted by time")
     paths: list[Path] = Field(default_factory=list, description="target paths, added to the commands")
@@ -153,7 +153,7 @@ class ScriptedSource:
             s = np.clip((ticks * period - path.start_s) / path.duration_s, 0.0, 1.0)
             if path.profile == "smooth":
                 s = s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
-            # The mean rate of a period makes the integrated target exact at every tick.
+            # With the mean rate of each period, the integrated target is exact at every tick.
             block.velocity[...] += np.diff(path.offset(s), axis=0) / period
         lasting, gripper = np.zeros(6), 0
         pieces = []
@@ -174,7 +174,7 @@ class ScriptedSource:
 
 @dataclass
 class TimedScript:
-    """Script whose commands keep their times: read one period at a time, as from a live operator."""
+    """Script that is read one period at a time, as from a live operator, so that its commands keep their times."""
 
     script: ScriptedSource
     _all: CommandBlock | None = None

@@ -1,6 +1,6 @@
 """Task-space controller of the articulated mobile robot (Tanaka et al. 2019, III.B, IV.C).
 
-This module has the keys and defaults; the control law is in :mod:`dynsim.snake.controller`.
+This module defines the keys and defaults; the control law is in :mod:`dynsim.snake.controller`.
 
 [T]: M. Tanaka et al., "Task-Space Control of Articulated Mobile Robots With a Soft Gripper for Operations", IEEE
 Transactions on Robotics 35(1), 2019. Values that [T] does not give are marked "assumed".
@@ -97,7 +97,7 @@ class Config(Script):
     cost: Literal["eq19", "eq20", "eq20_min"] = default(
         "eq19",
         "null-space cost; `eq19`: joint angles, `eq20`: adds 1/norm of the signed support distances, as "
-        "printed, `eq20_min`: adds 1/smallest support distance, smoothed",
+        "printed in [T], `eq20_min`: adds 1/smallest support distance, smoothed",
     )
     cost_matrix: list[NonNegative] | None = default(
         None, "diagonal of K_V; default: [T] V.B (head yaw 15, head pitch 0.015, base 9.6, 4.8, 2.4, ...)"
@@ -143,7 +143,7 @@ class Config(Script):
 
     @model_validator(mode="after")
     def _known_modes(self) -> Config:
-        """Check that all commanded modes are in the table, even after the end of the run."""
+        """Check that the table has all commanded modes, even the modes of commands after the end of the run."""
         table = TABLE_II if self.modes is None else self.modes
         for i, command in enumerate(self.commands):
             if isinstance(command.mode, int) and command.mode not in table:
@@ -153,7 +153,7 @@ class Config(Script):
 
 
 def build(config: Config, context: BuildContext) -> TaskSpaceController:
-    """Build the controller for the snake of the context.
+    """Build the controller for the snake in the context.
 
     Raises
     ------
@@ -237,7 +237,7 @@ def build(config: Config, context: BuildContext) -> TaskSpaceController:
 def reference_sigma(model: SnakeModel, law: ControlLaw, row: int, plant: SnakeDescription) -> float:
     """Return the smallest singular value of B~ W^(-1/2) with the head raised and the base straight.
 
-    It depends on the number and length of the links and on the weights, so it is the unit of the damping parameters.
+    It depends on the number and length of the links and on the weights. The damping parameters are fractions of it.
     """
     work, pose, joints = new_work(model), np.zeros(6), reals(plant.reference_joints)
     pose_of_point(model, np.zeros(3), joints, work.frame, pose)
@@ -251,8 +251,8 @@ def check_controllable(
 
     The side-slip row of wheel pair 1 and the three ground-contact rows contain head joints only. Every shape
     controllable point of the head part fixes one of these joints, so n_h >= 4 ([T] eq 1) becomes n_h - m_h >= 4
-    (3 in a mode that lifts pair 1). Any other loss of rank is detected numerically at seeded random postures: a rank
-    that is low at all of them is low everywhere.
+    (3 in a mode that lifts pair 1). Any other loss of rank is detected numerically at seeded random postures: if the
+    rank is deficient at all of them, it is deficient everywhere.
 
     Raises
     ------

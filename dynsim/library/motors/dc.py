@@ -9,7 +9,7 @@ from dynsim.model.drives import Motor, MotorParameters
 
 
 class Config(MotorParameters):
-    """Brushed DC motor; no parameter is assumed."""
+    """Brushed DC motor without assumed parameter values."""
 
     type: Literal["dc"]
 

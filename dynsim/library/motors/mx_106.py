@@ -1,4 +1,4 @@
-"""ROBOTIS Dynamixel MX-106 at 12 V, position mode at its default gain: the joints of T2 Snake-3.
+"""ROBOTIS Dynamixel MX-106 at 12 V in position mode with its default gain: the joint servo of T2 Snake-3.
 
 Data sheet (emanual.robotis.com, MX-106R): stall torque 8.4 N m at 12 V and 5.2 A, no-load speed 45 rpm, gear 225 : 1,
 153 g. These values give K_m = U / ω_0 = 2.55 V s/rad, R = 3.64 Ω and a stall current of 3.3 A. The current in the data
@@ -16,7 +16,7 @@ from dynsim.model.drives import Servo, ServoParameters
 
 
 class Config(ServoParameters):
-    """Servo with 8.4 N m and 45 rpm; gain, gear friction and rotor inertia are not from the data sheet."""
+    """Servo with 8.4 N m and 45 rpm; the gain, gear friction and rotor inertia are not from the data sheet."""
 
     type: Literal["mx_106"]
     voltage_V: Positive = default(12.0, "supply voltage of the data sheet; also limits the voltage")

@@ -15,7 +15,7 @@ from dynsim.model.drives import Servo, ServoParameters
 
 
 class Config(ServoParameters):
-    """Servo with 2.5 N m and 55 rpm; gain and rotor inertia are not from the data sheet."""
+    """Servo with 2.5 N m and 55 rpm; the gain and rotor inertia are not from the data sheet."""
 
     type: Literal["mx_28"]
     voltage_V: Positive = default(12.0, "supply voltage of the data sheet; also limits the voltage")

@@ -1,4 +1,4 @@
-"""Position servo from its data sheet: voltage loop, limits of voltage, current and torque, and gear friction."""
+"""Position servo with data-sheet values: voltage loop, voltage, current and torque limits, and gear friction."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from dynsim.model.drives import Servo, ServoParameters
 class Config(ServoParameters):
     """Servo with all values at the output shaft: K_m = U / ω_0 and R = U K_m / τ_stall at `voltage_V`.
 
-    `voltage_V` also limits the voltage. A servo uses its own gains; the gains of the controller are for DC motors.
+    `voltage_V` is also the voltage limit. A servo uses its own gains; the gains of the controller are for DC motors.
     """
 
     type: Literal["servo"]

@@ -1,4 +1,4 @@
-"""Ideal torque source commanded by the controller, without circuit or gear; its power is τ v."""
+"""Ideal torque source that the controller commands; it has no circuit and no gear, and its power is τ v."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Joint motor of Wang and Minami's arm (their section IV, "actual motor's specifications"); no voltage limit."""
+"""Joint motor of Wang and Minami's arm (their section IV, "actual motor's specifications"), without voltage limit."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Circle of the hand in a plane with any normal."""
+"""Circular hand path in an arbitrary plane."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from dynsim.model.description import Array
 
 
 class Config(StrictConfig):
-    """Circle about `center_m`, counter-clockwise about `normal`, that starts in the direction `start`."""
+    """Circle about `center_m`, counter-clockwise about `normal`; `start` points from the centre to the first point."""
 
     type: Literal["circle"]
     center_m: Vector3 = Field(description="centre in the world")
@@ -32,7 +32,7 @@ class Config(StrictConfig):
     def _directions(self) -> tuple[Array, Array]:
         normal = unit_vector(self.normal, "normal")
         start = np.array(self.start)
-        first = unit_vector(list(start - normal * float(normal @ start)), "start, seen along the normal,")
+        first = unit_vector(list(start - normal * float(normal @ start)), "start, projected onto the plane,")
         return first, np.cross(normal, first)
 
     def position(self, t: Array) -> Array:
@@ -45,5 +45,5 @@ class Config(StrictConfig):
 
 
 def build(config: Config, context: BuildContext) -> HandPath:
-    """Return the configuration, which implements the path."""
+    """Return the configuration itself, which implements the `HandPath` interface."""
     return config

@@ -22,7 +22,7 @@ class Config(StrictConfig):
 
     type: Literal["csv"]
     file: str = Field(description="path of a CSV file, relative to the scenario file, with the header t_s,x_m,y_m,z_m")
-    # Read once: an edit of the file does not change a loaded scenario.
+    # The file is read only once, so that later edits do not change a loaded scenario.
     _rows: list[list[float]] = PrivateAttr()
 
     @model_validator(mode="after")
@@ -38,7 +38,7 @@ class Config(StrictConfig):
 
 
 def build(config: Config, context: BuildContext) -> HandPath:
-    """Return the configuration, which implements the path."""
+    """Return the configuration itself, which implements the `HandPath` interface."""
     return config
 
 
@@ -48,13 +48,13 @@ def _curve(rows: list[list[float]]) -> PchipInterpolator:
 
 
 def _check_curve(rows: list[list[float]], file: str) -> None:
-    """Raise ValueError if rounding makes the curve infinite or miss its rows."""
+    """Raise ValueError if, because of rounding, the curve becomes infinite or misses its rows."""
     table = np.array(rows)
     try:
         with np.errstate(all="ignore"):
             curve = _curve(rows)
             met = np.allclose(curve(table[:, 0]), table[:, 1:], rtol=1e-9, atol=1e-12)
-    except ValueError:  # slopes that overflow
+    except ValueError:  # raised if slopes overflow
         met = False
     if not (met and np.isfinite(curve.c).all()):
         raise ValueError(f"{file}: cannot be interpolated: numbers too large, or rows too close in time")

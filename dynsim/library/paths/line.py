@@ -1,4 +1,4 @@
-"""Straight line of the hand between two points, from rest to rest."""
+"""Straight hand path between two points, from rest to rest."""
 
 from __future__ import annotations
 
@@ -30,5 +30,5 @@ class Config(StrictConfig):
 
 
 def build(config: Config, context: BuildContext) -> HandPath:
-    """Return the configuration, which implements the path."""
+    """Return the configuration itself, which implements the `HandPath` interface."""
     return config

@@ -1,4 +1,4 @@
-"""Smooth curve of the hand through points at specified times."""
+"""Smooth hand path through points at specified times."""
 
 from __future__ import annotations
 
@@ -32,5 +32,5 @@ class Config(StrictConfig):
 
 
 def build(config: Config, context: BuildContext) -> HandPath:
-    """Return the configuration, which implements the path."""
+    """Return the configuration itself, which implements the `HandPath` interface."""
     return config

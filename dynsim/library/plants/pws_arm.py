@@ -32,7 +32,7 @@ ArmChoice: Any = families.union("plant", only=("serial_arm", "urdf_arm"))
 
 
 class WheelConfig(StrictConfig):
-    """Both wheels: solid discs with separate motors, at axle height r."""
+    """Parameters of both wheels: solid discs with separate motors and their axle at height r."""
 
     mass_kg: NonNegative = default(0.25, "mass of each wheel")
     radius_m: Positive = default(0.05, "radius r of each wheel")
@@ -47,13 +47,13 @@ class WheelConfig(StrictConfig):
         if axle > 2.0 * across * (1.0 + 1e-9):
             key = "inertia_axle_kg_m2" if self.inertia_axle_kg_m2 is not None else "inertia_across_kg_m2"
             raise error_at(
-                key, f"{axle:g} about the axle must not exceed twice the moment across it ({across:g}); change one"
+                key, f"{axle:g} about the axle must not exceed twice the transverse moment ({across:g}); change one"
             )
         return self
 
     @property
     def moments(self) -> tuple[float, float]:
-        """Moments of inertia about and across the axle [kg m²]."""
+        """Moments of inertia about the axle and perpendicular to it [kg m²]."""
         square = self.mass_kg * self.radius_m**2
         axle, across = self.inertia_axle_kg_m2, self.inertia_across_kg_m2
         return 0.5 * square if axle is None else axle, 0.25 * square if across is None else across
@@ -96,7 +96,7 @@ class Base(StrictConfig):
             raise ValueError(f"the third coordinate must be 0 (the caster touches the floor), got {caster[2]:g}")
         if abs(caster[0]) < 1e-9:
             raise ValueError(
-                "must not be on the axle, or the base has no support triangle; change the first coordinate"
+                "must not be on the axle, otherwise the base has no support triangle; change the first coordinate"
             )
         return caster
 
@@ -120,15 +120,15 @@ class Config(StrictConfig):
 def build(config: Config, context: BuildContext) -> Robot:
     """Build the base as a joint whose rates are the wheel rates, with the arm's bodies on it.
 
-    Mass and transverse inertia of the wheels belong to the base, and the inertia about the axle belongs to the wheel
-    joints. On flat ground this is the energy of real wheels, T = ½ I_a φ̇² + ½ I_t ω² + ½ m v². The motors of the
-    wheels are fixed on the base.
+    The mass and transverse inertia of the wheels belong to the base, and their inertia about the axle belongs to the
+    wheel joints. On flat ground this gives the energy of real wheels, T = ½ I_a φ̇² + ½ I_t ω² + ½ m v². The motors of
+    the wheels are fixed to the base.
 
     Raises
     ------
     ModelError
-        If the arm is invalid, a body of the arm has the name of the base or of a part of it, or an inertia is not
-        physical.
+        If the arm is invalid, a body of the arm has the same name as the base or one of its parts, or an inertia is
+        not physical.
     """
     arm = families.build("plant", config.arm, context, Robot)
     base, wheel = config.base, config.base.wheel
@@ -141,7 +141,7 @@ def build(config: Config, context: BuildContext) -> Robot:
         parts.append(Inertia(wheel.mass_kg, hub, np.diag([across, axle, across])))
         if wheel.motor is not None:
             motor: Drive = families.build("motor", wheel.motor, context.at_joint(joint), Drive)
-            # The rows of the base carry no body, so the mass of the motor is added to the base.
+            # The wheel joints do not have separate bodies, so the mass of the motor is added to the base.
             parts.append(Inertia(motor.mass, hub if motor.mass_point is None else motor.mass_point))
             motors.append(replace(motor, mass=0.0, mass_point=None))
     body = Link(
@@ -205,7 +205,7 @@ def _mounted(link: Link, R: Array, p: Array) -> Link:
     """Return a link of the arm, moved from the ground to the base."""
     if link.parent is not None:
         return link
-    # Without rotation of the mount R_PJ stays the exact identity, which the kernels exploit.
+    # If the mount is not rotated, R_PJ remains exactly the identity, which the kernels exploit.
     return replace(link, parent=BASE, R_PJ=R @ link.R_PJ, p_PJ=p + R @ link.p_PJ)
 
 
@@ -214,7 +214,7 @@ def _framed(frame: Frame, R: Array, p: Array) -> Frame:
 
 
 def _shapes(base: Base) -> tuple[Shape, ...]:
-    """Return a plate from axle to caster and the caster's ball for display; the wheels are bodies of the scene."""
+    """Return the shapes to display: a plate from axle to caster, and the caster's ball; wheels are separate bodies."""
     r, x, y = base.wheel.radius_m, base.caster_m[0], base.caster_m[1]
     front, back = max(x, 0.0) + 0.5 * r, min(x, 0.0) - r
     low, high = 0.6 * r, max(base.mount.position_m[2], 1.6 * r)

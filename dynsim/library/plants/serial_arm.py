@@ -28,12 +28,12 @@ ENGINE = "dynamics"
 MotorChoice: Any = families.union("motor")
 AXES = {"x": [1.0, 0.0, 0.0], "y": [0.0, 1.0, 0.0], "z": [0.0, 0.0, 1.0]}
 
-# Maximum number of links of a chain; each takes some kilobytes before the simulation starts.
+# Maximum number of links of a chain; each link takes a few kilobytes before the simulation starts.
 LINKS_MAX = 100_000
 
 
 class LinkKeys(StrictConfig):
-    """Keys of a joint and its link. The link extends from the joint along its +z axis."""
+    """Scenario keys of a joint and its link. The link extends from the joint along its own +z axis."""
 
     count: int = default(1, "number of equal links", ge=1, le=LINKS_MAX)
     kind: Literal["revolute", "prismatic"] = default("revolute", "type of the joint")
@@ -70,7 +70,7 @@ class LinkKeys(StrictConfig):
         return axis
 
 
-# Keys of one kind of joint → their counterparts for the other kind.
+# Mapping from the keys of one kind of joint to their counterparts for the other kind.
 ONLY_REVOLUTE = {
     "damping_N_m_s_per_rad": "damping_N_s_per_m",
     "friction_N_m": "friction_N",
@@ -81,7 +81,7 @@ ONLY_PRISMATIC = {angular: linear for linear, angular in ONLY_REVOLUTE.items()}
 
 
 def _of_other_kind(kind: object) -> dict[str, str]:
-    """Return the keys that a joint of this kind does not have → their counterparts."""
+    """Return a mapping from the keys that a joint of this kind does not have to their counterparts."""
     return ONLY_REVOLUTE if kind == "prismatic" else ONLY_PRISMATIC
 
 
@@ -102,7 +102,7 @@ class LinkConfig(LinkKeys):
 
     @property
     def limits(self) -> tuple[float, float]:
-        """Lower and upper limit [rad, or m if prismatic]; infinite without limits."""
+        """Lower and upper limit [rad, or m if prismatic]; infinite if the joint has no limits."""
         if self.limit_deg is not None:
             low, high = np.deg2rad(self.limit_deg).tolist()
             return low, high
@@ -136,7 +136,7 @@ class Config(StrictConfig):
     type: Literal["serial_arm"]
     base: BaseConfig = default(BaseConfig(), "pose of the base")
     gravity_m_s2: Vector3 = default([0.0, 0.0, -9.81], "gravitational acceleration")
-    # Omitted from resolved scenarios, where every entry of the chain is complete.
+    # Resolved scenarios omit this key, because every entry of their chain is complete.
     link: LinkKeys | None = default(None, "defaults for all entries of `chain`; default: none", exclude=True)
     chain: list[LinkConfig] = Field(min_length=1, description="links from the base to the hand")
     initial_deg: list[float] | None = default(
@@ -176,19 +176,19 @@ class Config(StrictConfig):
             if len(self.initial_deg) != n:
                 raise error_at("initial_deg", f"has {len(self.initial_deg)} angles for {n} joints; use one per joint")
             if any(link.kind == "prismatic" for link in self.chain):
-                raise error_at("initial_deg", "requires a revolute chain; set initial_m and initial_deg per link")
+                raise error_at("initial_deg", "requires only revolute joints; set initial_m and initial_deg per link")
         return self
 
 
 def _with_defaults(shared: dict[str, Any], entry: dict[str, Any]) -> dict[str, Any]:
-    """Return an entry of the chain with the missing keys that apply to its kind of joint."""
+    """Return an entry of the chain, completed with the shared keys that apply to its kind of joint."""
     merged = {**shared, **entry}
     foreign = _of_other_kind(merged.get("kind"))
     return {key: value for key, value in merged.items() if key in entry or key not in foreign}
 
 
 def _owners(key: str, chain: list[dict[str, Any]]) -> str:
-    """Return the entries of the chain that set a key, or else the key's counterpart for the other kind of joint."""
+    """Return the paths at which chain entries set the key; if none does, its counterpart for the other joint kind."""
     owners = [f"plant.chain.{i}.{key}" for i, entry in enumerate(chain) if key in entry]
     return ", ".join(owners) or {**ONLY_REVOLUTE, **ONLY_PRISMATIC}[key]
 
@@ -196,7 +196,7 @@ def _owners(key: str, chain: list[dict[str, Any]]) -> str:
 def build(config: Config, context: BuildContext) -> Robot:
     """Build the chain as a tree of bodies ``link_1``… with joints ``joint_1``… and initial positions.
 
-    The frame of a link is at its joint with +z along the link; the base is rotated by ``base.yaw_deg`` about +z.
+    The frame of a link is at its joint, with +z along the link. The base is rotated by ``base.yaw_deg`` about +z.
     """
     yaw = np.deg2rad(config.base.yaw_deg)
     turn = np.array([[np.cos(yaw), -np.sin(yaw), 0.0], [np.sin(yaw), np.cos(yaw), 0.0], [0.0, 0.0, 1.0]])

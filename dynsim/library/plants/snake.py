@@ -2,7 +2,7 @@
 
 [T]: M. Tanaka et al., "Task-Space Control of Articulated Mobile Robots With a Soft Gripper for Operations", IEEE
 Transactions on Robotics 35(1), 2019. Values that [T] does not give are marked "assumed".
-Kinematic by default; ``level: dynamic`` builds a tree of bodies with masses, servos and tyres.
+The robot is kinematic by default; ``level: dynamic`` builds a tree of bodies with masses, servos and tyres.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from dynsim.snake.description import SnakeDescription
 from dynsim.snake.lifting import Lifts
 
 ENGINE = "kinematic"
-# Controller for which `section_defaults` has defaults.
+# Type of the controller for which `section_defaults` has defaults.
 TASK_SPACE = "task_space"
 
-# Compliant tyres (assumed): with rigid tyres the loads of the left and right wheel of a pair are not determined.
+# Compliant tyres (assumed); with rigid tyres, the loads on the left and right wheel of a pair would be indeterminate.
 TYRES = {"stiffness_N_per_m": 1e5, "damping_N_s_per_m": 200.0}
 MotorChoice: Any = families.union("motor")
 DrivenSide = Literal["left", "right", "none"]
@@ -94,7 +94,7 @@ class GripperConfig(StrictConfig):
     lost_deg: Positive = default(29.0, "rotation beyond which the object is lost", lt=180)
 
     def gripper(self, length: float) -> Gripper:
-        """Return the gripper with its tip at ``length`` ahead of the head point [m]."""
+        """Return the gripper whose tip is ``length`` [m] ahead of the head point."""
         turning = self.turning_stiffness_N_m_per_rad, self.turning_damping_N_m_s_per_rad, self.turning_bound_N_m
         return Gripper(
             body="head",
@@ -168,7 +168,7 @@ def section_defaults(plant: Mapping[str, Any], sections: Mapping[str, Any]) -> d
         if not isinstance(contacts, Mapping) or contacts.get("stiffness_N_per_m", TYRES) is not None:
             defaults["contacts"] |= TYRES
     controller = sections.get("controller")
-    # Another controller gets no defaults: its error must not be about a key that the user did not write.
+    # Other controllers get no defaults, so that no error is about a key that the user did not write.
     if isinstance(controller, Mapping) and controller.get("type") == TASK_SPACE:
         defaults["controller"] = {"state": "feedforward"}  # [T] IV.C.2
         sensor = {"measured": "motion_capture", "estimated": "encoders"}.get(str(controller.get("state")))
@@ -213,13 +213,13 @@ def build(config: Config, context: BuildContext) -> SnakeDescription | SnakeTree
 
 
 def _stop(kind: str, stop_deg: float | None, limit_deg: float) -> float:
-    """Return the mechanical stop of joints of a kind [rad]; raise ModelError if it is within the command limit."""
+    """Return the stop of yaw or pitch joints [rad]; raise ModelError if it is within the limit of the commands."""
     if stop_deg is None:
         return float(np.deg2rad(limit_deg))
     if stop_deg < limit_deg:
         raise ModelError(
             f"plant.dynamics.stops_deg.{kind} = {stop_deg:g}: must not be less than plant.limits_deg.{kind} = "
-            f"{limit_deg:g}, or commands would exceed the stop",
+            f"{limit_deg:g}, otherwise commands could exceed the stop",
             keys=("plant", "dynamics", "stops_deg", kind),
         )
     return float(np.deg2rad(stop_deg))
@@ -232,8 +232,8 @@ def describe(config: Config) -> SnakeDescription:
     ------
     ModelError
         If the head part is not controllable in six coordinates (n_h odd or n_h < 4, [T] eq 1), there are too few wheel
-        rows (n_b + n_w >= 2 is required, [T] eq 16 with all wheels on the ground), or lists do not fit the number of
-        joints or wheel pairs. The controller checks conditions on lifted wheels and shape controllable points.
+        rows (n_b + n_w >= 2 is required, [T] eq 16 with all wheels on the ground), or a list has the wrong length for
+        the joints or wheel pairs. The controller checks conditions on lifted wheels and shape controllable points.
     """
     n, n_h = config.yaw_joints, config.head_joints
     if n_h % 2:
@@ -268,7 +268,7 @@ def describe(config: Config) -> SnakeDescription:
     names = tuple(f"{'psi' if j % 2 else 'theta'}{j // 2 + 1}" for j in range(n_h))
     names += tuple(f"theta{n_h // 2 + i + 1}" for i in range(n_b))
 
-    # [T] V.A; for other lengths of the head part a similar S shape that keeps the head level
+    # The posture of [T] V.A; for other lengths of the head part, a similar S shape that keeps the head level.
     raised = [0.0, -0.8, 0.0, -1.1, 0.0, 1.9] if n_h == 6 else [0.0, 0.0] * (n_h // 2 - 2) + [0.0, -0.8, 0.0, 0.8]
     angles = raised if config.initial_joints_rad is None else config.initial_joints_rad
     if len(angles) not in (n_h, joints):

@@ -65,7 +65,7 @@ class Config(StrictConfig):
 
     @model_validator(mode="after")
     def _check_joints(self) -> Self:
-        """Check names and kinds of joints here, so that errors have a line; ``build`` reports all other errors."""
+        """Check the names and kinds of joints here, so that errors include a line; ``build`` reports all others."""
         from dynsim.model.urdf.reader import MOVING, SEVERAL, read_tree
 
         try:
@@ -101,12 +101,12 @@ class Config(StrictConfig):
 
 
 def build(config: Config, context: BuildContext) -> Robot:
-    """Build the robot of the file with the scenario's motors.
+    """Build the robot described in the URDF file, with the motors of the scenario.
 
     Raises
     ------
     ModelError
-        If the file is invalid (see :func:`dynsim.model.urdf.reader.read_urdf`), or the hand is on a body that does not
+        If the file is invalid (see :func:`dynsim.model.urdf.reader.read_urdf`), or the body of the hand does not
         exist.
     """
     from dynsim.model.urdf.reader import read_urdf
@@ -118,7 +118,7 @@ def build(config: Config, context: BuildContext) -> Robot:
         "revolute": {"damping": config.damping_N_m_s_per_rad, "friction": config.friction_N_m},
         "prismatic": {"damping": config.damping_N_s_per_m, "friction": config.friction_N},
     }
-    # Joints with several rates have no damping, friction or motors.
+    # Joints with several degrees of freedom have no damping, friction or motors.
     single = [link for link in robot.links if link.joint_of_rows is None]
     links = tuple(
         dataclasses.replace(link, **{key: loss for key, loss in stated[link.kind].items() if loss is not None})
@@ -166,6 +166,6 @@ def _initial(robot: Robot, positions: dict[str, float], poses: dict[str, PoseCon
         path = f"plant.initial_pose.{name}"
         for key, off in (("position_m", abs(normal @ p)), ("rpy_deg", float(np.abs(R @ normal - normal).max()))):
             if off > 1e-9:
-                raise ModelError(f"{path}.{key}: must be in the plane of the joint (normal {normal.tolist()})")
+                raise ModelError(f"{path}.{key}: must lie in the plane of the joint (normal {normal.tolist()})")
         q[index[rows[0]] : index[rows[0]] + 3] = x @ p, y @ p, np.arctan2(y @ R @ x, x @ R @ x)
     return q

@@ -1,4 +1,4 @@
-"""Box with rounded edges; the signed distance is C¹, flat on the faces and round over edges and corners."""
+"""Box with rounded edges; its signed distance is C¹, with flat faces and rounded edges and corners."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from dynsim.model.urdf.reader import rotation
 
 
 class Config(StrictConfig):
-    """Box about `center_m`, rotated by `rpy_deg`; the robot is outside."""
+    """Box centred at `center_m` and rotated by `rpy_deg`; the robot is outside."""
 
     type: Literal["box"]
     center_m: Vector3 = Field(description="centre in the world")

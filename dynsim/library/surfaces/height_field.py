@@ -36,7 +36,7 @@ class Config(StrictConfig):
     origin_m: Vector3 = default(
         [0.0, 0.0, 0.0], "position of the first height of the first row; z is added to all heights"
     )
-    # Read once: an edit of the file does not change a loaded scenario.
+    # The file is read only once, so that later edits do not change a loaded scenario.
     _heights: list[list[float]] = PrivateAttr()
 
     @model_validator(mode="after")

@@ -1,7 +1,7 @@
 """Kinds of joints, one module each: rows, coordinates, units, and the motion of the body in the joint's frame.
 
 A module defines ``ROWS``, its rows by kind (:attr:`dynsim.model.description.Link.kind`), and for a joint with several
-rows a function that makes its links. All modules of this package are used. The motion in the kernels is a branch of
+rows a function that makes its links. All modules of this package are loaded. In the kernels, the motion is a branch of
 :func:`dynsim.dynamics.tree.sweep.forward_sweep` (one angle, one distance) or of
 :func:`dynsim.dynamics.tree.joints.row_motion` (everything else).
 """
@@ -27,7 +27,7 @@ DISTANCE = ("m", "m/s", "m/s²", "N")
 
 @dataclass(frozen=True)
 class Row:
-    """One row of a joint: one rate.
+    """One row of a joint, which belongs to one rate.
 
     Attributes
     ----------
@@ -36,20 +36,20 @@ class Row:
     units : tuple of str
         Units of position, velocity, acceleration and force.
     neutral : tuple of float
-        Coordinates of the whole joint at which its frames coincide; empty for later rows.
+        Coordinates of the whole joint at which its two frames coincide; empty for later rows.
     names : tuple of str
-        Names of these coordinates, if there are several.
+        Names of the joint's coordinates, if there are several.
     offset : int
         Index of the row's coordinates within the coordinates of the joint.
     own_position : bool
-        Whether the first of these is the integral of its rate, so that a motor can control it although the joint has
-        several rows.
+        Whether the first of these coordinates is the integral of the row's rate, so that a motor can control it
+        although the joint has several rows.
     drawn : str or None
         Kind of joint, in the scene of a record, that moves the row's body in the same way; None: not available, and
         records of robots with such a joint have no scene.
     motion : callable
-        (:class:`~dynsim.model.description.Link`, coordinates (k, T)) → rotation (3, 3, T) and origin (3, T) of the body
-        in the joint's frame.
+        Function of a :class:`~dynsim.model.description.Link` and coordinates (k, T); returns rotation (3, 3, T) and
+        origin (3, T) of the body in the joint's frame.
     """
 
     code: int
@@ -72,7 +72,7 @@ def rows() -> dict[str, Row]:
 
 
 def turned(axis: Array, angle: Array) -> Array:
-    """Return the rotation about a unit axis by angles (T,), (3, 3, T)."""
+    """Return the rotations, (3, 3, T), about a unit axis by angles (T,)."""
     x, y, z = axis
     K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     return np.eye(3)[:, :, None] + np.sin(angle) * K[:, :, None] + (1.0 - np.cos(angle)) * (K @ K)[:, :, None]

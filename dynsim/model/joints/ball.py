@@ -1,4 +1,4 @@
-"""Ball joint and free body: attitude as a quaternion (w, x, y, z), angular velocity in the body's axes."""
+"""Ball joint and free body: the attitude is a quaternion (w, x, y, z), the angular velocity is in body axes."""
 
 from __future__ import annotations
 
@@ -37,9 +37,10 @@ ROWS = {
 
 
 def ball(link: Link) -> tuple[Link, ...]:
-    """Return the links of a ball joint that carries the body of ``link``, whose kind and axis do not matter.
+    """Return the links of a ball joint that carries the body of ``link``; its kind and axis are not used.
 
-    Coordinates: quaternion w, x, y, z of the body in the joint's frame. Rates: its angular velocity in its axes.
+    The coordinates are the quaternion w, x, y, z of the body in the joint's frame. The rates are the angular velocity
+    of the body in its own axes.
     """
     from dynsim.model.description import in_rows
 
@@ -49,8 +50,8 @@ def ball(link: Link) -> tuple[Link, ...]:
 def floating(link: Link) -> tuple[Link, ...]:
     """Return the links of a body that moves freely relative to the joint's frame.
 
-    Coordinates: position of its origin in the joint's frame, then the quaternion. Rates: velocity of the origin in the
-    axes of the joint's frame, angular velocity in the axes of the body.
+    The coordinates are the position of the body's origin in the joint's frame, then the quaternion. The rates are the
+    velocity of the origin in the axes of the joint's frame, then the angular velocity in body axes.
     """
     from dynsim.model.description import in_rows, without_body
 

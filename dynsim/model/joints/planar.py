@@ -29,7 +29,8 @@ def planar(link: Link) -> tuple[Link, ...]:
     from dynsim.model.description import in_rows
 
     normal = np.asarray(link.axis, dtype=np.float64)
-    # Axes of the plane: x and y turned the shortest way to the normal; x and y themselves for +z.
+    # The axes of the plane are x and y after the shortest rotation of z to the normal; for +z they are x and y
+    # themselves.
     z = np.array([0.0, 0.0, 1.0])
     cosine, v = float(normal[2]), np.cross(z, normal)
     square = float(v @ v)
@@ -37,7 +38,7 @@ def planar(link: Link) -> tuple[Link, ...]:
         R = np.diag([1.0, -1.0, -1.0])
     else:
         K = np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
-        # 1 / (1 + cosine), whose denominator near -z would be a difference of equal numbers.
+        # This is 1/(1 + cosine), rewritten because the denominator would cancel near -z.
         R = np.eye(3) + K + K @ K * ((1.0 - cosine) / square if cosine < 0.0 else 1.0 / (1.0 + cosine))
     return in_rows(link, [("x", "prismatic", R[:, 0]), ("y", "prismatic", R[:, 1]), ("angle", "revolute", normal)])
 
@@ -45,8 +46,8 @@ def planar(link: Link) -> tuple[Link, ...]:
 def rolling(link: Link) -> tuple[Link, ...]:
     """Return the links of a body that rolls on the plane z = 0 of the joint's frame like a wheelset with axle along y.
 
-    Coordinates: x, y and heading of the centre of the axle. Rates: speed along the heading, rate of turning. It cannot
-    move sideways.
+    The coordinates are x and y of the centre of the axle, and the heading. The rates are the speed along the heading
+    and the turning rate. The body cannot move sideways.
     """
     from dynsim.model.description import in_rows
 

@@ -1,4 +1,4 @@
-"""Mobile base on two wheels of one axle that roll without slip; its rates are the wheel rates ([WM] II.E)."""
+"""Mobile base with two wheels on one axle that roll without slip; its rates are the wheel rates ([WM] II.E)."""
 
 from __future__ import annotations
 
@@ -37,9 +37,10 @@ ROWS = {
 def wheeled(link: Link, radius: float, track: float) -> tuple[Link, ...]:
     """Return the links of a base that rolls on the plane z = 0 of the joint's frame on two wheels.
 
-    Coordinates: angles of the left and the right wheel, then x and y of the centre of the axle; both wheels turn
-    positively when the base rolls ahead, along its x. Rates: wheel rates, V = r (φ̇_r + φ̇_l)/2 and
-    ω = r (φ̇_r − φ̇_l)/T; rolling without slip, and the heading r (φ_r − φ_l)/T, are therefore exact.
+    The coordinates are the angles of the left and the right wheel, then x and y of the centre of the axle. Both wheels
+    turn positively when the base rolls forward, along its x axis. The rates are the wheel rates, with
+    V = r (φ̇_r + φ̇_l)/2 and ω = r (φ̇_r − φ̇_l)/T. Rolling without slip and the heading r (φ_r − φ_l)/T are therefore
+    exact.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
 """URDF import: strict reading of links and joints, lenient reading of visual shapes, and conversion to a robot.
 
-All numbers are checked, and errors name element and line. Elements that the URDF specification makes optional get its
+All numbers are checked, and errors name element and line. Elements that are optional in the URDF specification get its
 defaults (a link without ``<inertial>`` has no mass, a joint without ``<axis>`` turns about x). Other elements that are
-missing, misspelt, repeated or not numeric are refused.
+missing, misspelt, repeated or not numeric are errors.
 """
 
 from __future__ import annotations
@@ -34,18 +34,18 @@ from dynsim.system.inputs import read_bytes
 # XML of a URDF file: elements with line numbers, and attributes as numbers; unknown attributes are reported.
 
 
-# The largest robots in use have some 100 links and 1 MB of text.
+# Limits on a file; the largest robots in use have some 100 links and 1 MB of text.
 BYTES_MAX, ELEMENTS_MAX, DEPTH_MAX = 16_000_000, 100_000, 100
 ATTRIBUTES_MAX, NAME_LENGTH_MAX, _NUMBER_LENGTH_MAX = 100, 200, 400
-# Largest magnitude of a number: no robot needs larger ones, and their products could overflow.
+# Maximum magnitude of a number: no robot needs larger numbers, and their products could overflow.
 _MAGNITUDE_MAX = 1e15
 
-# Elements of physics; their values are attributes, so text in them is an error.
+# Elements that define physics. Their values are attributes, so text inside them is an error.
 _WITHOUT_TEXT = {"mass", "inertia", "origin", "axis", "limit", "dynamics", "mimic"}
 
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-# Child elements that physics depends on, by parent, and their attributes. Other elements, and other attributes of
+# Child elements that affect the physics, by parent, and their attributes. Other elements, and other attributes of
 # limits and losses, are extensions of some programs; they are ignored unless they look like a misspelling of these.
 _CHILDREN = {
     "robot": ("link", "joint"),
@@ -93,7 +93,7 @@ class Element:
         return self.error(f"{self.owner}: {text}")
 
     def name(self, others: Mapping[str, UrdfLink | UrdfJoint]) -> str:
-        """Return the name of a link or joint, checked to be printable and unique."""
+        """Return the name of a link or joint, after checking that it is printable and unique."""
         name = self.attributes.get("name", "")
         if not name:
             raise self.error(f"<{self.tag}> has no name; add the attribute name")
@@ -109,7 +109,7 @@ class Element:
         return name
 
     def check_children(self) -> None:
-        """Refuse repeated, misplaced or misspelt elements, which other readers ignore silently."""
+        """Reject repeated, misplaced or misspelt elements, which other readers silently ignore."""
         known, seen = _CHILDREN[self.tag], set()
         for child in self.children:
             if child.tag in known:
@@ -131,7 +131,7 @@ class Element:
                 raise self.fault(f"unknown attribute {cut(key)} of <{self.tag}>; {hint}")
 
     def required(self, tag: str, fix: str) -> Element:
-        """Return the child with this tag; without it, raise an error with the advice ``fix``."""
+        """Return the child with this tag, or raise an error with the advice ``fix`` if it is missing."""
         child = self.child(tag)
         if child is None:
             inside = ": <inertial>" if self.tag == "inertial" else ""
@@ -150,7 +150,7 @@ class Element:
         return self.numbers(key, 1, None if default is None else (default,))[0]
 
     def numbers(self, key: str, count: int, default: tuple[float, ...] | None = None) -> tuple[float, ...]:
-        """Return the ``count`` numbers of an attribute: plain ASCII decimals, finite."""
+        """Return the ``count`` numbers of an attribute, which must be finite plain ASCII decimals."""
         text, example = self.attributes.get(key), _EXAMPLE[count]
         if text is None:
             if default is not None:
@@ -168,7 +168,7 @@ class Element:
                 )
             value = float(word)
             vanished = value == 0.0 and re.search("[1-9]", re.split("[eE]", word)[0])
-            # Limits may be as large as numbers go, meaning no limit.
+            # Limits may be arbitrarily large, which means that there is no limit.
             largest = math.inf if self.tag == "limit" else _MAGNITUDE_MAX
             if vanished or not math.isfinite(value) or abs(value) > largest:
                 raise self.fault(f"{stated} is out of the range of numbers; check its exponent")
@@ -261,7 +261,10 @@ def _expand(path: Path) -> str:
 
 
 def _near(word: str, known: tuple[str, ...]) -> str:
-    """Return the known word of which ``word`` looks like a misspelling, or "". Programs have similar extensions."""
+    """Return the known word of which ``word`` looks like a misspelling, or "".
+
+    Words that are merely similar may be extensions of other programs.
+    """
     if word in known:
         return ""
     near = difflib.get_close_matches(word[:40].casefold(), known, n=1, cutoff=0.8)
@@ -274,12 +277,12 @@ def _words(text: str) -> list[str]:
 
 
 def quoted(text: str) -> str:
-    """Return a text of the file, quoted and shortened for a message."""
+    """Return a text from the file, quoted and shortened for a message."""
     return repr(cut(text))
 
 
 def cut(text: str) -> str:
-    """Return a text of the file, shortened for a message."""
+    """Return a text from the file, shortened for a message."""
     return text if len(text) <= 60 else text[:57] + "..."
 
 
@@ -333,7 +336,7 @@ def _colour(material: Element, named_colours: Mapping[str, Colour | None]) -> Co
     return named_colours.get(material.attributes.get("name", ""))
 
 
-# The largest robots in use have some 100 links.
+# Maximum number of links; the largest robots in use have some 100 links.
 LINKS_MAX = 2000
 MOVING = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
 # Joints with several rates.
@@ -344,9 +347,10 @@ UNLIMITED = 1e9
 
 @dataclass(frozen=True)
 class UrdfLink:
-    """Link as stated in the file; ``inertia`` is None without ``<inertial>``; ``shaped``: has visual or collision.
+    """Link as stated in the file.
 
-    ``shapes`` are the visuals that can be drawn.
+    ``inertia`` is None if the link has no ``<inertial>``; ``shaped`` is True if it has a visual or collision element;
+    ``shapes`` are the visual elements that can be drawn.
     """
 
     name: str
@@ -603,7 +607,7 @@ ROWS = {"floating": floating, "planar": planar}
 
 @dataclass(frozen=True)
 class _Place:
-    """Moving body that carries a link (None: the world), the link's frame there, and its distance from the root."""
+    """Moving body that carries a link (None: the world), the link's frame on it, and its distance from the root."""
 
     body: str | None
     R: Array
@@ -615,11 +619,11 @@ class _Place:
 def read_urdf(path: Path, lock: Mapping[str, float] | None = None) -> Robot:
     """Read the bodies and joints of a URDF file.
 
-    Joints keep their names and the order of the file (but a parent always comes first); each body is named after the
-    link at its moving joint, and every other link is a frame of the body that carries it. Floating and planar joints
-    become their rows (:mod:`dynsim.model.joints`). The hand is the link named ``hand``, otherwise the tip of the chain
-    with the most moving joints: the last link fixed to its last body, or that body's origin if nothing is fixed to it.
-    The root link is the world. A mimic joint is a coupling to its leader; a locked leader locks it too.
+    Joints keep their names and their order in the file (except that a parent always comes first); each body is named
+    after the link at its moving joint, and every other link is a frame of the body that carries it. Floating and planar
+    joints become their rows (:mod:`dynsim.model.joints`). The hand is the link named ``hand``, otherwise the tip of the
+    chain with the most moving joints: the last link fixed to its last body, or that body's origin if nothing is fixed
+    to it. The root link is the world. A mimic joint is a coupling to its leader; a locked leader locks it too.
 
     Parameters
     ----------
@@ -646,7 +650,7 @@ def read_urdf(path: Path, lock: Mapping[str, float] | None = None) -> Robot:
     places = _places(locked)
     links = _links(locked, places)
     if not links:
-        raise ModelError(f"{path}: no moving joint")
+        raise ModelError(f"{path}: has no moving joint")
     _warn(locked, places, links)
     frames = [Frame(name, pose.body, pose.R, pose.p) for name, pose in places.items() if pose.body != name]
     rows = tuple(row for link in links for row in (ROWS[link.kind](link) if link.kind in ROWS else (link,)))
@@ -739,7 +743,8 @@ def _places(tree: UrdfTree) -> dict[str, _Place]:
     for order, joint in enumerate(tree.joints.values()):
         below[joint.parent].append((order, joint))
     places = {tree.root: _Place(None, np.eye(3), np.zeros(3), 0, 0)}
-    # Fixed joints first: links behind them belong to an existing body and may carry joints early in the file.
+    # Follow fixed joints first, because links behind them belong to an existing body and may carry joints early in the
+    # file.
     pending: list[tuple[bool, int, str]] = []
     joints = tree.joints
 
@@ -761,7 +766,7 @@ def _places(tree: UrdfTree) -> dict[str, _Place]:
 
 
 def _links(tree: UrdfTree, places: Mapping[str, _Place]) -> tuple[Link, ...]:
-    """Return the moving bodies with everything fixed to them; a floating or planar joint is still a single link."""
+    """Return the moving bodies with everything fixed to them; a floating or planar joint is a single link here."""
     joint_to = {joint.child: joint for joint in tree.joints.values()}
     inertias, shapes = _inertias(tree, places), _shapes(tree, places)
     links = []
@@ -805,7 +810,7 @@ def _shapes(tree: UrdfTree, places: Mapping[str, _Place]) -> dict[str | None, tu
 
 
 def _hand(tree: UrdfTree, places: Mapping[str, _Place]) -> _Place:
-    """Return the controlled point: the link ``hand`` if it moves, otherwise the tip of the first deepest chain."""
+    """Return the controlled point: the link ``hand`` if it moves, otherwise the tip of the first longest chain."""
     tip = max(tree.links, key=lambda name: (places[name].moving, places[name].joints))
     if HAND in places and places[HAND].moving > 0:
         tip = HAND
@@ -813,7 +818,7 @@ def _hand(tree: UrdfTree, places: Mapping[str, _Place]) -> _Place:
 
 
 def _warn(tree: UrdfTree, places: Mapping[str, _Place], links: tuple[Link, ...]) -> None:
-    """Refuse impossible bodies; warn about missing masses."""
+    """Reject impossible bodies and warn about missing masses."""
     for link in links:
         link.inertia.check(f"{tree.path}:{tree.links[link.name].line}: link {link.name!r}, with everything fixed to it")
     loaded: set[str | None] = set()
@@ -822,7 +827,7 @@ def _warn(tree: UrdfTree, places: Mapping[str, _Place], links: tuple[Link, ...])
             loaded |= {link.name, link.parent}
     empty = [link.joint for link in links if link.name not in loaded and (link.parent in loaded or not link.parent)]
     if empty:
-        warnings.warn(f"{tree.path}: nothing beyond these joints has a mass ({', '.join(empty)})", stacklevel=3)
+        warnings.warn(f"{tree.path}: no link beyond these joints has a mass ({', '.join(empty)})", stacklevel=3)
     moving = [tree.links[name] for name, pose in places.items() if pose.body is not None]
     bare = [link.name for link in moving if link.inertia is None and link.shaped]
     if bare:
@@ -837,7 +842,7 @@ def _warn(tree: UrdfTree, places: Mapping[str, _Place], links: tuple[Link, ...])
             odd.append(part.name)
     if odd:
         warnings.warn(
-            f"{tree.path}: impossible moments of inertia, accepted because the sum with the links fixed to them is "
-            f"possible ({', '.join(odd)})",
+            f"{tree.path}: impossible moments of inertia were accepted, because the sums with the links fixed to these "
+            f"links are possible ({', '.join(odd)})",
             stacklevel=3,
         )

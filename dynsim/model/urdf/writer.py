@@ -1,4 +1,4 @@
-"""URDF export: bodies and joints of a robot as a file that reads back to the same dynamics."""
+"""URDF export: bodies and joints of a robot as a file that gives the same dynamics when it is read."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from dynsim.record.urdf_text import add_shapes, connect, numbers, xml_text
 def write_urdf(robot: Robot) -> str:
     """Write the bodies, joints and shapes of a robot as URDF text.
 
-    Frames, and the hand as one of them, become links without mass. Losses of joints are bearing losses, without motor
+    Frames, including the hand's frame, become links without mass. Joint losses contain only bearing losses, not motor
     losses.
 
-    Numbers are written in full, so that reading the text back gives the same dynamics to rounding.
+    Numbers are written with all digits, so that reading the text gives the same dynamics up to rounding errors.
 
     Raises
     ------
@@ -78,7 +78,7 @@ def write_urdf(robot: Robot) -> str:
 
 
 def _whole_joints(robot: Robot) -> list[Link]:
-    """Return the links of the file: rows that make a floating or planar joint as one link of that kind."""
+    """Return the links of the file; rows that form a floating or planar joint become one link of that kind."""
     rows: dict[str, list[Link]] = {}
     for link in robot.links:
         rows.setdefault(link.joint_of_rows or link.joint, []).append(link)

@@ -1,11 +1,11 @@
-"""Simulation that is driven by a pilot and followed by servos, in a separate process, and its connection to the servos.
+"""Simulation in a separate process, which a pilot drives and servos follow, and its connection to the servos.
 
     process of the servos                              process of the simulation
     ---------------------                              -------------------------
     writes its time to shared memory       ──▶         ServoFollower.ready: the next tick may be simulated
     reads a pipe without waiting           ◀──         ServoFollower.after_tick: writes a posture for each tick
 
-The control loop of the servos has a separate interpreter, so compilation, browsers or disks cannot block it.
+The control loop of the servos runs in a separate interpreter, so that compilation, browsers or disks cannot block it.
 """
 
 from __future__ import annotations
@@ -41,15 +41,15 @@ from dynsim.teleop.snake import Array, Session, SpeedLimits, begin
 from dynsim.teleop.web.live import DriveReport, LiveDrive
 
 NOT_STARTED = -math.inf
-"""Time reported by the servos before they have reached the initial posture."""
+"""Time that the servos report before they have reached the initial posture."""
 NICENESS = 5
 REGULAR, BROKEN, NOT_LIFTED = 0.0, 1.0, 2.0
-"""Codes of the end of a drive, sent after a time of NaN."""
+"""Codes that state how a drive ended; they are sent after a time of NaN."""
 
 
 @dataclass(frozen=True)
 class DriveRequest:
-    """Inputs of a drive."""
+    """Inputs for a drive."""
 
     scenario: Scenario
     servo_map: ServoMap
@@ -62,7 +62,7 @@ class DriveRequest:
 
 @dataclass(frozen=True)
 class Ready:
-    """Data for the servos before they move; ``step`` is the time between samples [s]."""
+    """Data that the servo process needs before the servos move; ``step`` is the time between samples [s]."""
 
     address: str
     still: Record
@@ -72,7 +72,7 @@ class Ready:
 
 @dataclass(frozen=True)
 class Done:
-    """Result of a drive; ``driven`` is its duration [s], ``failure`` an error of the simulation or of saving."""
+    """Result of a drive; ``driven`` is its duration [s], and ``failure`` is an error in simulating or saving it."""
 
     report: DriveReport
     driven: float
@@ -81,30 +81,30 @@ class Done:
 
 
 class Columns:
-    """Joints of a simulation that the servos of a map follow.
+    """Signals and columns of a simulation that the servos of a map follow.
 
     Raises
     ------
     CheckRefused
-        If a signal or column does not exist or is not available in a live drive, or the robot lifts wheels but the map
-        has no ``lifts``.
+        If a signal or column does not exist or is not available in a live drive, or if the robot lifts wheels but the
+        map has no ``lifts``.
     """
 
     def __init__(self, session: Session, servo_map: ServoMap) -> None:
         still, known = session.still, session.joints()
         if servo_map.lifts is None and LIFTED in known:
             raise CheckRefused(
-                "the robot lifts wheel pairs but the servo map has no 'lifts', so they would drag over the floor; "
+                "the robot lifts wheel pairs but the servo map has no 'lifts', so they would drag on the floor; "
                 "add an entry 'lifts' to the map"
             )
         self._lifts = servo_map.lifts
         if self._lifts is not None and self._lifts.signal not in known:
             raise CheckRefused(
-                f"lifts.signal: {self._lifts.signal!r} is not available in a live drive; use {', '.join(known)}"
+                f"lifts.signal: {self._lifts.signal!r} is not available in a live drive; use one of {', '.join(known)}"
             )
         self._session = session
         self._fixed = np.array([servo.hold_at or 0.0 for servo in servo_map.servos])
-        # Index of the servo, signal and column of its angle and of its rate; None for held rates.
+        # Index of each servo, signal and column of its angle, and signal and column of its rate (None for held rates).
         self._sources: list[tuple[int, tuple[str, int], tuple[str, int] | None]] = []
         for index, servo in enumerate(servo_map.servos):
             if servo.hold_at is not None:
@@ -118,7 +118,7 @@ class Columns:
             if missing := [name for name in signals if name not in known]:
                 raise CheckRefused(
                     f"{servo.joint}: signal {missing[0]!r} is not available in a live drive (signals: "
-                    f"{', '.join(known)}); for a sampled controller use 'rates: held'"
+                    f"{', '.join(known)}); for a sampled controller, use 'rates: held'"
                 )
             position, *rates = ((name, still.labels[name].index(servo.label)) for name in signals)
             self._sources.append((index, position, rates[0] if rates else None))
@@ -134,7 +134,10 @@ class Columns:
         return Sample(self._session.time, position, velocity)
 
     def base(self, yaw: tuple[str, list[int]]) -> tuple[Array, Array]:
-        """Return the yaw angles of the base part [rad], from columns of a signal, and the grounded wheel pairs."""
+        """Return the yaw angles of the base part [rad] and which wheel pairs are on the ground.
+
+        ``yaw`` contains the signal with the yaw angles and their columns.
+        """
         assert self._lifts is not None
         joints = self._session.joints()
         signal, columns = yaw
@@ -151,14 +154,14 @@ class ServoFollower:
     servo_map : ServoMap
         Map of the servos.
     samples : Connection
-        Pipe for the postures.
+        Pipe through which the postures are sent.
     servo_time : array
-        Shared memory with the time of the servos [s].
+        Shared memory that contains the time of the servos [s].
 
     Raises
     ------
     CheckRefused
-        See :class:`Columns`.
+        As for :class:`Columns`.
     """
 
     def __init__(self, session: Session, servo_map: ServoMap, samples: Connection, servo_time: Any) -> None:
@@ -194,25 +197,25 @@ class ServoFollower:
             self._send(sample)
 
     def end(self, how: float) -> None:
-        """Send the code of the end of the drive, and close the pipe."""
+        """Send the code that states how the drive ended, and close the pipe."""
         self._send(Sample(math.nan, np.full_like(self.first.position, how), np.zeros_like(self.first.position)))
         self._samples.close()
 
     def _send(self, sample: Sample) -> None:
         rows = np.broadcast_arrays(sample.position, sample.velocity, sample.lift, sample.lift_rate)
-        # A process of servos that is gone is reported elsewhere.
+        # If the process of the servos no longer exists, this is reported elsewhere.
         with suppress(OSError):
             os.write(self._samples.fileno(), np.concatenate([[sample.time], *rows]).tobytes())
 
 
 def simulate(request: DriveRequest, control: Connection, samples: Connection, servo_time: Any) -> None:
-    """Run the process of the simulation: send Ready or an error, drive, save, and send Done.
+    """Run in the process of the simulation: send Ready or an error, drive, save the drive, and send Done.
 
-    Any message on ``control`` ends the drive, and so does the end of the process of the servos.
+    The drive ends when a message arrives on ``control``, or when the process of the servos ends.
     """
     # A terminal sends signals to all processes of a group; only the process of the servos handles them.
     ignore_stops()
-    # On a busy computer the servos have priority.
+    # Lower the priority of this process, so that the servos have priority on a busy computer.
     with suppress(AttributeError, OSError):
         os.nice(NICENESS)
     drives: SimpleQueue[LiveDrive] = SimpleQueue()
@@ -285,7 +288,7 @@ FAULTS = {
 POLL_INTERVAL = 0.2
 """Interval between checks for Ctrl-C while waiting for the simulation [s]."""
 PATIENCE = 5.0
-"""Maximum wait for the end of a process that has finished its work [s]."""
+"""Maximum time to wait until a process ends after it has finished its work [s]."""
 
 
 class PipeFeed:
@@ -354,7 +357,7 @@ def safe_path() -> Iterator[None]:
 
 
 class SimulationProcess:
-    """Drive in a separate process, which is ended when the block of this context manager ends.
+    """Process that simulates a drive; it is a context manager that ends the process when the block ends.
 
     Attributes
     ----------
@@ -368,7 +371,7 @@ class SimulationProcess:
         context: Any = get_context("spawn")
         self._control, control = context.Pipe()
         samples, sender = context.Pipe(duplex=False)
-        # Starting the resource tracker of Python unblocks signals, so start it before they are blocked.
+        # Starting Python's resource tracker unblocks signals, so start it before the signals are blocked.
         with safe_path():
             resource_tracker.ensure_running()
         with signals_held(), safe_path():
@@ -377,7 +380,7 @@ class SimulationProcess:
                 target=simulate, args=(request, control, sender, servo_time), name="dynsim simulation", daemon=True
             )
             self._process.start()
-        # Close the ends in this process, otherwise they would hide the end of the other process.
+        # Close these ends of the pipes in this process; otherwise it would not notice that the other process has ended.
         control.close()
         sender.close()
         self.feed = PipeFeed(samples, servo_time, request.servo_map)
@@ -394,7 +397,7 @@ class SimulationProcess:
         self.feed.close()
 
     def ready(self) -> Ready:
-        """Wait until the simulation can be driven, which may include the compilation of kernels.
+        """Wait until the simulation can be driven; this may include the time to compile kernels.
 
         Raises
         ------
@@ -410,12 +413,12 @@ class SimulationProcess:
         return message
 
     def finish(self, why: str) -> Done:
-        """End the drive, unless it has ended, and wait until it is saved.
+        """End the drive, if it has not ended yet, and wait until it has been saved.
 
         Raises
         ------
         DynsimError
-            If the process has ended before.
+            If the process ended before the drive was saved.
         """
         with suppress(OSError):
             self._control.send(why)

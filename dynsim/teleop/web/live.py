@@ -1,4 +1,4 @@
-"""A live drive: the simulation runs in real time in the calling thread, the server in another thread."""
+"""Live drive: the simulation runs in real time in the calling thread, and the server runs in another thread."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ NOT_READY = "the robot is not ready yet"
 class RealTimeClock:
     """Clock that waits for the next tick.
 
-    After a late tick at most one tick follows without a pause. A larger delay is not made up, so simulated time falls
-    behind wall time. Therefore motions exceed the commanded speed for at most one tick, and commands do not take effect
-    in bursts.
+    After a late tick, at most one tick follows without a pause. A larger delay is not made up, so that simulated time
+    falls behind wall time. Therefore a motion exceeds the commanded speed for at most one tick, and commands do not
+    take effect in bursts.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ class RealTimeClock:
     now : callable
         Monotonic clock [s].
     wait : callable
-        Function that waits for a time [s].
+        Function that waits for a given time [s].
 
     Attributes
     ----------
@@ -72,7 +72,7 @@ class RealTimeClock:
 
 @dataclass
 class DriveReport:
-    """Report of a drive.
+    """Report on the timing and the end of a drive.
 
     Attributes
     ----------
@@ -81,9 +81,9 @@ class DriveReport:
     lost : float
         Wall time by which the simulation has fallen behind [s].
     ended : str
-        Reason of the end.
+        Reason why the drive ended.
     stop : SimulationStopped or None
-        Error that ended the simulation.
+        Error that ended the simulation, if any.
     """
 
     late: list[float] = field(default_factory=list)
@@ -93,7 +93,7 @@ class DriveReport:
 
 
 class Follower(Protocol):
-    """Interface of a robot that follows the simulation; the simulation waits for it."""
+    """Interface of a robot that follows the simulation and for which the simulation waits."""
 
     @property
     def begun(self) -> bool:
@@ -101,25 +101,25 @@ class Follower(Protocol):
 
     @property
     def ready(self) -> bool:
-        """True if the follower is close enough for another tick."""
+        """True if the follower is close enough to the simulation for another tick."""
 
     @property
     def steady(self) -> bool:
         """True if the robot may change its mode now, and the drive may end."""
 
     def after_tick(self) -> None:
-        """Send the state of the simulation after a tick."""
+        """Send the state of the simulation to the robot after a tick."""
 
 
 class LiveDrive:
-    """Session that browsers can access from :meth:`open` to :meth:`close`.
+    """Drive of a session, which browsers can access from :meth:`open` to :meth:`close`.
 
     Parameters
     ----------
     session : Session
         Simulation to drive.
     name : str
-        Name shown in the page.
+        Name that the page shows.
     follower : Follower, optional
         Robot for which the simulation waits before each tick; the wait counts as time behind real time.
     """
@@ -148,14 +148,14 @@ class LiveDrive:
         return self.server.address
 
     def close(self) -> None:
-        """Send the reason of the end to the browsers, and stop the server and its thread."""
+        """Send the reason for the end to the browsers, and stop the server and its thread."""
         self.server.stop(self.report.ended)
 
     def run(self, *, until_closed: bool = False) -> DriveReport:
-        """Drive until the pilot ends the drive, Ctrl-C, or the maximum duration.
+        """Drive until the pilot ends the drive, the user presses Ctrl-C, or the maximum duration has passed.
 
-        With ``until_closed`` the drive also ends when the last browser leaves.
-        Signals are handled between ticks only, so that each tick is either executed and recorded, or neither.
+        If ``until_closed`` is True, the drive also ends when the last browser disconnects. Signals are handled only
+        between ticks, so that each tick is either executed and recorded, or not executed.
         """
         session, report = self.session, self.report
         try:
@@ -183,13 +183,13 @@ class LiveDrive:
         return report
 
     def end(self, why: str = "ended by the pilot", *, at_once: bool = False) -> None:
-        """End the drive before its next tick (``at_once``) or when its follower is steady; thread-safe."""
+        """End the drive before the next tick if ``at_once``, otherwise when its follower is steady; thread-safe."""
         self._ended = self._ended or why
         self._at_once = self._at_once or at_once
         self._over.set()
 
     def _followed(self, command: Command, state: str) -> Command:
-        """Return a command that the follower can execute; a mode request waits while the dead-man switch is held."""
+        """Return a command that the follower can execute; delay a mode request while the dead-man switch is held."""
         if self._follower is None:
             return command
         if self._over.is_set() or state != DRIVING:
@@ -214,13 +214,16 @@ class LiveDrive:
         return True
 
     def _wait_for_follower(self, until_closed: bool) -> None:
-        """Wait until the follower is ready; a switch that is held before its start must be released first."""
+        """Wait until the follower is ready.
+
+        If the dead-man switch is held before the follower has begun, it must be released before it takes effect.
+        """
         follower = self._follower
         while follower is not None and not follower.ready and not self._is_over(until_closed):
             if not follower.begun:
                 self.deadman.disarm()
                 self._show(NOT_READY, self.deadman.command()[2])
-            # Do not wait for the event: it is already set if the drive continues until its follower is steady.
+            # Do not wait for the event: it is already set if the drive only continues until its follower is steady.
             clock.sleep(WAIT)
 
     def _show(self, state: str, count: int) -> None:
@@ -245,7 +248,7 @@ class LiveDrive:
         }
 
     def _contacts(self, frame: LiveFrame) -> dict[str, Any]:
-        """Return the contact forces for the page: normal force, normal and tangential force."""
+        """Return the contact forces for the page: normal force, normal vector, tangential force and contact mode."""
         scene, forces = self.session.still.scene, dict[str, Any]()
         if scene is None:
             return forces

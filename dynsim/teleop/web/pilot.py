@@ -1,4 +1,4 @@
-"""Messages of a pilot: validation of small JSON texts with known keys, and the dead-man switch."""
+"""Messages from a pilot, which are short JSON texts, and their validation; the dead-man switch."""
 
 from __future__ import annotations
 
@@ -13,33 +13,33 @@ from dynsim.snake.description import FIXING, NO_REQUEST, SWITCHING
 from dynsim.teleop.snake import Command, PilotAxis
 
 MAX_BYTES = 4096
-"""Maximum size of a message [bytes]; a longer message closes the connection."""
+"""Maximum size of a message [bytes]; if a message is longer, the connection is closed."""
 MAX_COUNT = 2**53
 """Largest integer that a browser represents exactly."""
 STEPS = 100
-"""Number of speed steps up to full speed, so that noise of a joystick does not add entries to the script."""
+"""Number of steps to which a speed is rounded, so that joystick noise does not add entries to the script."""
 REQUESTS = {"switching": SWITCHING, "fixing": FIXING}
 ACTIONS = ("take", "leave", "end")
 
 
 class Refused(ValueError):
-    """Invalid message of a client; the text is the reason."""
+    """A client has sent an invalid message; the text states the reason."""
 
 
 @dataclass(frozen=True)
 class PilotCommand:
-    """Command of the pilot.
+    """Command from the pilot.
 
     Attributes
     ----------
     count : int
-        Increasing number of the message.
+        Number of the message, which increases from message to message.
     axes : tuple of float
-        Velocities as fractions of full speed, −1 to 1.
+        Velocities as fractions of full speed, from −1 to 1.
     held : bool
         True if the dead-man switch is held.
     request : int
-        Requested mode; ``NO_REQUEST`` for none.
+        Requested mode; ``NO_REQUEST`` if no mode is requested.
     closed : bool
         True to close the gripper.
     """
@@ -52,7 +52,7 @@ class PilotCommand:
 
 
 def parse(text: str | bytes, axes: int, modes: tuple[int, ...]) -> PilotCommand | str:
-    """Parse a message of a client into a command, or one of ``ACTIONS``.
+    """Parse a message from a client; return a command, or one of the ``ACTIONS``.
 
     Parameters
     ----------
@@ -104,12 +104,12 @@ def _count(value: Any) -> int:
 
 
 def _axes(values: Any, count: int) -> tuple[float, ...]:
-    """Return ``count`` finite values, limited to full speed and rounded to its steps."""
+    """Return ``count`` values, limited to full speed and rounded to speed steps; raise Refused if any is invalid."""
     if not isinstance(values, list) or len(values) != count:
         raise Refused(f"axes: must be a list of {count} numbers")
     axes = []
     for value in values:
-        # An integer may have thousands of digits; a float may overflow to infinity.
+        # An integer may have thousands of digits, and a float may have overflowed to infinity.
         if (
             isinstance(value, bool)
             or not isinstance(value, int | float)
@@ -138,20 +138,20 @@ def _request(value: Any, modes: tuple[int, ...]) -> int:
     raise Refused(f"mode: unknown mode; modes: {known}")
 
 
-# Dead-man switch: set by the thread of the server, read by the simulation at each tick.
+# Dead-man switch: the thread of the server sets it, and the simulation reads it at each tick.
 
 
 SILENCE = 0.25
-"""Time without a message from the pilot after which velocities are zero [s]."""
+"""Velocities become zero if no message from the pilot arrives for this time [s]."""
 
 NO_PILOT, RELEASED, DRIVING, SILENT = "no pilot", "key released", "driving", "silent"
 
 
 class Deadman:
-    """Dead-man switch with the newest command of the pilot; thread-safe.
+    """Dead-man switch that stores the newest command from the pilot; thread-safe.
 
     Velocities are zero unless the switch is held and the last message is not older than ``SILENCE``. After a silence,
-    and for a new pilot, the switch has an effect only after a message that it is released.
+    and for a new pilot, the switch takes effect only after a message has reported that it is released.
 
     Parameters
     ----------
@@ -169,7 +169,7 @@ class Deadman:
         self._silent = False
 
     def receive(self, command: PilotCommand) -> None:
-        """Store a command of the pilot; it is ignored if a newer command was received before."""
+        """Store a command from the pilot; ignore it if a newer command has already been received."""
         with self._lock:
             now = self._clock()
             if self._newest is not None and command.count <= self._newest.count:
@@ -182,17 +182,17 @@ class Deadman:
             self._newest, self._received_at, self._closed = command, now, command.closed
 
     def reset(self) -> None:
-        """Discard the command, when the pilot leaves."""
+        """Discard the stored command, because the pilot has left."""
         with self._lock:
             self._newest, self._armed, self._request, self._silent = None, False, NO_REQUEST, False
 
     def disarm(self) -> None:
-        """Require that the switch is released once before it has an effect."""
+        """Require that the switch is released once before it takes effect."""
         with self._lock:
             self._armed, self._request = False, NO_REQUEST
 
     def command(self) -> tuple[Command, str, int]:
-        """Return the command for the simulation, the state of the pilot, and the count of the pilot command."""
+        """Return the command for the simulation, the state of the pilot, and the number of the pilot's last message."""
         with self._lock:
             newest, still = self._newest, Command((0.0,) * len(self._limits), closed=self._closed)
             if newest is None:

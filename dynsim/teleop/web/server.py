@@ -39,15 +39,15 @@ FRAMES = 60.0
 """Maximum frame rate of a client [1/s]."""
 MAX_CLIENTS = 16
 MAX_MESSAGES = 400
-"""Maximum number of messages of a client per second; a browser sends 50."""
+"""Maximum number of messages per second from one client; the page sends 50."""
 MAX_REFUSED = 20
-"""Number of invalid messages after which the connection of a client is closed."""
+"""Number of invalid messages after which the connection to a client is closed."""
 MAX_ACCEPTED, MAX_WAITING = 40, 1024
 """Maximum number of connections that are accepted in each second, and of those that wait for it in the system."""
 REQUEST_TIME = 1.0
 """Maximum time from the acceptance of a connection to its complete request [s]."""
 LAST_MESSAGE_TIME = 1.0
-"""Maximum time for the last message to all clients [s]."""
+"""Maximum time to send the last message to all clients [s]."""
 _HEADERS = {
     "Cache-Control": "no-store",
     "Referrer-Policy": "no-referrer",
@@ -62,7 +62,7 @@ _HEADERS = {
 class _ListeningSocket(socketlib.socket):
     """Listening socket that accepts at most ``MAX_ACCEPTED`` connections per second.
 
-    ``asyncio`` has no limit of its own, but it stops accepting for a second when ``accept`` reports that the system has
+    ``asyncio`` does not limit the rate, but it stops accepting for a second when ``accept`` reports that the system has
     no more file descriptors.
     """
 
@@ -117,17 +117,17 @@ class Server:
     Parameters
     ----------
     deadman : Deadman
-        Receives the commands of the pilot.
+        Dead-man switch that receives the commands from the pilot.
     hello : mapping
         First message to each client.
     axes : int
         Number of axes of the robot.
     modes : tuple of int
-        Modes of the robot.
+        Modes that a pilot may request.
     page : callable
-        Returns the page for the address of the web socket.
+        Function that returns the page; its argument is the address of the web socket.
     end : callable
-        Called when the pilot ends the drive.
+        Function that is called when the pilot ends the drive.
     """
 
     deadman: Deadman
@@ -171,7 +171,7 @@ class Server:
         return len(self._clients)
 
     def start(self, port: int = 0) -> None:
-        """Start the server; port 0 selects a free port.
+        """Start the server; if the port is 0, select a free port.
 
         Raises
         ------
@@ -186,7 +186,7 @@ class Server:
             raise DynsimError(f"cannot listen on {LOOPBACK}, port {port}: {self.failure}; choose another --http-port")
 
     def stop(self, why: str = "") -> None:
-        """Send the reason of the end to all clients, close the connections and end the thread."""
+        """Send the reason for the end to all clients, close the connections and end the thread."""
         self._why = why
         if self._loop is not None and self._quit is not None and not self._loop.is_closed():
             self._loop.call_soon_threadsafe(self._quit.set)
@@ -197,7 +197,7 @@ class Server:
             LOG.warning("%d connections to the drive's port failed, or came too fast", count)
 
     def show(self, frame: Mapping[str, Any]) -> None:
-        """Send a new frame to all clients; thread-safe. A busy client receives the newest frame only."""
+        """Send a new frame to all clients; thread-safe. A busy client receives only the newest frame."""
         if self._loop is not None and not self._loop.is_closed():
             self._loop.call_soon_threadsafe(self._set_frame, json.dumps(frame, separators=(",", ":")))
 
@@ -235,12 +235,12 @@ class Server:
             self._ready.set()
             await self._quit.wait()
             messages = (client.socket.send(json.dumps({"over": self._why})) for client in self._clients.values())
-            # Do not wait for a browser that no longer reads.
+            # Do not wait for a browser that no longer reads messages.
             with suppress(TimeoutError):
                 await asyncio.wait_for(asyncio.gather(*messages, return_exceptions=True), LAST_MESSAGE_TIME)
 
     def _guard(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Return the page or a rejection without details; None for a valid web socket of the page."""
+        """Return the page, a rejection without details, or None if the request is a valid web socket of the page."""
         hosts, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
         own = {f"{name}:{self.port}" for name in (LOOPBACK, "localhost")}
         if len(hosts) != 1 or hosts[0] not in own:
@@ -326,7 +326,7 @@ class Server:
                 await client.socket.send(json.dumps({"role": role, "free": self._pilot is None}))
 
     async def _send(self, client: _Client) -> None:
-        """Send frames as they arrive, the newest only."""
+        """Send the newest frame whenever a new frame is available."""
         with suppress(ConnectionClosed):
             while True:
                 await client.new_frame.wait()

@@ -1,1 +1,1 @@
-"""Brace forces of least motor heat for a given motion, and their tables."""
+"""Brace forces that minimise the motor heat for a given motion, and their tables."""

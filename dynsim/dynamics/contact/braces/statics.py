@@ -1,12 +1,13 @@
-"""Brace forces of least motor heat for a given motion, their ranges, and certificates if no forces are possible.
+"""Brace forces that minimise motor heat for a given motion, their ranges, and certificates of infeasibility.
 
     tau = M vdot + h + g + J_m vdot + (D + D_m) v − Bᵀ f,    minimise Σ w_j tau_j²,  w = R / K_m²
 
 subject to lower ≤ tau ≤ upper (both zero for a joint without a motor), |f_t| ≤ μ f_n and f_n ≥ min_N: a second-order
 cone program. Each brace has f = (f_n, f_1, f_2) along its normal n and two tangents; the rows of B map rates to the
 velocities of its point along them. A sliding brace has f_t = −μ f_n d with the direction of slip d; a commanded f_n is
-given. The unknowns of a brace are thus f if it is held, f_n if it slides or has no friction, without f_n if commanded.
-If braces have a target force, the program minimises the deviation from it instead of the heat, see ``NEAR``.
+known. The unknowns of a brace are thus f if it is held, and f_n if it slides or has no friction; f_n is not an unknown
+if it is commanded. If braces have a target force, the program minimises the deviation from it instead of the heat; see
+``NEAR``.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from dynsim.dynamics.tree.spatial import point_velocity, put_vector, six
 from dynsim.dynamics.tree.sweep import kinematics, newton_euler
 from dynsim.jit.kernel import integers, internal_kernel, kernel, reals
 
-# Tables of the program: braces and motors in, forces out, workspace.
+# Tables of the program: braces and motors (input), forces (output) and workspace.
 
 
 # BraceArrays.table
@@ -39,12 +40,12 @@ AXES = 3  # 9: unit normal and two tangents in W, one after the other
 SLIP = 12  # 2: unit direction of sliding along the tangents, zero for a brace that is held
 FRICTION = 14
 LEAST = 15  # min_N
-COMMANDED = 16  # [N], NaN for none
+COMMANDED = 16  # commanded normal force [N], NaN if none
 # Target of the normal force of a brace [N], and its weight (compliance) [m/N]; zero for braces without a target.
 # If any brace has a target, forces minimise Σ compliance (f_n − near)² instead of the heat.
 NEAR, COMPLIANCE = 17, 18
 BRACE_SIZE = 19
-# BraceArrays.motors: a torque source has K_m = 1 and no resistance, a joint without a motor K_m = 1 and no current
+# BraceArrays.motors: a torque source has K_m = 1 and no resistance; a joint without a motor has K_m = 1 and no current
 HEAT = 0  # w = R / K_m² [W/(N m)²]
 LOWER = 1  # torque limits at the present joint rate [N m], infinite for none; both zero without a motor
 UPPER = 2
@@ -96,14 +97,14 @@ def brace_arrays(link: np.ndarray, motors: np.ndarray) -> BraceArrays:
     )
 
 
-# Tolerance of the largest margin to the constraints, as a fraction of the force scale [1]: below −SLACK there is no
-# solution, within ±SLACK the solution has no interior.
+# Tolerance of the largest margin to the constraints, as a fraction of the force scale [1]. Below −SLACK, no solution
+# exists; within ±SLACK, the set of solutions has no interior.
 SLACK = 1e-9
-# If all torques keep this distance from their limits, as a fraction of the force scale, the margin is not maximised.
+# If all torques are at least this far from their limits, as a fraction of the force scale, the margin is not maximised.
 AMPLE = 1e-6
-# An interval is open if forces of this multiple of the force scale are still possible.
+# An interval counts as unbounded if forces of this multiple of the force scale are still possible.
 FAR = 1e4
-# Weight of the forces in the objective, in addition to the heat: keeps forces finite that do not load any motor.
+# Weight of the forces in the objective, in addition to the heat; it keeps forces that do not load any motor finite.
 LEAST_WEIGHT = 1e-14
 
 
@@ -131,11 +132,11 @@ def brace_motion(model: ModelArrays, ws: Workspace, braces: BraceArrays, q, v, p
 def brace_statics(
     model: ModelArrays, ws: Workspace, braces: BraceArrays, q, v, vdot, tables, torques, normal, intervals
 ):
-    """Compute forces of least heat along a motion; the last forces, and intervals if requested, go to ``braces``.
+    """Compute the forces of least heat along a motion; write the last forces and the requested intervals to ``braces``.
 
-    Returns the number of instants with a solution: it stops at the first instant at which no forces fulfil all
-    constraints. Then ``certificate`` is a vector ω (n,) of joint rates that proves it: for all torques within their
-    limits and all forces of the braces, ω·(tau + Bᵀ f) < ω·free, although both sides would have to be equal.
+    Returns the number of instants with a solution: the computation stops at the first instant at which no forces
+    satisfy all constraints. Then ``certificate`` is a vector ω (n,) of joint rates that proves it: for all torques
+    within their limits and all admissible brace forces, ω·(tau + Bᵀ f) < ω·free, although a solution requires equality.
 
     Parameters
     ----------
@@ -188,7 +189,10 @@ def torque_limits(braces: BraceArrays, ws: Workspace):
 
 @internal_kernel
 def least_heat_forces(model: ModelArrays, ws: Workspace, braces: BraceArrays, intervals):
-    """Write torques, forces and intervals of one instant to ``braces``; without a solution, a certificate and False."""
+    """Write the torques, forces and intervals of one instant to ``braces``; return whether a solution exists.
+
+    Without a solution, a certificate is written instead.
+    """
     results, table, motors = braces.results, braces.table, braces.motors
     c, n, first, x = braces.link.shape[0], braces.free.shape[0], braces.first, braces.program.x
     scale = brace_rows(model, ws, braces)
@@ -199,14 +203,14 @@ def least_heat_forces(model: ModelArrays, ws: Workspace, braces: BraceArrays, in
         limited |= not (math.isinf(motors[j, LOWER]) and math.isinf(motors[j, UPPER]))
     best = False
     if passive == 0:
-        # The optimum without limits is also the optimum with limits if it keeps them, as in most cases.
+        # An optimum without limits that satisfies the limits is also the optimum with limits, as in most cases.
         equations, cones = constraints(braces, scale, False, False)
         middle_forces(braces, scale)
         least_heat(braces, unknowns, equations, cones, scale)
         keep(braces, scale)
         best = not limited or ample(braces, scale)
     if limited and (intervals or not best):
-        # Contradictory equations have no margin: first allow the torques of passive joints to be off.
+        # Contradictory equations have no margin. First relax them: allow nonzero torques at passive joints.
         if passive > 0:
             equations, cones = constraints(braces, scale, True, True)
             if largest_margin(braces, equations, cones, scale) < -SLACK:
@@ -241,7 +245,7 @@ def least_heat_forces(model: ModelArrays, ws: Workspace, braces: BraceArrays, in
 
 @internal_kernel
 def keep(braces: BraceArrays, scale):
-    """Write torques and forces of the unknowns x to ``braces``."""
+    """Write the torques and forces that result from the unknowns x to ``braces``."""
     for j in range(braces.free.shape[0]):
         torque = braces.free[j]
         for k in range(braces.first[braces.link.shape[0]]):
@@ -272,7 +276,7 @@ def brace_forces(braces: BraceArrays, k, scale):
 
 @internal_kernel
 def ample(braces: BraceArrays, scale):
-    """Return whether all torques keep ample distance from their limits."""
+    """Return whether all torques are at an ample distance from their limits."""
     for j in range(braces.free.shape[0]):
         torque, room = braces.torques[j], AMPLE * scale
         if torque - braces.motors[j, LOWER] < room or braces.motors[j, UPPER] - torque < room:
@@ -293,7 +297,7 @@ def middle_forces(braces: BraceArrays, scale):
 
 @internal_kernel
 def largest_margin(braces: BraceArrays, equations, cones, scale):
-    """Find a point x inside all constraints; return the worst margin there, the largest possible, at most 1."""
+    """Find the point x inside the constraints with the best worst-case margin; return this margin, at most 1."""
     middle_forces(braces, scale)
     unknowns = braces.first[braces.link.shape[0]]
     return maximise_margin(braces.program, unknowns, equations, cones, 1.0, LEAST_WEIGHT)
@@ -301,7 +305,7 @@ def largest_margin(braces: BraceArrays, equations, cones, scale):
 
 @internal_kernel
 def brace_rows(model: ModelArrays, ws: Workspace, braces: BraceArrays):
-    """Compute the torques without the unknown forces, and the rows B of these forces; return a force scale [N]."""
+    """Compute the torques without the unknown forces, and the rows B for these forces; return a force scale [N]."""
     newton_euler(model, ws, 1.0, 1.0, 1.0)
     table, B, jacobian, first, n = braces.table, braces.B, braces.jacobian, braces.first, braces.free.shape[0]
     torque, lever, scale = 0.0, 0.0, 1e-3
@@ -337,16 +341,16 @@ def brace_rows(model: ModelArrays, ws: Workspace, braces: BraceArrays):
 
 @internal_kernel
 def along(table, jacobian, k, j, e):
-    """Return the velocity of the point of brace k along its axis e per unit of rate j."""
+    """Return the velocity of brace k's point along axis e of the brace per unit rate j."""
     at = AXES + 3 * e
     return table[k, at] * jacobian[0, j] + table[k, at + 1] * jacobian[1, j] + table[k, at + 2] * jacobian[2, j]
 
 
 @internal_kernel
 def constraints(braces: BraceArrays, scale, limits, relaxed):
-    """Set up equations and cones in the forces divided by ``scale``; return their numbers.
+    """Set up the equations and cones for the forces divided by ``scale``; return their numbers.
 
-    ``limits`` includes the torque limits; with ``relaxed``, passive joints are in cones instead of equations.
+    With ``limits``, the torque limits are included. With ``relaxed``, passive joints have cones instead of equations.
     """
     program, table, B, motors = braces.program, braces.table, braces.B, braces.motors
     A, b, G, h, first = program.A, program.b, program.G, program.h, program.first
@@ -370,7 +374,7 @@ def constraints(braces: BraceArrays, scale, limits, relaxed):
                 G[rows, k] = mu
             G[rows + 1, tangents], G[rows + 2, tangents + 1], G[rows, unknowns] = 1.0, 1.0, -1.0
             rows, cones = rows + 3, cones + 1
-    # Torques in units of the force scale.
+    # The torques are in units of the force scale.
     for j in range(n if limits else 0):
         low, high = motors[j, LOWER], motors[j, UPPER]
         if low == high and not relaxed:
@@ -394,9 +398,9 @@ def constraints(braces: BraceArrays, scale, limits, relaxed):
 
 @internal_kernel
 def contradiction(braces: BraceArrays, equations, cones, relaxed):
-    """Write multipliers of the torques, as joint rates, from the multipliers of a negative best margin."""
+    """Write the certificate: the multipliers of the torques at a negative best margin, as joint rates."""
     program, motors = braces.program, braces.motors
-    # Torques are the last equations and the last cones: loop backwards.
+    # The torques are the last equations and the last cones, so loop backwards.
     e, i = equations - 1, program.first[cones] - 1
     for j in range(braces.free.shape[0] - 1, -1, -1):
         low, high = motors[j, LOWER], motors[j, UPPER]
@@ -448,7 +452,7 @@ def possible_with_least(braces: BraceArrays, j):
 
 @internal_kernel
 def least_heat(braces: BraceArrays, unknowns, equations, cones, scale):
-    """Find the forces of least heat in units of ``scale`` (H = B w Bᵀ, g = −B w free), or forces nearest to targets."""
+    """Find the forces of least heat, or nearest to targets, in units of ``scale`` (H = B w Bᵀ, g = −B w free)."""
     program, B, motors, n = braces.program, braces.B, braces.motors, braces.free.shape[0]
     clear_objective(program, unknowns, LEAST_WEIGHT)
     largest = 0.0

@@ -1,9 +1,9 @@
-"""Small dense second-order-cone programs: interior-point solver, and selection of indeterminate contact forces.
+"""Small dense second-order cone programs: interior-point solver, and selection of indeterminate contact forces.
 
     minimise ½ xᵀ H x + gᵀ x   subject to   A x = b,   s = G x + h ∈ K
 
-K is a product of cones {(s_0, s_1): |s_1| ≤ s_0} of any sizes; a cone of size 1 is s_0 ≥ 0. A primal–dual
-interior-point method with Nesterov–Todd scaling and Mehrotra's corrector (as in coneqp of CVXOPT), for a dozen
+K is a product of cones {(s_0, s_1): |s_1| ≤ s_0} of any sizes; a cone of size 1 is s_0 ≥ 0. The solver is a primal–dual
+interior-point method with Nesterov–Todd scaling and Mehrotra's corrector (as in coneqp of CVXOPT), for about a dozen
 unknowns. H must be positive semidefinite; A may have dependent rows. x is optimal if there are multipliers y and
 z ∈ K with
 
@@ -24,21 +24,24 @@ from dynsim.dynamics.linear import affine_row, factor_symmetric, solve_symmetric
 from dynsim.jit.kernel import integers, internal_kernel, kernel, reals
 
 ITERATIONS = 60
-# Tolerance of the optimality conditions for a program scaled to numbers near 1: rounding of some dozen operations.
+# Tolerance of the optimality conditions for a program scaled to numbers near 1; a few dozen operations round this much.
 TOLERANCE = 1e-13
-# Complementarity gap at which the iteration ends: smaller gaps are lost in double precision.
+# Complementarity gap at which the iteration ends, because double precision cannot resolve smaller gaps.
 GAP_MIN = 1e-16
 # Below CLOSE, the iteration ends after PATIENCE steps that do not halve the residual.
 CLOSE, PATIENCE = 1e-9, 2
 # Regularisation of the Newton system along undetermined directions; the optimum is unchanged.
 REGULAR = 1e-13
-# Fraction of the distance to the boundary of the cones that a step leaves. With a hundredth of it, steps end off the
-# central path, at the edge of a cone, and the next steps creep along that edge.
+# Fraction of the distance to the boundary of the cones that remains after a step. With a hundredth of this value, steps
+# end away from the central path, at the edge of a cone, and the next steps creep along that edge.
 ASIDE = 2e-2
 
 
 class ConeProgram(NamedTuple):
-    """Data, solution and scratch of a program; smaller programs use leading parts. S is the sum of cone sizes."""
+    """Data, solution and scratch arrays of a program. S is the sum of the cone sizes.
+
+    Smaller programs use the leading parts of the arrays.
+    """
 
     H: np.ndarray  # (n, n)
     g: np.ndarray  # (n,)
@@ -46,8 +49,8 @@ class ConeProgram(NamedTuple):
     b: np.ndarray  # (m,)
     G: np.ndarray  # (S, n)
     h: np.ndarray  # (S,)
-    first: np.ndarray  # (cones + 1,) int: start of each cone in s, and the end
-    x: np.ndarray  # (n,) start and solution
+    first: np.ndarray  # (cones + 1,) int: start of each cone in s, and end of the last cone
+    x: np.ndarray  # (n,) initial point, then solution
     y: np.ndarray  # (m,)
     s: np.ndarray  # (S,)
     z: np.ndarray  # (S,)
@@ -76,7 +79,9 @@ def program_size(n: int, m: int, cones: int, rows: int) -> int:
 
 @internal_kernel
 def program_in(flat, first, n, m, cones, rows):
-    """Return a :class:`ConeProgram` in one array: a table of many arrays would be passed through every function.
+    """Return a :class:`ConeProgram` whose arrays are views of one array.
+
+    Many separate arrays would have to be passed through every function.
 
     Parameters
     ----------
@@ -117,10 +122,11 @@ def piece(flat, start, rows, columns):
 
 @kernel
 def solve_cone_program(program: ConeProgram, n, m, cones):
-    """Solve the leading n unknowns, m equations and ``cones`` cones from ``program.x``, where all s must be inside.
+    """Solve the program of the leading n unknowns, m equations and ``cones`` cones, starting from ``program.x``.
 
-    Solution and multipliers are left in x, y, s and z. Returns the largest residual of the optimality conditions,
-    including s · z; for numbers near 1 it is the relative error of the optimum.
+    All s must be inside their cones at the start. The solution and the multipliers are left in x, y, s and z. Returns
+    the largest residual of the optimality conditions, including s · z; for numbers near 1, it is the relative error of
+    the optimum.
     """
     x, y, s, z, first = program.x, program.y, program.s, program.z, program.first
     work, step = program.work, program.step
@@ -133,7 +139,7 @@ def solve_cone_program(program: ConeProgram, n, m, cones):
         for i in range(rows):
             gap += s[i] * z[i]
         gap = gap / cones if cones > 0 else 1.0
-        # Close to the boundary of the cones, rounding (or NaN) ends the progress.
+        # Close to the boundary of the cones, rounding (or NaN) prevents further progress.
         since += 1
         if error < least:
             if error < 0.5 * least:
@@ -145,7 +151,7 @@ def solve_cone_program(program: ConeProgram, n, m, cones):
         scale_cones(program, cones)
         factor_kkt(program, n, m, rows, cones)
 
-        # Predictor: a full step to complementarity.
+        # The predictor is a full step towards complementarity.
         for c in range(cones):
             jordan(work, LAMBDA, LAMBDA, TARGET, first[c], first[c + 1], -1.0, 0.0)
         newton_step(program, n, m, cones)
@@ -172,7 +178,7 @@ def solve_cone_program(program: ConeProgram, n, m, cones):
 
 @internal_kernel
 def keep(program: ConeProgram, n, m, cones, store):
-    """Store the present unknowns, or restore the stored values."""
+    """Store the current unknowns, or restore the stored values."""
     kept, rows = program.kept, program.first[cones]
     position = 0
     for table, size in ((program.x, n), (program.y, m), (program.s, rows), (program.z, rows)):
@@ -262,7 +268,7 @@ def scale_cones(program: ConeProgram, cones):
 
 @internal_kernel
 def hyperbolic(u, a, end):
-    """Return √(u_0² − |u_1|²) of the cone's part of u."""
+    """Return √(u_0² − |u_1|²) for the part of u in the cone from a to end."""
     square = 0.0
     for i in range(a + 1, end):
         square += u[i] * u[i]
@@ -285,10 +291,10 @@ def unscale(program: ConeProgram, c, u):
 
 @internal_kernel
 def factor_kkt(program: ConeProgram, n, m, rows, cones):
-    """Factor [H + Gᵀ W⁻² G + Aᵀ A, Aᵀ; A, 0] = L D Lᵀ, regularised; D on the diagonal, L below it.
+    """Factor the regularised matrix [H + Gᵀ W⁻² G + Aᵀ A, Aᵀ; A, 0] = L D Lᵀ; D is on the diagonal, L below it.
 
-    Aᵀ A, which the right-hand side compensates, gives pivots to unknowns that only the equations determine.
-    An equation that depends on the preceding ones gets a pivot that suppresses its multiplier.
+    The term Aᵀ A, which the right-hand side compensates, provides pivots for unknowns that only the equations
+    determine. An equation that depends on the preceding ones gets a pivot that suppresses its multiplier.
     """
     kkt, scaled = program.kkt, program.scaled
     column = program.work[TARGET]
@@ -318,7 +324,7 @@ def factor_kkt(program: ConeProgram, n, m, rows, cones):
 
 @internal_kernel
 def newton_step(program: ConeProgram, n, m, cones):
-    """Compute the step of all unknowns for λ ∘ (W dz + W⁻¹ ds) = TARGET, which is overwritten."""
+    """Compute the Newton step of all unknowns for λ ∘ (W dz + W⁻¹ ds) = TARGET; TARGET is overwritten."""
     work, step, first = program.work, program.step, program.first
     z, rows = program.z, first[cones]
     target, ds, dz = work[TARGET], work[DS], work[DZ]
@@ -353,7 +359,7 @@ def newton_step(program: ConeProgram, n, m, cones):
 
 @internal_kernel
 def jordan(work, u, v, out, a, end, factor, keep):
-    """Set row ``out`` to keep times itself plus factor (u · v, u_0 v_1 + v_0 u_1), in the cone from a to end."""
+    """Set row ``out`` to ``keep`` times itself plus ``factor`` (u · v, u_0 v_1 + v_0 u_1), in the cone a to end."""
     product = 0.0
     for i in range(a, end):
         product += work[u, i] * work[v, i]
@@ -365,7 +371,7 @@ def jordan(work, u, v, out, a, end, factor, keep):
 
 @internal_kernel
 def divide(work, u, out, a, end):
-    """Replace row ``out`` by the r with u ∘ r = out, in the cone from a to end."""
+    """Replace row ``out`` by the vector r with u ∘ r = out, in the cone from a to end."""
     along = 0.0
     for i in range(a + 1, end):
         along += work[u, i] * work[out, i]
@@ -431,7 +437,7 @@ def longest_step(program: ConeProgram, cones):
 @internal_kernel
 def exit_distance(u, du, a, end):
     """Return the smallest α > 0 at which u + α du leaves the cone; infinite if it never does."""
-    # At most to the height of the apex: on a line through the apex itself, rounding hides the double root below.
+    # Go no further than the height of the apex: on a line through the apex, rounding hides the double root found below.
     apex = -u[a] / du[a] if du[a] < 0.0 else math.inf
     if end == a + 1:
         return apex
@@ -447,14 +453,14 @@ def exit_distance(u, du, a, end):
     return min(constant / below, apex) if below > 0.0 else apex
 
 
-# Split of forces among redundant sticking contacts by cone programs: least norm in the cones, or largest margin.
+# Split of forces among redundant sticking contacts by cone programs: least norm within the cones, or largest margin.
 
 
-# Weight of |z|² in the objective of the margin: makes the best split unique if the margin alone does not.
+# Weight of |z|² in the objective of the margin; it makes the best split unique if the margin alone does not.
 LEAST_WEIGHT = 1e-13
-# Bound on the margin, in units of the largest given force: two walls pressed apart have no largest margin.
+# Bound on the margin, in units of the largest given force; for a body wedged between two walls the margin is unbounded.
 MARGIN_MAX = 10.0
-# Tolerance in units of the largest force: for tangential forces without friction, and for cones that meet in a point.
+# Tolerance, in units of the largest force, for tangential forces without friction and for cones that meet in a point.
 FORCE_TOLERANCE = 1e-9
 
 
@@ -476,10 +482,10 @@ def split_room_in(flat, first, r, count):
 
 @kernel
 def best_split(f0, N, r, contact_first, mu, contacts, joints, out, room: ConeProgram, least):
-    """Split forces f = f0 + N z of redundant sticking contacts: inside all cones if possible, then with least norm.
+    """Find the split f = f0 + N z of redundant sticking contacts: inside all cones if possible, then with least norm.
 
     The best margin is max_z min_j (μ_j f_n,j − |f_t,j|). If it is negative, no split holds all contacts. A contact
-    without friction cannot carry a tangential force: its force is set to zero if possible, and its margin is f_n,j.
+    without friction cannot carry a tangential force: this force is set to zero if possible, and the margin is f_n,j.
 
     Parameters
     ----------
@@ -488,17 +494,17 @@ def best_split(f0, N, r, contact_first, mu, contacts, joints, out, room: ConePro
     N : (p or more, r or more) ndarray
         Directions in which they can be split differently; r columns are used.
     contact_first : (contacts + joints or more,) ndarray of int
-        Normal row of each sticking contact, followed by its tangential rows, then for the ``joints`` the row of each
-        joint held by dry friction and of each closed joint stop.
+        Normal row of each sticking contact, which is followed by its tangential rows; then, for the ``joints``, the row
+        of each joint held by dry friction and of each closed joint stop.
     mu : (contacts + joints or more,) ndarray
-        Static friction; for joints the bound of their force, whose margin is μ_j − |f_j|; negative for a stop, whose
-        margin is its force f_j.
+        Static friction of a contact. For a joint held by dry friction: the bound of its force, with the margin
+        μ_j − |f_j|. For a stop: a negative number, with the margin f_j.
     out : (p or more,) ndarray
-        Force of least norm in all cones; if no force is in all cones, the force of the best margin.
+        Force of least norm in all cones; if no force is in all cones, the force with the best margin.
     room : ConeProgram
         Scratch of :func:`split_sizes`.
     least : bool
-        False: always the split of the best margin.
+        If False, always return the split with the best margin.
 
     Returns
     -------
@@ -543,7 +549,7 @@ def best_split(f0, N, r, contact_first, mu, contacts, joints, out, room: ConePro
         margin = min(margin, -error)
 
     if least and margin > FORCE_TOLERANCE:
-        # The cones have an interior: find the least force, from the point found.
+        # The cones have an interior: find the force of least norm, starting from the point found.
         for k in range(r):
             room.g[k] = 0.0
             for i in range(p):
@@ -587,26 +593,26 @@ def force_row(f0, N, r, i, factor, scale, room: ConeProgram, row, by_margin):
     room.G[row, r], room.h[row] = by_margin, factor * f0[i] / scale
 
 
-# Selection of indeterminate contact forces: towards least norm, within the friction cones.
+# Selection of indeterminate contact forces: as close to least norm as the friction cones allow.
 
 
 # Blocks of the scratch ``room``: G, its factor, columns S (coefficients on the rows of their block), then vectors.
 MATRIX, FACTOR, COLUMNS, NOW, GOAL, RIGHT, PIVOT, ROW, SIZE = 0, 1, 2, 3, 4, 5, 6, 7, 8
-# A row that separates faster than this has no force; slip slower than this has no direction, and neither has a force
-# that changes the rate of its row by less [m/s].
+# Speed [m/s]: a row that separates faster has no force, slower slip has no direction, and a force that changes the rate
+# of its row by less has no direction either.
 STILL = 1e-9
 # G is singular if a pivot is below SINGULAR times the mean of its diagonal. The projection adds SHIFT times that mean
 # to the diagonal; each refinement multiplies the error by about SHIFT.
 SINGULAR, SHIFT, REFINEMENTS = 1e-10, 1e-6, 4
-# Bisections of the step to a cone; share of the largest force that may be outside it.
+# Number of bisections of the step to a cone; fraction of the largest force by which a force may be outside its cone.
 HALVINGS, ROUNDING = 50, 1e-12
 
 
 @internal_kernel
 def select_least_norm(W, w, kind, mu, p, f, room):
-    """Move the forces f, (p,), with the motion w = W f + b towards their least norm. Uses ``room``, (CONE_ROOM, p, p).
+    """Move the forces f, (p,), towards their least norm without changing the motion w = W f + b.
 
-    Leaves f unchanged if it is unique.
+    f remains unchanged if it is unique. ``room`` is scratch, (CONE_ROOM, p, p).
     """
     n = changeable(W, w, kind, mu, p, f, room)
     if n < 2:
@@ -628,7 +634,8 @@ def select_least_norm(W, w, kind, mu, p, f, room):
     if not trace > 0.0 or factor_shifted(G, L, n, 0.0) > SINGULAR * trace / n:
         return
     factor_shifted(G, L, n, SHIFT * trace / n)
-    # x = (G + ε)⁻¹ G x₀, refined: the error outside the range of G stays zero, inside it falls by ε each time.
+    # x = (G + ε)⁻¹ G x₀, refined iteratively: the error outside the range of G stays zero; the error within it falls by
+    # a factor of about ε each time.
     for i in range(n):
         goal[i] = 0.0
     for _ in range(1 + REFINEMENTS):
@@ -672,7 +679,7 @@ def select_least_norm(W, w, kind, mu, p, f, room):
 
 @internal_kernel
 def changeable(W, w, kind, mu, p, f, room):
-    """Write the columns S of rows whose forces may change, with first row and size; return their number."""
+    """Write the columns S for rows whose forces may change, with their first rows and sizes; return their number."""
     S, row, size = room[COLUMNS], room[ROW, 0], room[SIZE, 0]
     n, k = 0, 0
     while k < p:
@@ -721,14 +728,14 @@ def factor_shifted(G, L, n, shift):
 
 @internal_kernel
 def inside(mu, n, room, share, slack):
-    """True if the forces at the fraction ``share`` from NOW to GOAL are in their cones."""
+    """Return whether the forces at the fraction ``share`` of the way from NOW to GOAL are in their cones."""
     now, goal, row, size = room[NOW, 0], room[GOAL, 0], room[ROW, 0], room[SIZE, 0]
     i = 0
     while i < n:
         normal = now[i] + share * (goal[i] - now[i])
         if normal < -slack:
             return False
-        # Three consecutive columns of one row each: a sticking point.
+        # Three consecutive columns with one row each belong to a sticking point.
         sticks = size[i] == 1.0 and i + 2 < n and row[i + 1] == row[i] + 1.0 and mu[int(row[i])] > 0.0
         if sticks:
             x = now[i + 1] + share * (goal[i + 1] - now[i + 1])

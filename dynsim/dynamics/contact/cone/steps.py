@@ -1,7 +1,7 @@
-"""Contact problem with bilateral and unilateral rows, Coulomb cones and dry joint friction, unsmoothed: its solver.
+"""Solver of the contact problem with bilateral and unilateral rows, Coulomb cones and dry friction without smoothing.
 
-First the steps (residual, Newton step, block Gauss–Seidel sweep) and the layout of the scratch array ``room``, then the
-solver itself.
+The first part of the file contains the steps (residual, Newton step, block Gauss–Seidel sweep) and the layout of the
+scratch array ``room``; the second part contains the solver itself.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from dynsim.jit.kernel import internal_kernel, kernel
 
 BOTH_WAYS, ONE_WAY, CONE, TANGENT, BOX = 0, 1, 2, 3, 4
 
-# Blocks of the scratch: two matrices, then vectors in first rows.
+# Blocks of the scratch array: two matrices, then vectors, each in the first row of its block.
 MATRIX, SHIFTED = 0, 1
 MOTION, MOBILITY, RIGHT, STATUS, FIRST, SECOND, BETA = 2, 3, 4, 5, 6, 7, 8
 BEST, SWEPT, START, GOAL = 9, 10, 11, 12
 SHIFTED_RIGHT, KEPT, LAST, ANCHOR, PROOF, NO_FRICTION, KNOWN = 13, 14, 15, 16, 17, 18, 19
 CONE_ROOM = 20
-# STATUS of a block, at its first row: no force, u = 0, sliding, at the bound FIRST.
+# STATUS of a block, stored at its first row: no force; held with u = 0; sliding; at the bound FIRST.
 OFF, HOLDS, SLIDES, CLAMPED = 0.0, 1.0, 2.0, 3.0
 # The proximal term is PROXIMAL_FACTOR times the relative residual, at least LEAST_PROXIMAL, which is above rounding.
 PROXIMAL_FACTOR, LEAST_PROXIMAL = 1e3, 1e-11
@@ -52,7 +52,7 @@ def mobilities(W, kind, p, room):
         total = 0.0
         for i in range(size):
             total += abs(W[k + i, k + i])
-        # An immobile row gets some mobility, so that quotients stay finite.
+        # An immobile row gets a small mobility, so that quotients stay finite.
         total = max(total / size, 1e-14 * largest, 1e-300)
         for i in range(size):
             mobility[k + i] = total
@@ -100,17 +100,17 @@ def bounded(x, bound):
 
 @internal_kernel
 def newton_step(W, b, kind, mu, p, f, room, relative, most):
-    """Take one Newton step of f, from u of f in ``room[MOTION, 0]``.
+    """Take one Newton step of f, given its motion u in ``room[MOTION, 0]``.
 
     Blocks that are off (z_n = w f_n − u_n ≤ 0) get f = 0 and have no unknown. BOX rows with |z| ≥ w μ have no unknown
-    either; their bound goes to the right-hand side of all rows. The others have u_n' = 0, and u_t' = 0 if
-    z_t = w f_t − u_t is inside the disc of radius μ z_n. Outside, along d = z_t / |z_t| and e across it,
+    either; their bound goes to the right-hand side of all rows. The other blocks have u_n' = 0, and u_t' = 0 if
+    z_t = w f_t − u_t is inside the disc of radius μ z_n. Outside the disc, with d = z_t / |z_t| and e normal to it,
 
         d·f_t' = μ f_n',    (1 − β) w e·f_t' + β e·u_t' = 0,    β = μ z_n / |z_t|,
 
-    so that such a block has the unknowns f_n and e·f_t. Rows n, e of the motion and columns n + μ d, e of the force
-    make the matrix. Each row gets a proximal term, w times a fraction of up to ``most`` that falls with the
-    ``relative`` residual.
+    so that such a block has the unknowns f_n and e·f_t. The matrix consists of the rows n and e of the motion and the
+    columns n + μ d and e of the force. Each row gets a proximal term: w times a fraction, at most ``most``, that falls
+    with the ``relative`` residual.
     """
     mobility, A, x = room[MOBILITY, 0], room[MATRIX], room[RIGHT, 0]
     status, first, second, beta = room[STATUS, 0], room[FIRST, 0], room[SECOND, 0], room[BETA, 0]
@@ -120,7 +120,7 @@ def newton_step(W, b, kind, mu, p, f, room, relative, most):
     copy(b, known, p)
     m = 0
     while m < p:
-        # STATUS is written at the first row of a block only: tangents have values left by another problem.
+        # STATUS is only written at the first row of a block; tangents have values left over from another problem.
         if status[m] == CLAMPED:
             for k in range(p):
                 known[k] += W[k, m] * first[m]
@@ -171,7 +171,7 @@ def newton_step(W, b, kind, mu, p, f, room, relative, most):
 
 @internal_kernel
 def find_statuses(kind, mu, p, f, room):
-    """Set STATUS of each block; for sliding blocks FIRST, SECOND = d and BETA; at a bound FIRST."""
+    """Set STATUS of each block, FIRST, SECOND = d and BETA of sliding blocks, and FIRST of blocks at a bound."""
     u, mobility = room[MOTION, 0], room[MOBILITY, 0]
     status, first, second, beta = room[STATUS, 0], room[FIRST, 0], room[SECOND, 0], room[BETA, 0]
     k = 0
@@ -216,7 +216,7 @@ def fill_row(W, kind, mu, p, i, j, alpha, gamma, room, r):
 
 @internal_kernel
 def sweep(W, b, kind, mu, p, f, room):
-    """Do one sweep of block Gauss–Seidel: each block solved exactly with the other forces fixed."""
+    """Do one block Gauss–Seidel sweep: solve each block exactly with the other forces fixed."""
     mobility = room[MOBILITY, 0]
     k = 0
     while k < p:
@@ -238,11 +238,11 @@ def sweep(W, b, kind, mu, p, f, room):
 
 @internal_kernel
 def solve_block(W, k, n, x, y, mu, f, least):
-    """Return the forces of the block at row k alone, whose motion without them is (n, x, y).
+    """Return the forces of the single block at row k; its motion without these forces is (n, x, y).
 
-    Off if n ≥ 0. Otherwise u_n = 0 makes f_n = −(n + w·f_t) / W_nn, which leaves (S + α) f_t = g with the Schur
-    complement S of W_nn, g = w n / W_nn − (x, y). It sticks if α = 0 is in the cone; otherwise α is the root of
-    |f_t| − μ f_n, which is positive at 0 and negative for large α.
+    The block is off if n ≥ 0. Otherwise u_n = 0 gives f_n = −(n + w·f_t) / W_nn, which leaves (S + α) f_t = g with the
+    Schur complement S of W_nn and g = w n / W_nn − (x, y). The block sticks if the force for α = 0 is in the cone;
+    otherwise α is the root of |f_t| − μ f_n, which is positive at α = 0 and negative for large α.
     """
     f[k], f[k + 1], f[k + 2] = 0.0, 0.0, 0.0
     normal = W[k, k]
@@ -289,7 +289,7 @@ def solve_block(W, k, n, x, y, mu, f, least):
 
 @internal_kernel
 def sliding_force(a, c, d, gx, gy, wx, wy, n, mu, alpha):
-    """Return (f_n, f_t, |f_t| − μ f_n) of ((a, c), (c, d)) + α."""
+    """Return f_n, f_t and |f_t| − μ f_n for the matrix ((a, c), (c, d)) + α."""
     determinant = (a + alpha) * (d + alpha) - c * c
     fx = ((d + alpha) * gx - c * gy) / determinant
     fy = ((a + alpha) * gy - c * gx) / determinant
@@ -303,15 +303,17 @@ def sliding_force(a, c, d, gx, gy, wx, wy, n, mu, alpha):
 # Return value of ``solve_cones`` instead of a residual if there is provably no solution.
 NO_SOLUTION = -1.0
 
-# Newton steps from one start; the first are full steps, the others are shortened until they reduce the merit.
+# Number of Newton steps from one start; the first FULL_STEPS are full steps, and later steps are halved up to HALVINGS
+# times until they reduce the merit.
 NEWTON_STEPS, FULL_STEPS, HALVINGS = 20, 6, 8
-# Total number of starts; sweeps per start (times its number); and number of starts after which this count restarts.
+# Total number of starts; sweeps per start, multiplied by the number of the start; number of starts after which this
+# multiplier begins again.
 ROUNDS, SWEEPS, SWEPT_ROUNDS = 200, 10, 40
-# Starts before a proof is tried, and for each problem of the proof.
+# Number of starts before a proof is tried, and for each problem in the proof.
 FEW_ROUNDS = 8
 # Proximal-point method: number of steps, first and smallest ε.
 NEAR_STEPS, FIRST_EPSILON, LEAST_EPSILON = 60, 1e-3, 1e-9
-# A proof covers all forces up to this times |b| / mobility; its problem is regularised by the second number.
+# A proof covers all forces up to PROVED_FORCE times |b| / mobility; its problem is regularised by PROOF_SHIFT.
 PROVED_FORCE, PROOF_SHIFT, PROOF_STEPS = 1e6, 1e-6, 4
 
 
@@ -319,28 +321,29 @@ PROVED_FORCE, PROOF_SHIFT, PROOF_STEPS = 1e6, 1e-6, 4
 def solve_cones(W, b, kind, mu, p, f, room, tolerance):
     """Solve a contact problem for the forces f; return its residual, or NO_SOLUTION.
 
-    The residual is the largest error of a block in the units of u, by the natural map with the block's own mobility w
-    (the mean of its diagonal entries): |u| for BOTH_WAYS, |min(w f, u)| for ONE_WAY and normals, and
-    |w f_t − P(w f_t − u_t)| for tangents, with the projection P on the disc of radius μ w f_n; the same for BOX rows,
-    with the projection on ±μ w. It is zero exactly at solutions; nothing in it is regularised. A residual above
-    ``tolerance`` means that no better f was found.
+    The residual is the largest error of a block in the units of u, measured by the natural map with the block's own
+    mobility w (the mean of its diagonal entries): |u| for BOTH_WAYS, |min(w f, u)| for ONE_WAY and normals, and
+    |w f_t − P(w f_t − u_t)| for tangents, with the projection P onto the disc of radius μ w f_n. BOX rows have the same
+    error as tangents, with the projection onto ±μ w. The residual is zero only at solutions, and no term in it is
+    regularised. A residual above ``tolerance`` means that no better f was found.
 
     Parameters
     ----------
     W, b : (p or more, p or more) ndarray, (p or more,) ndarray
-        Need not be symmetric in ONE_WAY columns, and may be rank-deficient.
+        Matrix and vector of the motion u = W f + b. W need not be symmetric in ONE_WAY columns, and may be
+        rank-deficient.
     kind : (p,) ndarray of int
         BOTH_WAYS, ONE_WAY, CONE, TANGENT or BOX.
     mu : (p,) ndarray
         Friction coefficients at CONE rows, bounds of the forces at BOX rows, possibly infinite.
     f : (p,) ndarray
-        Start, overwritten by the solution or the best forces found.
+        Initial forces, overwritten with the solution or the best forces found.
     room : (CONE_ROOM, p or more, p or more) ndarray
         Scratch.
     tolerance : float
-        Sufficient residual [units of u].
+        Residual at which the search ends [units of u].
     """
-    if p == 0:  # without possible contacts there is no scratch either
+    if p == 0:  # without possible contacts, no scratch is allocated either
         return 0.0
     residual = approach_or_proximal_point(W, b, kind, mu, p, f, room, tolerance, FEW_ROUNDS)
     if residual <= tolerance:
@@ -352,7 +355,7 @@ def solve_cones(W, b, kind, mu, p, f, room, tolerance):
 
 @internal_kernel
 def approach_or_proximal_point(W, b, kind, mu, p, f, room, tolerance, rounds):
-    """Do :func:`solve_cones` without a proof: one start, then :func:`proximal_point`, then up to ``rounds`` starts."""
+    """Solve as :func:`solve_cones` without a proof: one start, :func:`proximal_point`, then up to ``rounds`` starts."""
     residual = approach(W, b, kind, mu, p, f, room, tolerance, 1)
     if not residual <= tolerance:
         residual = proximal_point(W, b, kind, mu, p, f, room, tolerance)
@@ -363,7 +366,7 @@ def approach_or_proximal_point(W, b, kind, mu, p, f, room, tolerance, rounds):
 
 @internal_kernel
 def approach(W, b, kind, mu, p, f, room, tolerance, rounds):
-    """Do :func:`solve_cones` by Newton's method from up to ``rounds`` starts: f, then swept and scattered ones."""
+    """Solve as :func:`solve_cones` by Newton's method from up to ``rounds`` starts: f, then swept or random forces."""
     best, swept, mobility = room[BEST, 0], room[SWEPT, 0], room[MOBILITY, 0]
     mobilities(W, kind, p, room)
     residual, merit = measure(W, b, kind, mu, p, f, room)
@@ -386,10 +389,10 @@ def approach(W, b, kind, mu, p, f, room, tolerance, rounds):
             if not scattered:
                 copy(f, swept, p)
             residual, merit = measure(W, b, kind, mu, p, f, room)
-        # A value too small for some problems is too large for others.
+        # Alternate between values: a value that is too small for some problems is too large for others.
         most = 1e-6 if attempt % 6 < 2 else 1e-3 if attempt % 6 < 4 else 1e-9
         for step in range(NEWTON_STEPS + 1):
-            # Written so that NaN is never the best.
+            # The comparison is written so that NaN is never the best residual.
             if residual < least:
                 least = residual
                 copy(f, best, p)
@@ -405,7 +408,7 @@ def approach(W, b, kind, mu, p, f, room, tolerance, rounds):
 
 @internal_kernel
 def damped_step(W, b, kind, mu, p, f, room, relative, most, before, damped):
-    """Take one Newton step, halved until the merit falls if ``damped``; return residual and merit there."""
+    """Take one Newton step, halved until the merit falls if ``damped``; return the residual and merit after it."""
     start, goal = room[START, 0], room[GOAL, 0]
     copy(f, start, p)
     newton_step(W, b, kind, mu, p, f, room, relative, most)
@@ -432,14 +435,14 @@ def damped_step(W, b, kind, mu, p, f, room, relative, most, before, damped):
 
 @internal_kernel
 def scatter(mobility, p, f, size, attempt):
-    """Set a start with forces of order ``size`` / mobility, patternless but the same in every run."""
+    """Set initial forces of order ``size`` / mobility that are pseudo-random but the same in every run."""
     for k in range(p):
         f[k] = size / mobility[k] * math.sin(12.9898 * (k + 1) * attempt)
 
 
 @internal_kernel
 def shift(W, b, p, room, epsilon):
-    """Write W + ε w and b − ε w a, with the anchor a, to ``room[SHIFTED]`` and ``room[SHIFTED_RIGHT, 0]``."""
+    """Write W + ε w to ``room[SHIFTED]`` and b − ε w a, with the anchor a, to ``room[SHIFTED_RIGHT, 0]``."""
     shifted, right, mobility, anchor = room[SHIFTED], room[SHIFTED_RIGHT, 0], room[MOBILITY, 0], room[ANCHOR, 0]
     for k in range(p):
         for m in range(p):
@@ -450,11 +453,11 @@ def shift(W, b, p, room, epsilon):
 
 @internal_kernel
 def proximal_point(W, b, kind, mu, p, f, room, tolerance):
-    """Solve (W + ε w) f' + b − ε w f = 0, with the same cones, repeatedly (proximal point); return the residual.
+    """Solve (W + ε w) f' + b − ε w f = 0 repeatedly with the same cones (proximal-point method); return the residual.
 
-    A fixed point solves the problem itself for any ε; if forces are not unique, they stay near the start f. As W + ε w
-    is regular, each of these problems takes few Newton steps. ε falls after a solved problem and grows after an
-    unsolved one. Leaves the best f.
+    A fixed point solves the original problem for any ε. If the forces are not unique, they stay near the initial f. As
+    W + ε w is regular, each of these problems takes few Newton steps. ε falls after a solved problem and grows after an
+    unsolved one. The best forces found are left in f.
     """
     shifted, right = room[SHIFTED], room[SHIFTED_RIGHT, 0]
     kept, anchor = room[KEPT, 0], room[ANCHOR, 0]
@@ -468,7 +471,7 @@ def proximal_point(W, b, kind, mu, p, f, room, tolerance):
     for _ in range(NEAR_STEPS):
         shift(W, b, p, room, epsilon)
         left = approach(shifted, right, kind, mu, p, f, room, inner, 1)
-        # ``approach`` has left the mobilities of the shifted problem.
+        # Restore the mobilities, because ``approach`` has left those of the shifted problem.
         mobilities(W, kind, p, room)
         residual, _ = measure(W, b, kind, mu, p, f, room)
         if residual < least:
@@ -488,12 +491,12 @@ def proximal_point(W, b, kind, mu, p, f, room, tolerance):
 
 @internal_kernel
 def impossible(W, b, kind, mu, p, room):
-    """True if it is proved that no forces up to PROVED_FORCE |b| / w solve the problem.
+    """Return whether it is proved that no forces up to PROVED_FORCE |b| / w solve the problem.
 
-    The proof is a combination d of motions, of any sign for BOTH_WAYS rows, not negative for ONE_WAY rows and normals,
-    zero for tangents and BOX rows. A solution has d·u ≥ 0; but d·u = (Wᵀd)·f + d·b, which is negative if d·b is and no
-    admissible force makes (Wᵀd)·f positive: bodies that close in on each other from all sides. Such a d is the
-    remaining motion, −ε w f, of the problem without friction solved with ε w added to W.
+    The proof is a combination d of motions, of any sign for BOTH_WAYS rows, non-negative for ONE_WAY rows and normals,
+    and zero for tangents and BOX rows. A solution has d·u ≥ 0. But d·u = (Wᵀd)·f + d·b is negative if d·b is negative
+    and no admissible force makes (Wᵀd)·f positive, for example if bodies close in on each other from all sides. Such a
+    d is the remaining motion, −ε w f, of the frictionless problem that is solved with ε w added to W.
     """
     proof, none, scale = room[PROOF, 0], room[NO_FRICTION, 0], 0.0
     right, mobility = room[SHIFTED_RIGHT, 0], room[MOBILITY, 0]
@@ -501,7 +504,7 @@ def impossible(W, b, kind, mu, p, room):
         proof[k], none[k], room[ANCHOR, 0, k], scale = 0.0, 0.0, 0.0, max(scale, abs(b[k]))
     mobilities(W, kind, p, room)
     shift(W, b, p, room, PROOF_SHIFT)
-    # Repeat for the remaining motion: each time a millionth of the motion that forces can cause remains.
+    # Repeat for the remaining motion. Each time, a millionth of the motion that forces can cause remains.
     for _ in range(PROOF_STEPS):
         approach(room[SHIFTED], right, kind, none, p, proof, room, 1e-9 * scale, FEW_ROUNDS)
         mobilities(W, kind, p, room)
