@@ -306,7 +306,7 @@ def _shared_forces(record: Record, prepared: Prepared, dependent: bool, stepped:
             f"{choice}"
         ]
     return [
-        f"{', '.join(touching)}: shared forces that the motion does not determine, because the points stick; "
+        f"{', '.join(touching)}: the motion does not determine how load is shared, because the points stick; "
         "the recorded forces are the least-norm split within all friction cones"
     ]
 

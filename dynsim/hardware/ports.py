@@ -1,4 +1,4 @@
-"""Open the servo bus on a port, which is specified by name and may be real or virtual."""
+"""Open the servo bus on a named port, real or virtual."""
 
 from __future__ import annotations
 

@@ -262,7 +262,7 @@ class _Reader:
         for key, text in texts.items():
             if not isinstance(text, str):
                 raise RecordError(f"{key} of {_describe(path)} is not a text")
-        signal = Signal(data, labels=_texts(labels, f"{_describe(path)} has labels"), **texts)
+        signal = Signal(data, labels=_texts(labels, f"labels of {_describe(path)}"), **texts)
         check_signal(name, signal, samples)
         return signal
 
@@ -273,7 +273,7 @@ class _Reader:
         for name, kind in EVENT_COLUMNS.items():
             path = f"events/{name}"
             texts = kind is str
-            columns[name] = _texts(self._column(path), f"has event {name}s") if texts else self._numbers(path).tolist()
+            columns[name] = _texts(self._column(path), _describe(path)) if texts else self._numbers(path).tolist()
             if len(columns[name]) != len(columns["time"]):
                 counts = len(columns[name]), len(columns["time"])
                 raise RecordError(f"{_describe(path)} has {counts[0]} entries, but there are {counts[1]} times")
@@ -346,8 +346,8 @@ def _mapping(name: str, text: str) -> dict[str, Any]:
 def _texts(values: Any, name: str) -> tuple[str, ...]:
     """Return the texts of an attribute or a data set, which h5py reads as str or bytes."""
     if np.ndim(values) != 1:
-        raise RecordError(f"{name} that are not a list")
+        raise RecordError(f"{name} must be a list")
     texts = tuple(text.decode("utf-8") if isinstance(text, bytes) else text for text in np.asarray(values).tolist())
     if not all(isinstance(text, str) for text in texts):
-        raise RecordError(f"{name} that are not texts")
+        raise RecordError(f"{name} must be texts")
     return texts

@@ -303,7 +303,7 @@ def test_a_slower_replay_that_is_offered_passes(write_map, quantity: str) -> Non
     servo_map = load_servo_map(write_map(limits, ("run_up: 20", "run_up: 5, stop_time: 0.5")))
     with raises(CheckRefused, re.compile(r"--speed 0\.\d+")) as refusal:
         check_motion(swing(), servo_map)
-    slower = float(str(refusal.value).split("--speed ")[1].split()[0])
+    slower = float(re.findall(r"--speed ([\d.]+\d)", str(refusal.value))[0])
     motion = check_motion(swing(), servo_map, speed=slower)
     name, limit = quantity.split(": ")
     value = max(abs(margin.value) for margin in motion.margins if margin.quantity == name and margin.joint != "wheel")

@@ -413,11 +413,11 @@ def test_columns_of_tables_name_sensor_and_component() -> None:
         ({"body": "world"}, "body: 'world' has no joint; bodies: "),
         (
             {"body": "link_1", "frame": "tool"},
-            "frame: 'tool' is not a frame fixed to link_1; remove it, this body has no frames",
+            "frame: 'tool' is not a frame fixed to link_1; remove it, because this body has no frames",
         ),
         (
             {"body": "link_1", "frame": "link_2"},
-            "frame: 'link_2' is not a frame fixed to link_1; remove it, this body has no frames",
+            "frame: 'link_2' is not a frame fixed to link_1; remove it, because this body has no frames",
         ),
         ({"body": "box", "frame": "tool"}, "frame: 'tool' is not a frame fixed to box; frames: box.grasp"),
         ({"body": "box.grasp"}, "body: 'box.grasp' is a frame fixed to box; use body: box, frame: box.grasp"),
