@@ -67,7 +67,7 @@ class Balance:
 def pressed(
     model: Model, contacts: Sequence[Contact], loads: Sequence[Load], control: JointControl, real: bool
 ) -> Model:
-    """Return the model in its posture at rest; for parameters and errors see :func:`balanced`.
+    """Return the model in its rest posture; for parameters and errors see :func:`balanced`.
 
     Only compliant contacts change the posture: they carry no load unless they are pressed in.
     """

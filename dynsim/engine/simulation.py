@@ -1395,7 +1395,7 @@ class Simulation:
         return raised
 
     def _collect_due(self, raised: BaseException | None) -> None:
-        """Empty the log of the kernels, and collect the callbacks due at the time that the run has reached.
+        """Empty the kernel log, and collect the callbacks due at the current time of the run.
 
         All callbacks are collected before the first is called, so that a snapshot taken in a callback contains all
         events and due callbacks of this time.

@@ -278,7 +278,7 @@ def geometry(arm: Arm, points: Points, work: Work, q, k, count):
 
 @kernel
 def statics(arm: Arm, points: Points, course: Course, work: Work, Q, F, min_force, forces):
-    """Compute the torques of the instants with their derivatives, and the geometry of all knots.
+    """Compute torques and their derivatives at the given instants, and the geometry at all knots.
 
     ∂τ/∂q_r = H_jr − Σ_c J_cj · ∂F_c/∂q_r − Σ_c (a_j × s_cr) · F_c with the symmetric matrix H_ij = −a_i · M_j for
     joints i that carry joint j, and zero for a prismatic joint i; M_j = Σ_k J_kj × w_k over weights and forces. s_cr is

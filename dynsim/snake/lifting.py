@@ -280,7 +280,7 @@ class Lifts(StrictConfig):
     """
 
     signal: str = Field(
-        "grounded", description="signal of the record with 1 for wheel pairs on the ground and 0 for lifted pairs"
+        "grounded", description="recorded signal that is 1 for wheel pairs on the ground and 0 for lifted pairs"
     )
     joints: tuple[str, ...] = Field(min_length=1, description="pitch joints on the axles of the first, second, … pair")
     clearance_mm: Positive = Field(5.0, description="height of the lower wheel of a lifted pair above the floor")

@@ -278,7 +278,7 @@ def used_limit(record: Record) -> np.ndarray:
 
 
 def opening(record: Record) -> np.ndarray:
-    """Return the opening angle of the door, or the turn of the head in a record without a door, shape (T,) [°]."""
+    """Return the opening angle of the door, or the rotation of the head if the record has no door, shape (T,) [°]."""
     has_door = "door" in record.labels.get("q", ())
     angle = record["q"][:, record.labels["q"].index("door")] if has_door else record["w"][:, 5]
     return np.asarray(np.abs(np.rad2deg(angle - angle[0])))

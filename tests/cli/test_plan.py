@@ -139,6 +139,7 @@ def floor_that_grips(data: dict[str, Any]) -> None:
     data["contacts"]["friction"] = 6.0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("change", "survives", "names"),
     [

@@ -62,6 +62,7 @@ server.stop()
 """
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("descriptors", [20, 200])
 def test_idle_connections_delay_the_page_and_are_one_line_of_log(descriptors: int) -> None:
     """Also when the process has too few file descriptors for them."""

@@ -57,6 +57,7 @@ def test_a_run_that_stops_logs_why(caplog: pytest.LogCaptureFixture) -> None:
     assert str(stop.value) in message
 
 
+@pytest.mark.long
 def test_workers_log_in_their_parent(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO, "dynsim")
     records = dynsim.compare("elbow_comparison", overrides=SHORT, jobs=2)

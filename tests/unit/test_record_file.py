@@ -439,12 +439,14 @@ def test_a_file_of_another_process_is_read_in_a_child_and_the_same(tmp_path: Pat
     assert there.signals["q"].data.flags.writeable
 
 
+@pytest.mark.long
 def test_an_endless_file_ends_with_one_error(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(isolated, "TIME_S", 2)
     with raises(RecordError, "endless.h5", "2 s", "processor time"):
         Record.load(ENDLESS)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_reading_ends_at_a_signal(number: signal.Signals, tmp_path: Path):
     """Also the child ends, which reads the endless file."""
@@ -500,6 +502,7 @@ def test_a_file_that_expands_too_much_is_refused(tmp_path: Path):
         Record.load(path, trust=True)
 
 
+@pytest.mark.long
 def test_trusted_damage_ends_in_one_error_or_does_no_harm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Without the protection of the digest each file is read, refused, or ends its own reader."""
     monkeypatch.setattr(isolated, "TIME_S", 2)

@@ -114,6 +114,7 @@ def failures(name: str) -> Iterator[str]:
                 yield f"{argument} = {wrong!r}: {error!r}"
 
 
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("name", RIGHT)
 def test_a_wrong_type_is_named(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -248,7 +248,7 @@ def read_xml(path: Path) -> Element:
     try:
         parser.Parse(data, True)
     except expat.ExpatError as error:
-        raise _error(path, error.lineno, f"not XML: {expat.ErrorString(error.code)}") from None
+        raise _error(path, error.lineno, f"not well-formed XML: {expat.ErrorString(error.code)}") from None
     except (LookupError, ValueError) as error:
         raise ModelError(f"{path}: unknown encoding ({error}); save it as UTF-8") from None
     return roots[0]
@@ -650,7 +650,7 @@ def read_urdf(path: Path, lock: Mapping[str, float] | None = None) -> Robot:
     places = _places(locked)
     links = _links(locked, places)
     if not links:
-        raise ModelError(f"{path}: has no moving joint")
+        raise ModelError(f"{path}: has no moving joints")
     _warn(locked, places, links)
     frames = [Frame(name, pose.body, pose.R, pose.p) for name, pose in places.items() if pose.body != name]
     rows = tuple(row for link in links for row in (ROWS[link.kind](link) if link.kind in ROWS else (link,)))

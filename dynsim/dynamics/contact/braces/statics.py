@@ -398,7 +398,7 @@ def constraints(braces: BraceArrays, scale, limits, relaxed):
 
 @internal_kernel
 def contradiction(braces: BraceArrays, equations, cones, relaxed):
-    """Write the certificate: the multipliers of the torques at a negative best margin, as joint rates."""
+    """Write the certificate of a negative best margin: the torque multipliers, which are joint rates."""
     program, motors = braces.program, braces.motors
     # The torques are the last equations and the last cones, so loop backwards.
     e, i = equations - 1, program.first[cones] - 1
