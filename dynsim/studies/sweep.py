@@ -49,7 +49,7 @@ def is_finite(value: Any) -> bool:
 
 
 def numbers(summary: dict[str, Any]) -> dict[str, Any]:
-    """Return all finite numbers of a summary that do not depend on the machine; contact numbers are ``CONTACT.…``."""
+    """Return all finite numbers of a summary that do not depend on the machine; keys of contacts are ``CONTACT.…``."""
     values = flat(summary)
     for key, value in summary.items():
         if isinstance(value, dict) and key != "base":

@@ -220,7 +220,7 @@ def _one_line_errors(path: Path) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class _Draft:
-    """Content for ``path`` in a temporary file, which becomes the file ``target``."""
+    """Draft of the file ``path``: a temporary file that is renamed to ``target`` when it is complete."""
 
     path: Path
     target: Path

@@ -28,7 +28,7 @@ class Config(StrictConfig):
         if self.edge_radius_m > most:
             raise error_at(
                 "edge_radius_m",
-                f"{self.edge_radius_m:g} m; must not exceed half the shortest edge ({most:g} m)",
+                f"must not exceed half the shortest edge ({most:g} m)",
             )
         return self
 
