@@ -72,13 +72,16 @@ class LinkSensor:
     Attributes
     ----------
     signals : tuple of (str, str, str)
-        Name, unit and description of each signal; a signal has a vector for each sensor.
+        Name, unit and description of each signal; a signal has a value for each sensor.
     measure : callable
-        Returns the vectors (T, 3) of each signal for the motion of the links and the mount of a sensor.
+        Returns the values (T, *shape) of each signal for the motion of the links and the mount of a sensor.
+    shape : tuple of int, optional
+        Shape of a value: (3,) for vectors (default), () for numbers.
     """
 
     signals: tuple[tuple[str, str, str], ...]
     measure: Callable[[LinkMotion, SensorMount], tuple[Array, ...]]
+    shape: tuple[int, ...] = (3,)
 
 
 def wrench(motion: LinkMotion, mount: SensorMount) -> tuple[Array, Array]:
@@ -117,15 +120,19 @@ def add_link_sensors(record: Record, scenario: Scenario, prepared: Prepared, pus
         Wrenches that the caller of a stepped simulation has set, in chronological order.
     """
     placed, count = build.sensor_mounts(scenario, prepared.model.robot), len(record)
-    values = {kind: np.empty((len(LINK_SENSORS[kind].signals), count, len(named), 3)) for kind, named in placed.items()}
+    kinds = {kind: LINK_SENSORS[kind] for kind in placed}
+    values = {k: np.empty((len(kinds[k].signals), count, len(named), *kinds[k].shape)) for k, named in placed.items()}
     for first in range(0, count if placed else 0, BLOCK):
         rows = slice(first, first + BLOCK)
         motion = link_motion(record, prepared, pushes, rows)
         for kind, named in placed.items():
             for k, mount in enumerate(named.values()):
-                values[kind][:, rows, k] = LINK_SENSORS[kind].measure(motion, mount)
+                for row, data in zip(values[kind], kinds[kind].measure(motion, mount), strict=True):
+                    if data.shape != row[rows, k].shape:
+                        raise ValueError(f"sensor {kind!r} returns shape {data.shape}, not {row[rows, k].shape}")
+                    row[rows, k] = data
     for kind, named in placed.items():
-        for (name, unit, description), data in zip(LINK_SENSORS[kind].signals, values[kind], strict=True):
+        for (name, unit, description), data in zip(kinds[kind].signals, values[kind], strict=True):
             record.add(name, data, unit, labels=tuple(named), description=description)
 
 

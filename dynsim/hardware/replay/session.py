@@ -82,8 +82,6 @@ def run_replay(
             replay = Replay(motion, servo_map, bus, clock, live=live, dump_folder=folder, **options)
             background = _open_outputs(replay, folder)
             try:
-                if moved:
-                    replay.journal.add_line(f"files of an earlier replay were moved to {moved}")
                 replay.run()
             finally:
                 result = replay.result
