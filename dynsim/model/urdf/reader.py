@@ -248,7 +248,7 @@ def read_xml(path: Path) -> Element:
     try:
         parser.Parse(data, True)
     except expat.ExpatError as error:
-        raise _error(path, error.lineno, f"not well-formed XML: {expat.ErrorString(error.code)}") from None
+        raise _error(path, error.lineno, f"invalid XML: {expat.ErrorString(error.code)}") from None
     except (LookupError, ValueError) as error:
         raise ModelError(f"{path}: unknown encoding ({error}); save it as UTF-8") from None
     return roots[0]
