@@ -155,7 +155,7 @@ def warn_about_meshes(scenes: Iterable[Scene | None]) -> None:
     """Print a warning for each mesh of the scenes that cannot be drawn."""
     from dynsim.draw.geometry.meshes import mesh_notes
 
-    for note in dict.fromkeys(note for scene in scenes for note in mesh_notes(scene)):
+    for note in mesh_notes(scenes):
         errors.print(f"[yellow]warning:[/] {escaped(note)}")
 
 

@@ -24,16 +24,25 @@ if TYPE_CHECKING:
 # Limits of processor time [s], memory and data [bytes] for files up to this size; they grow with larger ones.
 SIZE, TIME_S, MEMORY, DATA = 100_000_000, 8, 2_000_000_000, 900_000_000
 
-# Program of the child. The first message lists the folders in which Python searches for dynsim.
+# Program of the child. The first message lists the folders in which Python searches for dynsim. The parent ends the
+# child at Ctrl-C, which reaches both.
 START = """
 import pickle, signal, sys
-for number in (signal.SIGINT, signal.SIGTERM):
-    signal.signal(number, signal.SIG_DFL)
+signal.signal(signal.SIGINT, signal.SIG_IGN)
 sys.path[:], path, limits = pickle.load(sys.stdin.buffer)
 from dynsim.record import isolated
 from dynsim.record.reader import decode
 isolated.serve(decode, path, limits, sys.stdout.buffer)
 """
+
+
+def search_path() -> list[str]:
+    """Return the folders in which a child process searches for modules, with the working directory last.
+
+    So a ``json.py`` in the working directory does not replace the standard module.
+    """
+    here = ("", os.curdir, os.getcwd() if os.path.isdir(os.curdir) else "")
+    return sorted((folder for folder in sys.path if isinstance(folder, str)), key=lambda folder: folder in here)
 
 
 def scale(size: int) -> float:
@@ -62,7 +71,6 @@ def read(path: Path) -> Content:
     """
     factor = scale(path.stat().st_size)
     limits = math.ceil(TIME_S * factor), int(MEMORY * factor)
-    folders = [folder for folder in sys.path if isinstance(folder, str)]
     # A linear algebra library with many threads would reserve more memory than the limit.
     environment = os.environ | {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
     try:
@@ -76,9 +84,9 @@ def read(path: Path) -> Content:
     assert process.stdout is not None
     try:
         with process.stdin as stream:
-            pickle.dump((folders, str(path), limits), stream)
+            pickle.dump((search_path(), str(path), limits), stream)
         answer = _received(process.stdout)
-    except (OSError, EOFError):
+    except (OSError, EOFError, pickle.UnpicklingError):
         raise RecordError(f"{path}: {_death(process.wait(), limits)}") from None
     finally:
         process.kill()
@@ -105,11 +113,12 @@ def _received(stream: IO[bytes]) -> Any:
 
 def _death(code: int, limits: Sequence[int]) -> str:
     """Return why the child with this return code ended without an answer."""
-    if code < 0 and signal.Signals(-code).name == "SIGXCPU":
+    name = signal.Signals(-code).name if code < 0 else ""
+    if name == "SIGXCPU":
         return f"reading it took more than {limits[0]} s of processor time; it is damaged"
-    if code < 0:
-        return f"the HDF5 library crashed on it ({signal.Signals(-code).name}); it is damaged"
-    return f"its reader ended with code {code}"
+    if name in ("SIGSEGV", "SIGBUS", "SIGFPE", "SIGILL", "SIGABRT"):
+        return f"the HDF5 library crashed on it ({name}); it is damaged"
+    return f"its reader was ended by {name}" if name else f"its reader ended with code {code}"
 
 
 def serve(decode: Callable[[Path], Content], path: str, limits: tuple[int, int], stream: IO[bytes]) -> None:
@@ -123,15 +132,14 @@ def serve(decode: Callable[[Path], Content], path: str, limits: tuple[int, int],
         resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
     except (ImportError, ValueError, OSError):
         pass  # Windows has no such limits; other systems not all of them
-    answer: Content | str
-    try:
-        answer = decode(Path(path))
-    except RecordError as error:
-        answer = str(error)
-    except MemoryError:
-        answer = f"{path}: reading it takes more than {memory / 1e9:.3g} GB of memory"
     buffers: list[pickle.PickleBuffer] = []
-    header = pickle.dumps(answer, protocol=5, buffer_callback=buffers.append)
+    try:
+        header = pickle.dumps(decode(Path(path)), protocol=5, buffer_callback=buffers.append)
+    except RecordError as error:
+        header = pickle.dumps(str(error))
+    except MemoryError:
+        buffers.clear()
+        header = pickle.dumps(f"{path}: not enough memory to read it")
     arrays = [buffer.raw() for buffer in buffers]
     pickle.dump((header, [array.nbytes for array in arrays]), stream)
     for array in arrays:

@@ -192,8 +192,8 @@ def decode(path: Path) -> Content:
             return _Reader(file, path.stat().st_size).content()
     except RecordError as error:
         raise RecordError(f"{path}: {error}") from error
-    except MemoryError:
-        raise
+    except MemoryError as error:
+        raise RecordError(f"{path}: not enough memory to read it") from error
     # For damaged files, h5py raises exceptions of almost any type.
     except Exception as error:
         text = str(error).strip("'\"").splitlines() or [type(error).__name__]

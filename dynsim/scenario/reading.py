@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,9 +27,9 @@ from dynsim.system.shipped import shipped_scenario, shipped_scenarios
 
 # Keys of a file that do not belong to a single variant.
 TOP = ("variants",)
-# Smallest magnitude of a number in a scenario, and the largest by the end of its key, which is its unit; the first
+# Smallest and largest magnitude of a number in a scenario, and the largest by the unit at the end of its key; the first
 # match counts.
-MAGNITUDE_MIN = 1e-30
+MAGNITUDE_MIN, MAGNITUDE_MAX = 1e-30, 1e15
 MAGNITUDES = {
     "noise_deg": 360.0,
     "noise_rad": 6.3,
@@ -54,7 +54,6 @@ MAGNITUDES = {
     "_V": 1e9,
     "_A": 1e9,
     "_hz": 1e9,
-    "": 1e15,
 }
 # Maximum number of other variants in which unknown keys are sought after an error.
 VARIANTS_SEARCHED = 100
@@ -362,28 +361,27 @@ def _make_absolute(data: Any, folder: Path) -> None:
             _make_absolute(item, folder)
 
 
-def _check_sizes(value: Any, keys: tuple[int | str, ...], origin: Origin) -> None:
+def _check_sizes(value: Any, keys: tuple[int | str, ...], origin: Origin, largest: float = MAGNITUDE_MAX) -> None:
     """Reject numbers that are no physical quantities; other checks reject NaN and infinity."""
     if isinstance(value, dict | list):
         for key, item in value.items() if isinstance(value, dict) else enumerate(value):
-            _check_sizes(item, (*keys, key), origin)
-    elif isinstance(value, int | float) and not isinstance(value, bool) and value != 0 and abs(value) < np.inf:
-        largest = largest_magnitude(keys)
-        if not MAGNITUDE_MIN <= abs(value) <= largest:
-            raise ScenarioError(
-                f"{origin.location(keys)}: {dotted(keys)} = {value_text(value)}: the magnitude must be between "
-                f"{MAGNITUDE_MIN:g} and {largest:g}, or zero"
-            )
+            # Below a key with a unit there may be names of joints and bodies, and indices.
+            _check_sizes(item, (*keys, key), origin, _largest(key, largest) if isinstance(key, str) else largest)
+    elif (
+        isinstance(value, int | float)
+        and not isinstance(value, bool)
+        and 0 < abs(value) < np.inf
+        and not MAGNITUDE_MIN <= abs(value) <= largest
+    ):
+        raise ScenarioError(
+            f"{origin.location(keys)}: {dotted(keys)} = {value_text(value)}: the magnitude must be between "
+            f"{MAGNITUDE_MIN:g} and {largest:g}, or zero"
+        )
 
 
-def largest_magnitude(keys: Sequence[int | str]) -> float:
-    """Return the largest magnitude of a number under these keys, from the unit in the last name."""
-    # Names of joints and bodies follow the key with the unit, and indices of lists.
-    for key in reversed(keys):
-        for unit, largest in MAGNITUDES.items():
-            if unit and isinstance(key, str) and key.endswith(unit):
-                return largest
-    return MAGNITUDES[""]
+def _largest(key: str, default: float) -> float:
+    """Return the largest magnitude of numbers under a key with a unit, otherwise ``default``."""
+    return next((largest for unit, largest in MAGNITUDES.items() if key.endswith(unit)), default)
 
 
 def to_yaml(resolved: Mapping[str, Any]) -> str:

@@ -333,15 +333,11 @@ def _result(good: bool, content: bytes) -> Any:
 
 
 def _beginning(work: Any) -> bytes:
-    """Return the first messages to a worker, see :func:`serve`.
+    """Return the first messages to a worker, see :func:`serve`."""
+    from dynsim.record.isolated import search_path  # imports numpy, which not all work needs
 
-    The worker searches for dynsim in the working directory last, so that a ``json.py`` there does not replace the
-    standard module.
-    """
-    here = ("", os.curdir, os.getcwd() if os.path.isdir(os.curdir) else "")
     path = [folder for folder in sys.path if isinstance(folder, str)]
-    safe = sorted(path, key=lambda folder: folder in here)
-    return pickle.dumps(safe) + pickle.dumps((path, _log_level(), packed(work)))
+    return pickle.dumps(search_path()) + pickle.dumps((path, _log_level(), packed(work)))
 
 
 def _log_level() -> int:

@@ -7,7 +7,6 @@ import inspect
 import types
 import typing
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from numbers import Integral, Real
 from typing import Any, TypeVar
 
@@ -33,7 +32,6 @@ def names_wrong_types(function: Function) -> Function:
     Traceback (most recent call last):
     TypeError: double: number = '3': must be float
     """
-
     if inspect.isclass(function):
         for name, method in list(vars(function).items()):
             if name == "__init__" or not name.startswith("_"):
@@ -75,9 +73,11 @@ def _matches(value: Any, annotation: Any, function: Callable[..., Any]) -> bool:
     if "Array" in str(annotation):
         import numpy as np
 
-        with suppress(TypeError, ValueError):
-            return value is not None and np.asarray(value, dtype=np.float64).size >= 0
-        return False
+        try:
+            np.asarray(value, dtype=np.float64)
+        except (TypeError, ValueError):
+            return False
+        return value is not None
     try:
         hint = eval(annotation, function.__globals__) if isinstance(annotation, str) else annotation
     except (NameError, TypeError):  # a name that is imported for type checks only

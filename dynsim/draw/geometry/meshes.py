@@ -8,7 +8,7 @@ import itertools
 import os
 import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 from xml.parsers import expat
@@ -336,15 +336,14 @@ class Meshes:
         return len(self.unique) - 1
 
 
-def mesh_notes(scene: Scene | None) -> list[str]:
-    """Return notes about the meshes of a scene that cannot be drawn, as on its page."""
-    if scene is None:
-        return []
+def mesh_notes(scenes: Iterable[Scene | None]) -> list[str]:
+    """Return notes about the meshes of scenes that cannot be drawn, as on their page; each file is read once."""
     meshes = Meshes()
-    meshes.of_robot(scene)
-    for shape in (*scene.fixed, *(shape for body in scene.bodies for shape in body.shapes)):
-        if shape.kind == "mesh":
-            meshes.index(shape.file)
+    for scene in filter(None, scenes):
+        meshes.of_robot(scene)
+        for shape in (*scene.fixed, *(shape for body in scene.bodies for shape in body.shapes)):
+            if shape.kind == "mesh":
+                meshes.index(shape.file)
     return meshes.notes()
 
 

@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 from pydantic import Field, ValidationInfo, model_validator
 
 from dynsim.config.base import StrictConfig, error_at
+from dynsim.hardware.bus.control_table import MX_106
 from dynsim.hardware.servo_map import read_yaml
 
 Probability = Annotated[float, Field(ge=0, le=1)]
@@ -74,10 +75,15 @@ class WrongRegister(_Timed):
     id: int
     value: Annotated[int, Field(ge=0)]
 
+    @property
+    def register(self) -> str:
+        """Name of the register."""
+        return {"wrong_model": "model_number", "wrong_firmware": "firmware", "wrong_mode": "operating_mode"}[self.kind]
+
     @model_validator(mode="after")
     def _fits(self) -> WrongRegister:
         """Reject a value that is too large for the register."""
-        largest = 2**16 - 1 if self.kind == "wrong_model" else 2**8 - 1
+        largest = 256 ** MX_106.fields[self.register].size - 1
         if self.value > largest:
             raise error_at("value", f"the register holds at most {largest}")
         return self

@@ -193,7 +193,6 @@ SUPPLY, SUPPLY_RESISTANCE = 12.0, 0.05  # V, Ω
 BROWN_OUT = 6.0
 """Supply voltage below which the electronics of the servos stop, and above which they restart [V] (unverified)."""
 OVERHEATING, OVERLOAD, INPUT_VOLTAGE = 1 << 2, 1 << 5, 1 << 0
-WRONG_REGISTERS = {"wrong_model": "model_number", "wrong_firmware": "firmware", "wrong_mode": "operating_mode"}
 
 
 @dataclass
@@ -343,7 +342,7 @@ class VirtualServos:
         index, registers = self.ids.index(fault.id), self.registers[fault.id]
         match fault.kind:
             case "wrong_model" | "wrong_firmware" | "wrong_mode":
-                registers[WRONG_REGISTERS[fault.kind]] = fault.value
+                registers[fault.register] = fault.value
                 self.reload(index)
             case "drop_off":
                 self.dead.add(fault.id)
