@@ -43,17 +43,20 @@ def mark(what, function):
         return function(*arguments)
     return marked
 
-# The first call of advance takes no step: it loads the kernels.
-def advance(*arguments):
-    if arguments[-1] > 0:
-        Path(f"simulating_{os.getpid()}").touch()
-    if arguments[-1] > 0 and "STANDS" in os.environ:
-        compiled(*arguments[:-1], 50)
-        # As a step that does not end: without the interpreter's lock, and deaf.
-        ctypes.CDLL(None).pause()
-    compiled(*arguments)
+# A call of advance with no step only loads the kernels.
+def watched(advance):
+    def run(*arguments):
+        if arguments[-1] > 0:
+            Path(f"simulating_{os.getpid()}").touch()
+        if arguments[-1] > 0 and "STANDS" in os.environ:
+            advance(*arguments[:-1], 50)
+            # Like a step that does not end: without the interpreter's lock, and deaf to signals.
+            ctypes.CDLL(None).pause()
+        advance(*arguments)
+    return run
 
-compiled, driver.advance = driver.advance, advance
+direct = driver.direct
+driver.direct = lambda run: watched(direct(run))
 joint_pd.follow = mark("planning", joint_pd.follow)
 """
 
