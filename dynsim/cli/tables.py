@@ -602,7 +602,8 @@ def print_plan(plan: BracePlan) -> None:
         print_line("rounds: search rounds that found this heat independently; 0 if it was found by exchanging braces")
     best = plan.best
     if best is not None:
-        print_line(f"best: {escaped(best.label)}{' (rejected)' if best.survives is False else ''}")
+        label = escaped(best.label) if best.braces else "no braces"
+        print_line(f"best: {label}{' (rejected)' if best.survives is False else ''}")
     for size in plan.sizes:
         for text in _notes(size):
             print_line(f"{size.count} brace{'' if size.count == 1 else 's'}: {escaped(text)}")

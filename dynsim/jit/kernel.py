@@ -60,13 +60,17 @@ class _KernelCache(_Cache):
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         path = self._path(sig, target_context.codegen())
         try:
-            content = path.read_bytes()
+            with path.open("rb") as file:
+                owner, content = os.fstat(file.fileno()).st_uid, file.read()
         except FileNotFoundError:
             for report in list(_listeners):
                 report()
             return None
         except OSError as error:
             _warn(f"{path}: cannot be read ({error.strerror}); recompiling")
+            return None
+        if _USER is not None and owner not in (0, _USER):
+            _warn(f"{path}: another user owns this file; recompiling")
             return None
         digest, payload = content[:_DIGEST_SIZE], content[_DIGEST_SIZE:]
         if hashlib.sha256(payload).digest() != digest:

@@ -23,6 +23,8 @@ Format = Literal["csv", "joint-trajectory", "urdf-log"]
 SUFFIX: dict[str, str] = {"csv": ".csv", "joint-trajectory": ".trajectory.yaml", "urdf-log": ".jsonl"}
 RATES = {"q": "v", "phi": "phi_dot", "rho": "rho_dot"}
 """Position signals of records, each with the signal of its rates."""
+ROWS_MAX = 1e7
+"""Maximum number of rows of a resampled motion."""
 _YAML_WORDS = {"y", "n", "yes", "no", "on", "off", "true", "false", "null"}
 
 
@@ -67,6 +69,8 @@ def export_record(record: Record, path: Path, format_: Format, *, rate: float | 
 
         between = CubicHermiteSpline(time, position, velocity)
         end = float(time[-1])
+        if end * rate > ROWS_MAX:
+            raise RecordError(f"--rate {rate:g}: {end:g} s would be {end * rate:.3g} rows; the limit is {ROWS_MAX:g}")
         # The last row is at the end of the record, even if that is not a multiple of the period.
         time = np.arange(np.ceil(end * rate * (1.0 - 1e-9))) / rate
         time = np.append(time, end)

@@ -366,7 +366,8 @@ def _check_sizes(value: Any, keys: tuple[int | str, ...], origin: Origin, larges
     if isinstance(value, dict | list):
         for key, item in value.items() if isinstance(value, dict) else enumerate(value):
             # Below a key with a unit there may be names of joints and bodies, and indices.
-            _check_sizes(item, (*keys, key), origin, _largest(key, largest) if isinstance(key, str) else largest)
+            limit = largest_magnitude(key, largest) if isinstance(key, str) else largest
+            _check_sizes(item, (*keys, key), origin, limit)
     elif (
         isinstance(value, int | float)
         and not isinstance(value, bool)
@@ -379,7 +380,7 @@ def _check_sizes(value: Any, keys: tuple[int | str, ...], origin: Origin, larges
         )
 
 
-def _largest(key: str, default: float) -> float:
+def largest_magnitude(key: str, default: float = MAGNITUDE_MAX) -> float:
     """Return the largest magnitude of numbers under a key with a unit, otherwise ``default``."""
     return next((largest for unit, largest in MAGNITUDES.items() if key.endswith(unit)), default)
 

@@ -20,6 +20,8 @@ from rich.text import Text
 
 # Width of output to a file or pipe, in columns: tables are as wide as they need to be.
 UNBOUNDED = 10_000
+# Size of a printed message: characters per line, and lines.
+LINE_MAX, LINES_MAX = 2000, 100
 # Unicode categories of characters that are escaped: control characters, invisible and direction-changing characters,
 # halves of surrogate pairs, line separators and paragraph separators.
 _UNFIT = {"Cc", "Cf", "Cs", "Zl", "Zp"}
@@ -34,6 +36,15 @@ def plain(text: object) -> str:
         c if c == "\n" or unicodedata.category(c) not in _UNFIT else c.encode("unicode_escape").decode("ascii")
         for c in written
     )
+
+
+def shortened(text: object) -> str:
+    """Return a message without the middle of very long lines and at most :data:`LINES_MAX` lines."""
+    lines = str(text).split("\n")
+    kept = [
+        line if len(line) <= LINE_MAX else f"{line[: LINE_MAX - 300]} … {line[-300:]}" for line in lines[:LINES_MAX]
+    ]
+    return "\n".join(kept + [f"  and {len(lines) - LINES_MAX} more lines"] * (len(lines) > LINES_MAX))
 
 
 def escaped(text: object) -> str:

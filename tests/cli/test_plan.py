@@ -131,6 +131,15 @@ def test_a_scene_without_an_answer_ends_with_its_reason_and_code_2(
     assert own.exists()
 
 
+@pytest.mark.parametrize(
+    ("option", "key"), [("--min-force", "min_N"), ("--clearance", "clearance_m"), ("--radius", "radius_m")]
+)
+def test_an_option_beyond_its_bounds_is_an_error(option: str, key: str) -> None:
+    result = CliRunner().invoke(app, ["plan", "pressing", option, "1e300"])
+    assert isinstance(result.exception, ScenarioError)
+    check_message(result.exception, key, "1e+300")
+
+
 def floor_below_reach(data: dict[str, Any]) -> None:
     data["surfaces"]["floor"]["point_m"] = [0.0, 0.0, -5.0]
 

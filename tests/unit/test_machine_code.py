@@ -152,6 +152,18 @@ def test_damaged_machine_code_is_compiled_anew(kernel_files: Path, damage: str) 
     assert _double() == 6  # a warning would be an error
 
 
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="files have no numeric owners")
+def test_machine_code_of_another_user_is_compiled_anew(kernel_files: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    _double()
+    (file,) = kernel_files.iterdir()
+    if os.getuid() == 0:
+        os.chown(file, 4242, -1)
+    else:
+        monkeypatch.setattr("dynsim.jit.kernel._USER", os.getuid() + 1)
+    with warns(UserWarning, "another user owns this file"):
+        assert _double() == 6
+
+
 def test_who_asks_is_told_once_that_a_kernel_is_compiled(kernel_files: Path) -> None:
     messages: list[str] = []
     with jit.on_compilation(lambda: messages.append("before")):

@@ -7,7 +7,7 @@ from rich.table import Table
 from support.messages import lines_with
 
 from dynsim.cli.tables import print_comparison, print_summary
-from dynsim.system.terminal import Terminal, escaped, escaped_line, plain
+from dynsim.system.terminal import Terminal, escaped, escaped_line, plain, shortened
 
 EVIL = "a\x1b]0;title\x07[red]b[/red][link=http://x]c[/link]\x9b2Jd\u202ee\x00\r\ud800\\"
 SHOWN = r"a\x1b]0;title\x07[red]b[/red][link=http://x]c[/link]\x9b2Jd\u202ee\x00\r\ud800" + "\\"
@@ -57,3 +57,11 @@ def test_tables_show_names_as_they_are_written():
         show(Terminal(file=output, width=300, emoji=False))
         assert output.getvalue().count(SHOWN) >= 4
         assert all(c == "\n" or c.isprintable() for c in output.getvalue())
+
+
+def test_messages_have_a_limited_size():
+    assert shortened("short\nlines") == "short\nlines"
+    lines = shortened("\n".join(["beginning " + "x" * 10**6 + " end"] * 1000)).split("\n")
+    assert len(lines) == 101
+    assert lines[-1] == "  and 900 more lines"
+    assert all(len(line) < 2010 and line.startswith("beginning") and line.endswith("end") for line in lines[:-1])

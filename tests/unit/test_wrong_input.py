@@ -297,6 +297,8 @@ def test_export_refuses_motion_without_columns_and_endless_rates(tmp_path: Path)
     record, _ = replayed()
     with raises(RecordError, "--rate", "inf"):
         export_record(record, tmp_path / "a.csv", "csv", rate=float("inf"))
+    with raises(RecordError, "--rate", "1e+09", "2e+09"):
+        export_record(record, tmp_path / "a.csv", "csv", rate=1e9)
     record.add("v", record.time, "rad/s")
     with raises(RecordError, "'q'", "(101, 1)", "'v'", "(101,)"):
         export_record(record, tmp_path / "a.csv", "csv")
