@@ -648,6 +648,39 @@ def test_a_killed_worker_costs_nothing_but_time(tmp_path: Path, whole: bytes):
     assert (out / "sweep.csv").read_bytes() == whole
 
 
+@pytest.mark.slow
+def test_a_sweep_of_5000_runs_outlives_a_killed_worker_every_two_seconds(tmp_path: Path, whole: bytes):
+    """Any worker can be killed, also while it starts; the kernels are compiled already (``whole``)."""
+    out, rng, killed = tmp_path / "out", np.random.default_rng(49), 0
+    runs = [
+        "single_pendulum",
+        "--set",
+        "duration_s=15",
+        "--grid",
+        f"{LENGTH}=0.5:1:5000",
+        "--no-figures",
+        "--jobs",
+        "2",
+    ]
+    with started(
+        [sys.executable, "-m", "dynsim", "sweep", *runs, "--out", str(out), "-q"], tmp_path / "errors"
+    ) as child:
+        while child.process.poll() is None:
+            time.sleep(2.0)
+            if workers := workers_of(child.process.pid):
+                os.kill(int(rng.choice(workers)), signal.SIGKILL)
+                killed += 1
+        code = child.end()
+    with (out / "sweep.csv").open(encoding="utf-8", newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    lost = sum(row["status"] == LOST for row in rows)
+    print(f"{killed} workers killed; exit code {code}; {len(rows)} rows, {lost} of them lost")
+    assert len(rows) == done(out) == 5000, child.stderr
+    assert code == (0 if lost == 0 else 3), child.stderr
+    assert killed > 10
+    assert lost < 0.01 * len(rows)
+
+
 def workers_of(pid: int) -> list[int]:
     """Worker processes of a parent, the one that has done most first: others may be loading still."""
 
