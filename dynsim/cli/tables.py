@@ -231,14 +231,14 @@ def _print_choice(
 def print_starts(console: Console, starts: Mapping[str, Start]) -> None:
     """Print the start positions of the hand and contact points [m] of each variant, as YAML lists in full precision.
 
-    Also print the contact gaps, the joints moved by initial.on_surface, and the tip margin of a mobile base at rest.
+    Also print the contact gaps, the joints that `initial` moved, and the tip margin of a mobile base at rest.
     """
     for variant, start in starts.items():
         values = {"hand": f"{_coordinates(start.hand)}"}
         values |= {f"contact {name}": f"{_coordinates(point)}" for name, point in start.contacts.items()}
         values |= {f"gap of {name}": f"{gap:+.4g} m" for name, gap in start.gaps.items()}
         for joint, (to, was, unit) in start.solved.items():
-            values[joint] = f"{to!r} {unit}, set by on_surface; was {was:.6g}"
+            values[joint] = f"{to!r} {unit}, set by `initial`; was {was:.6g}"
         if start.tip_margin is not None:
             braced = ""
             if start.tip_margin_braced is not None:

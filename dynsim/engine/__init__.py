@@ -55,7 +55,7 @@ class Start:
     aloft : str
         Scenario line that would put all declared contact points onto their surfaces; empty if all of them touch.
     solved : dict of str to (float, float, str)
-        Joints that ``initial.on_surface`` moved: new position, previous position and unit [deg or m].
+        Joints that ``initial`` moved: new position, previous position and unit [deg or m].
     tip_margin : float or None
         Tip margin of a mobile base at rest under weight and loads; None for a fixed or floating base.
     tip_margin_braced : float or None

@@ -43,8 +43,8 @@ DIFFERS = 1e-3
 START_SLIP_TIME = 1e-3
 # A joint with dry friction that is slower than this is at rest [rad/s or m/s].
 AT_REST = 1e-9
-# Negative friction heat below this fraction of the energy turnover is a rounding error.
-FRICTION_ROUNDING = 1e-12
+# Negative friction heat below this fraction of the energy turnover, or this energy [J], is a rounding error.
+FRICTION_ROUNDING, FRICTION_ROUNDING_J = 1e-12, 1e-10
 # Limits in files are rounded: a joint that starts at 1.5707963 = 90° does not exceed it.
 LIMIT_SLACK = 1e-6
 # Relative distance from a current limit within which it counts as reached.
@@ -186,7 +186,7 @@ def _contact_warnings(
                 "whether real braces do depends on their stiffness; lower contacts.friction or change the posture"
             )
     gained = -summary["friction_heat_J"]
-    if gained > FRICTION_ROUNDING * summary["energy_turnover_J"]:
+    if gained > max(FRICTION_ROUNDING * summary["energy_turnover_J"], FRICTION_ROUNDING_J):
         text = f"friction has added {gained:.3g} J to the arm: "
         if unilateral is None:
             text += "f_t = μ f_n reverses when the normal force pulls "
@@ -590,16 +590,17 @@ def _base_warnings(record: Record, scenario: Scenario, prepared: Prepared, begun
             f"{name} {low:.3g}" for name, low in zip(record.labels["wheel_load"], lowest, strict=True) if low < 0.0
         )
         least = f" (least loads [N]: {pulled})" if pulled else ""
-        beyond = f"{percent((record['tip_margin'] < 0.0).mean())} of the samples"
+        share = float((record["tip_margin"] < 0.0).mean())
+        beyond = f"in {percent(share)} of the samples" if share > 0.0 else "between two samples"
         if late.size and overturns_settled(record, settle) is None:
             warnings.append(
-                f"a jolt at the start drives the tip margin below zero at t = {first:.4f} s, in {beyond}, but none "
+                f"a jolt at the start drives the tip margin below zero at t = {first:.4f} s, {beyond}, but none "
                 f"from {settle:g} s on (margin at least {late.min():.3g}){least}; use initial.equilibrium, or start "
                 "the motion at rest"
             )
         else:
             warnings.append(
-                f"the base {tips} at t = {first:.4f} s, with a tip margin below zero in {beyond}; the run continues "
+                f"the base {tips} at t = {first:.4f} s, with a tip margin below zero {beyond}; the run continues "
                 f"as if the base were held down{least}; use plant.base.on_overturn: stop to end it there"
             )
     lifted = load.sum(axis=1) <= 0.0
