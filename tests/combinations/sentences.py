@@ -82,9 +82,13 @@ SENTENCES: dict[str, str] = {
     "reference beyond": r"^(.+): its reference exceeds its stop",
     "overloaded": r"^(.+): the rms (\S+) of the run exceeds the nominal",
     "tips at the start": (
-        rf"^a jolt at the start drives the tip margin below zero.*? in {NUMBER}(?: % of the samples)?[,;]"
+        r"^a jolt at the start drives the tip margin below zero.*? "
+        rf"(?:between two samples|in {NUMBER}(?: % of the samples)?)[,;]"
     ),
-    "tips": rf"^the base (?:tips over|is tipped over|1) at t = .*below zero (?:between two samples|in {NUMBER}(?: % of the samples)?)[,;]",
+    "tips": (
+        r"^the base (?:tips over|is tipped over|1) at t = .*below zero "
+        rf"(?:between two samples|in {NUMBER}(?: % of the samples)?)[,;]"
+    ),
     "lifted": rf"^the base is lifted: its wheels and caster carry no load in {NUMBER}(?: %)? of the samples",
     "would slip": rf"^the (\S+) wheel would slip: it requires up to {NUMBER} times the traction",
     "left out": r"^(?:contacts\.points\.)?(.+): no joint moves this point along the normal of",
