@@ -618,7 +618,7 @@ def _tips(match: Match, seen: Observed) -> str:
     tipped = any(event.kind == "tip_over" for event in seen.record.events)
     return (
         ""
-        if tipped and abs(float(match[1]) - 100.0 * float((margin < 0.0).mean())) < 0.1
+        if tipped and abs(float(match[1] or 0.0) - 100.0 * float((margin < 0.0).mean())) < 0.1
         else "by the signals it does not"
     )
 
