@@ -263,6 +263,24 @@ def test_a_one_sided_tie_pushes_and_does_not_pull():
     assert np.abs(balance(run)).max() < 1e-12
 
 
+@pytest.mark.parametrize("damping", [1.0, 100.0])
+def test_a_one_sided_tie_does_not_damp_before_it_touches(damping: float):
+    """The gap of 0.1 m closes at 1 m/s; then the damper takes energy, and the momentum stays."""
+    tie = Tie("bumper", "two", "one", vector(1, 0, 0), 500.0, damping, pushes=True, rest=0.2)
+    b, q = pair((tie,))
+    v = np.zeros(12)
+    v[0] = 1.0
+    run = stepped(b, b.state(q, v), np.array([0.0, 0.0995, 0.12, 1.0]), 2.5e-4, 0.5)
+    before, during, after = run.states("v")[1:, [0, 6]]
+    np.testing.assert_allclose(before, [1.0, 0.0], atol=1e-12)
+    assert during[1] > 1e-3
+    masses = np.array([1.0, 3.0])
+    np.testing.assert_allclose(run.states("v")[:, [0, 6]] @ masses, 1.0, atol=1e-12)
+    assert 0.0 < after[1] - after[0] < 1.0
+    assert run.states("elastic")[-1, STORED] == pytest.approx(0.0, abs=1e-9)
+    assert np.abs(balance(run)).max() < 1e-12
+
+
 def test_a_tie_that_ends_loses_what_it_has_stored():
     """All of it goes to the damper, and the bodies go on as they are."""
     b, q = pair((Tie("spring", "one", "two", vector(1, 0, 0), 300.0, rest=-0.25),))

@@ -289,6 +289,13 @@ def place_ties(unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace):
 
 
 @internal_kernel
+def damping_of_tie(unilateral: UnilateralArrays, k):
+    """Return the damping of tie k in this step: none if the tie only pushes and is open at the start of the step."""
+    is_open = unilateral.tie_table[k, ku.TIE_KIND] == kc.ONE_WAY and unilateral.tie[k, ku.TIE_AT] > 0.0
+    return 0.0 if is_open else unilateral.tie[k, ku.TIE_DAMPING]
+
+
+@internal_kernel
 def soften_ties(unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace, h):
     """Add the compliance of ties to their rows, set their bounds, and start from their last impulses."""
     table, tie, W = unilateral.tie_table, unilateral.tie, ws.small[0]
@@ -299,8 +306,9 @@ def soften_ties(unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace, 
         s.mu[r], s.f[r] = h * tie[k, ku.TIE_BOUND], h * tie[k, ku.TIE_FORCE]
         tie[k, ku.TIE_AT] -= 0.5 * h * s.rate[0, r]
         s.statistics[kt.STIFFEST] = max(s.statistics[kt.STIFFEST], tie[k, ku.TIE_STIFFNESS] * W[r, r])
+        stiffness, damping = tie[k, ku.TIE_STIFFNESS], damping_of_tie(unilateral, k)
         tie[k, ku.TIE_IMPLICIT], more, added = compliant_row(
-            tie[k, ku.TIE_STIFFNESS], tie[k, ku.TIE_DAMPING], W[r, r], tie[k, ku.TIE_AT], s.rate[0, r], h, s.theta
+            stiffness, damping, W[r, r], tie[k, ku.TIE_AT], s.rate[0, r], h, s.theta
         )
         W[r, r] += more
         s.right[r] += added
@@ -329,7 +337,7 @@ def book_ties(unilateral: UnilateralArrays, layout, s: SteppingArrays, ws: Works
             x = min(x, 0.0)
         row[ku.TIE_FORCE], row[ku.TIE_STORED_NOW] = force, 0.5 * row[ku.TIE_STIFFNESS] * x * x
         work = 0.5 * h * force * (s.rate[0, r] + s.rate[1, r])
-        lost = h * row[ku.TIE_DAMPING] * (s.rate[0, r] + row[ku.TIE_IMPLICIT] * change) ** 2
+        lost = h * damping_of_tie(unilateral, k) * (s.rate[0, r] + row[ku.TIE_IMPLICIT] * change) ** 2
         if at_bound:
             lost = stored - row[ku.TIE_STORED_NOW] - work
         book_spring(layout, row[ku.TIE_STORED_NOW] - stored, lost, work, y_new)
