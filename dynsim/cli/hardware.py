@@ -547,33 +547,49 @@ def hw_drive(
         if moves:
             print_address(ready.address, "Ctrl-C stops the robot; a second Ctrl-C switches the torque off", open_=open_)
         posture = dict(zip(servo_map.joints, motion.start.tolist(), strict=True))
+        done: Any = None
         error: DynsimError | None = None
+
+        def finish(ended: str) -> None:
+            """Save the drive before anything is printed, because nobody may read it; defer signals meanwhile."""
+            nonlocal done
+            interruption.keep()
+            try:
+                done = process.finish(ended)
+            except DynsimError as lost_drive:
+                done = lost_drive
+            interruption.heed()
+
         try:
             with shown_by(folder / SERVOS) as lost:
-                result = replayed(
-                    motion,
-                    servo_map,
-                    bus_on(port, servo_map, script=script, posture=posture, in_wall_time=True),
-                    folder / SERVOS,
-                    lost,
-                    quiet=quiet,
-                    live=moves,
-                    policy=policy,
-                    write_eeprom=configure,
-                    provenance={"port": port, "record": str(folder / "record.h5"), "simulated": ready.still.provenance},
-                )
+                try:
+                    result = replayed(
+                        motion,
+                        servo_map,
+                        bus_on(port, servo_map, script=script, posture=posture, in_wall_time=True),
+                        folder / SERVOS,
+                        lost,
+                        quiet=quiet,
+                        live=moves,
+                        policy=policy,
+                        write_eeprom=configure,
+                        provenance={
+                            "port": port,
+                            "record": str(folder / "record.h5"),
+                            "simulated": ready.still.provenance,
+                        },
+                    )
+                except Exception as stopped:
+                    finish(f"the servos stopped: {stopped}")
+                    raise
+                finish("ended")
         except DynsimError as stopped:
             error, result = stopped, getattr(stopped, "result", None)
-        # Defer signals until the drive is saved.
-        interruption.keep()
-        try:
-            done = process.finish("ended" if error is None else f"the servos stopped: {error}")
-        except DynsimError as lost_drive:
+        if isinstance(done, DynsimError):
             if error is None:
-                raise
-            errors.print(f"[red]error:[/] {escaped(str(lost_drive))}")
-            raise error from None
-        interruption.heed()
+                raise done
+            errors.print(f"[red]error:[/] {escaped(str(done))}")
+            raise error
     if result is not None and not quiet:
         print_timing(result)
     if not moves and error is None:

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.disturbed import WORLDS, disturb, fill, press_until_it_ends
 from support.messages import mentions, says
 from support.processes import wait_for
 from support.teleop_clients import Client, Teleop
@@ -463,3 +464,40 @@ def test_what_cannot_be_is_said_before_anything_moves(
     assert mentions(" ".join(refused.stderr.split()), *names)
     assert "Traceback" not in refused.stderr
     assert not (tmp_path / "out" / "servos" / "measured.h5").exists()
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_a_drive_keeps_its_cycle(
+    drives: Callable[..., Drive], world: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    disturb(world, tmp_path, monkeypatch)
+    drive = drives()
+    client = drive.begin()
+    pull(client, {"y": 1.0}, 0.02)
+    client.say(do="end")
+    drive.ended(1 if world == "dead disk" else 0)
+    check_against_the_simulation(drive)
+    measured, summary = drive.measured()
+    assert measured.complete
+    assert "fault" not in summary
+    # A cycle that waits for the slow disk takes a second.
+    assert np.diff(measured.time).max() < 0.8
+    assert summary["outputs_failed"].keys() == ({"streamed record"} if world == "dead disk" else set())
+
+
+def test_a_drive_whose_output_nobody_reads_ends_at_ctrl_c(drives: Callable[..., Drive]) -> None:
+    drive = drives()
+    assert drive.process.stdout is not None
+    fill(drive.process.stdout.fileno())
+    client = drive.begin()
+    pull(client, {"y": 1.0}, 0.02)
+    drive.process.send_signal(signal.SIGINT)
+    # The robot stops, and everything is saved, before anything is printed.
+    wait_for((drive.servos / "summary.json").exists)
+    wait_for((drive.folder / "summary.json").exists)
+    assert press_until_it_ends(drive.process) == 130
+    wait_for(drive.group_is_gone, failure="a process is left")
+    measured, summary = drive.measured()
+    assert summary["end_state"] == "holding"
+    assert summary["fault"] == Cause.INTERRUPTED.value
+    assert len(measured) > 10

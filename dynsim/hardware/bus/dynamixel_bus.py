@@ -91,6 +91,10 @@ class SerialPort(PortHandler):
         self.tx_time_per_byte = 1e3 / self.baudrate * 10.0
         return True
 
+    def getCurrentTime(self) -> float:
+        # The library uses the wall clock, so that a time-out would end early, or late, if somebody sets it.
+        return time.monotonic() * 1e3
+
     def readPort(self, length: int) -> bytes:
         # Wait instead of polling in a busy loop as the library does, to leave the processor to other processes.
         began = time.monotonic()

@@ -291,11 +291,11 @@ class Loop:
         for name, values in goals.items():
             if not values:
                 continue
-            self.bus.sync_write(FIELDS[name], values)
-            self._sent.update(values)
             if self.journal.state == ReplayState.FAULT:
                 now = self.clock.now()
                 self.policy_goals += [(now, id_, value) for id_, value in values.items()]
+            self._sent.update(values)
+            self.bus.sync_write(FIELDS[name], values)
 
 
 # End of a replay: stop the robot, leave the torque on or switch it off, and read the states of the servos.
@@ -341,7 +341,7 @@ class Ending:
             self._release()
 
     def after_fault(self, struck: ReplayState, *, found_holding: bool) -> None:
-        """Apply the fault policy to the faults in the result. This never raises an exception.
+        """Apply the fault policy to the faults in the result. After an error in this function, it may be called again.
 
         Parameters
         ----------
@@ -350,7 +350,7 @@ class Ending:
         found_holding : bool
             True if torque was on before the robot was armed.
         """
-        self._at_rest = struck == ReplayState.SETTLE
+        self._at_rest = self._at_rest or struck == ReplayState.SETTLE
         interrupted = self.result.faults[0].cause == Cause.INTERRUPTED
         if self.loop.stop.for_release:
             self._try(self._release)
@@ -372,7 +372,7 @@ class Ending:
             self._try(self._release if self.policy == "off" else self._leave_holding)
 
     def release_at_last(self) -> bool:
-        """Switch the torque off if the user has requested it since the policy was applied. Never raises errors."""
+        """Switch the torque off if the user has requested it since the policy was applied."""
         if self._released or not self.loop.stop.for_release:
             return False
         self._try(self._release)
@@ -380,14 +380,13 @@ class Ending:
         return True
 
     def read_back(self, *, armed: bool) -> None:
-        """Read the state of all servos and derive the end state of the robot. Never raises an exception."""
-        self.result.servos = tuple(ServoEnd(servo.joint, servo.id) for servo in self._servos)
-
-        def read() -> None:
-            self.result.servos = read_back(self.loop.bus, self._servos)
-
-        self._try(read)
-        self.result.end_state = robot_state(self.result.servos) if armed else NOT_ARMED
+        """Read the state of all servos and derive the end state of the robot."""
+        servos = tuple(ServoEnd(servo.joint, servo.id) for servo in self._servos)
+        try:
+            servos = read_back(self.loop.bus, self._servos)
+        except PortError as error:
+            self._port_died(error)
+        self.result.servos, self.result.end_state = servos, robot_state(servos) if armed else NOT_ARMED
 
     # -- faults during the policy -------------------------------------------------------------------------------------
 
@@ -396,17 +395,20 @@ class Ending:
         try:
             step()
         except PortError as error:
-            if all(fault.cause != Cause.PORT for fault in self.result.faults):
-                self._declare(Fault(Cause.PORT, f"{error}; the bus watchdogs stop armed servos"))
+            self._port_died(error)
         except Exception as error:
-            self._declare(Fault(Cause.PROGRAM, repr(error)))
+            self._declare(Fault(Cause.PROGRAM, brief(error)))
         except BaseException as error:
             # This is a request to exit, which is delayed until the robot has been stopped.
             self.loop.stop()
-            self._declare(Fault(Cause.PROGRAM, repr(error)))
+            self._declare(Fault(Cause.PROGRAM, brief(error)))
         else:
             return True
         return False
+
+    def _port_died(self, error: PortError) -> None:
+        if all(fault.cause != Cause.PORT for fault in self.result.faults):
+            self._declare(Fault(Cause.PORT, f"{error}; the bus watchdogs stop armed servos"))
 
     def _declare(self, fault: Fault) -> None:
         self.result.declare(replace(fault, time=self.loop.clock.now()))
@@ -474,7 +476,7 @@ class Ending:
         if course is None:
             return None
         start, end = course.time, course.end
-        speed = 0.0 if self._at_rest else course.speed
+        speed, self._at_rest = 0.0 if self._at_rest else course.speed, True
         stop_time = course.braking_time(loop.map.safety.stop_time)
         elapsed, goals = 0.0, 0
         while elapsed < stop_time and not loop.stop.for_release and not self._frozen:
@@ -594,6 +596,8 @@ SETTLE_TIME = 3.0
 """Maximum time to wait for the servos to come to rest [s]."""
 RECORD = "measured record"
 """Name of the measured record in the list of outputs that failed."""
+ATTEMPTS = 3
+"""Maximum number of attempts to apply the fault policy if errors of this program interrupt it."""
 DRY_RUN_TIME = 1.0
 """Duration of a dry run, which measures the timing of the bus without moving the robot [s]."""
 
@@ -669,21 +673,16 @@ class Replay:
                 self._disarm()
             else:
                 self._dry_run()
-        except Stopped as stopped:
-            self._fault(*stopped.faults)
-        except PortError as error:
-            self._fault(Fault(Cause.PORT, str(error)))
-        except (NoAnswer, RequestRefused) as error:
-            cause = Cause.ARMING if self.journal.state == ReplayState.ARM else Cause.VERIFICATION
-            busy = too_busy(self.bus) if isinstance(error, NoAnswer) else ""
-            self._fault(Fault(cause, f"{error}{busy and '; '}{busy}", (error.id,)))
-        except SimulationStopped as error:
-            self._fault(Fault(Cause.SIMULATION, f"the simulated robot of the virtual servos (--plant) {error}"))
         except BaseException as error:
-            # Always apply the fault policy before leaving a robot whose torque is on.
-            self._fault(Fault(Cause.PROGRAM, brief(error)))
-            for line in traceback.format_exception(error):
-                self.journal.add_line(line.rstrip())
+            # Always apply the fault policy before leaving a robot whose torque is on, also after errors while doing so.
+            struck, errors = self.journal.state, [error]
+            while len(errors) <= ATTEMPTS:
+                try:
+                    self._react(struck, errors)
+                    break
+                except BaseException as another:
+                    errors.append(another)
+            self._report(struck, errors)
             if not isinstance(error, Exception):
                 self._finish()
                 raise
@@ -715,6 +714,7 @@ class Replay:
 
     def _arm(self) -> None:
         self.journal.enter(ReplayState.ARM)
+        self.result.end_state = "unreachable"  # until the servos are read at the end
         on = {servo.id for servo in self._servos if self.bus.read(servo.id, FIELDS["torque_enable"])}
         self._found_holding = bool(on)
         for index, servo in enumerate(self._servos):
@@ -817,25 +817,53 @@ class Replay:
             "profile_acceleration": math.ceil(acceleration * servo.gear / RAD_S2_PER_UNIT),
         }
 
-    def _fault(self, *faults: Fault) -> None:
-        struck, result = self.journal.state, self.result
+    def _faults_of(self, error: BaseException) -> tuple[Fault, ...]:
+        """Return the faults that correspond to an error of the motion."""
+        match error:
+            case Stopped():
+                return error.faults
+            case PortError():
+                return (Fault(Cause.PORT, str(error)),)
+            case NoAnswer() | RequestRefused():
+                cause = Cause.ARMING if self.result.fault_state == ReplayState.ARM else Cause.VERIFICATION
+                busy = too_busy(self.bus) if isinstance(error, NoAnswer) else ""
+                return (Fault(cause, f"{error}{busy and '; '}{busy}", (error.id,)),)
+            case SimulationStopped():
+                return (Fault(Cause.SIMULATION, f"the simulated robot of the virtual servos (--plant) {error}"),)
+        return (Fault(Cause.PROGRAM, brief(error)),)
+
+    def _react(self, struck: ReplayState, errors: Sequence[BaseException]) -> None:
+        """Declare the faults of all errors since the motion, apply the fault policy, and read the state of the servos.
+
+        This function is called again after an error in it.
+        """
+        result = self.result
+        result.fault_state = struck
+        if math.isnan(result.fault_time):
+            result.fault_time = self.clock.now()
         # Stop the robot first, and write the log afterwards.
         with self.journal.buffered():
-            result.fault_state, result.fault_time = struck, self.clock.now()
             self.journal.enter(ReplayState.FAULT)
-            for fault in faults:
+            for fault in (fault for error in errors for fault in self._faults_of(error)):
                 result.declare(replace(fault, time=result.fault_time))
                 self.journal.add_line(f"in {struck.name}: {fault.cause}: {fault.text}")
             self._ending.after_fault(struck, found_holding=self._found_holding)
             armed = struck not in UNARMED or self.stop.for_release
-            if armed or faults[0].cause != Cause.PORT:
+            if armed or result.faults[0].cause != Cause.PORT:
                 self._ending.read_back(armed=armed)
+
+    def _report(self, struck: ReplayState, errors: Sequence[BaseException]) -> None:
+        """Write the state of the servos after a fault, and tracebacks of program errors, to the log."""
         self._log_end()
-        if armed and result.end_state != "unreachable":
+        if (struck not in UNARMED or self.stop.for_release) and self.result.end_state != "unreachable":
             registers = self._read_registers()
             if self._ending.release_at_last():
                 self._log_end()
             self._dump(registers, REGISTERS_AFTER_FAULT)
+        for error in errors:
+            if self._faults_of(error)[0].cause == Cause.PROGRAM:
+                for line in traceback.format_exception(error):
+                    self.journal.add_line(line.rstrip())
 
     def _log_end(self) -> None:
         self.journal.add_line(f"end state: {self.result.end_state}")

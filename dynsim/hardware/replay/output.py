@@ -292,7 +292,8 @@ class ReplayResult:
         for number, known in enumerate(self.faults):
             if known.cause == fault.cause:
                 ids = known.ids + tuple(id_ for id_ in fault.ids if id_ not in known.ids)
-                self.faults[number] = replace(known, text=_joined(known.text, fault.text), ids=ids)
+                text = known.text if fault.text in known.text else _joined(known.text, fault.text)
+                self.faults[number] = replace(known, text=text, ids=ids)
                 return
         self.faults.append(fault)
 

@@ -11,7 +11,7 @@ from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from dynsim.errors import DynsimError
+from dynsim.errors import DynsimError, brief
 from dynsim.hardware.bus.protocol import Bus, Clock
 from dynsim.hardware.errors import OutputsFailed, PortError, ReplayAborted, ReplayInterrupted, VerificationFailed
 from dynsim.hardware.replay.check import MotionTask
@@ -83,12 +83,17 @@ def run_replay(
             background = _open_outputs(replay, folder)
             try:
                 replay.run()
+            except Exception as error:
+                # All errors before the record is built are faults.
+                failures[RECORD] = error
             finally:
                 result = replay.result
                 failures |= background.close() | replay.journal.failures
     except BaseException as error:
-        if result is None:
+        if result is None and (isinstance(error, DynsimError) or not isinstance(error, Exception)):
             raise
+        if result is None:
+            raise PortError(f"unexpected error: {brief(error)}; nothing was moved") from error
         if not isinstance(error, Exception):
             _save(result, folder, failures)
             raise
@@ -132,6 +137,12 @@ def shown_by(folder: Path) -> Iterator[Failures]:
             if isinstance(error, ReplayAborted | OutputsFailed):
                 _add_to_summary(folder, failures)
         raise
+    except Exception as error:
+        # An error of this program outside the motion, whose end state has been logged.
+        text = (
+            f"unexpected error: {brief(error)}; for the end state of the robot, see {folder / LOG}{_recovery(folder)}"
+        )
+        raise ReplayAborted(text) from error
     _flush(failures)
     if failures:
         _add_to_summary(folder, failures)
@@ -207,6 +218,11 @@ def _failure_text(failures: Failures) -> str:
     return "; ".join(f"{name} failed: {text}" for name, text in _messages(failures).items())
 
 
+def _recovery(folder: Path) -> str:
+    """Return how to recover the record, if it has not been written."""
+    return f"; `dynsim hw recover {folder}` builds a record from the saved cycles" if (folder / PART).exists() else ""
+
+
 def raise_for(result: ReplayResult, folder: Path, failures: Failures) -> None:
     """Raise the exception that corresponds to the fault or to failed outputs; return if there are none.
 
@@ -217,10 +233,10 @@ def raise_for(result: ReplayResult, folder: Path, failures: Failures) -> None:
     lost = _failure_text(failures)
     if failures and RECORD not in failures:
         lost += f"; {folder / MEASURED} is complete"
-    elif (folder / PART).exists():
-        lost += f"; `dynsim hw recover {folder}` builds a record from the saved cycles"
-    fault, state = result.fault, result.fault_state
-    if fault is None or state is None:
+    else:
+        lost += _recovery(folder)
+    fault = result.fault
+    if fault is None:
         if failures:
             raise OutputsFailed(f"the motion succeeded (end state: {result.end_state}), but {lost}")
         return
