@@ -1,10 +1,11 @@
 """Families of types that a scenario selects with ``type``: modules of dynsim or of plug-ins.
 
 For a plant, ``type: snake`` selects the module ``dynsim.library.plants.snake`` or, if there is no such module, the
-entry point ``snake`` in the group ``dynsim.plants`` of an installed package. No other registry exists. Entry points are
-searched only if dynsim has no member with that name; a search takes milliseconds with few packages installed and longer
-with many. A plug-in is imported only when a scenario uses it; ``dynsim list``, ``dynsim schema`` and ``dynsim check``
-import all plug-ins.
+entry point ``snake`` in the group ``dynsim.plants`` of an installed package. A module ``catalogue`` of a family has
+further members, see :mod:`dynsim.library.motors.catalogue`. No other registry exists. Entry points are searched only if
+dynsim has no member with that name; a search takes milliseconds with few packages installed and longer with many. A
+plug-in is imported only when a scenario uses it; ``dynsim list``, ``dynsim schema`` and ``dynsim check`` import all
+plug-ins.
 """
 
 from __future__ import annotations
@@ -45,6 +46,9 @@ FAMILIES: Mapping[str, tuple[str, ...]] = {
 }
 
 
+CATALOGUE = "catalogue"
+"""Name of a module with several members of a family: their ``NAMES``, and a function ``member(name)``."""
+
 # Imported modules of plug-ins by family and name.
 _imported: dict[tuple[str, str], ModuleType] = {}
 
@@ -57,18 +61,28 @@ def _modules(family: str) -> tuple[str, ...]:
 
 
 def _module(family: str, name: str) -> ModuleType:
-    return importlib.import_module(f"dynsim.library.{family}s.{name}")
+    if name in _modules(family):
+        return importlib.import_module(f"dynsim.library.{family}s.{name}")
+    member: ModuleType = _module(family, CATALOGUE).member(name)
+    return member
+
+
+def _catalogue(family: str) -> tuple[str, ...]:
+    """Return the names of the members in the module ``catalogue`` of a family; empty if it has no such module."""
+    return tuple(_module(family, CATALOGUE).NAMES) if CATALOGUE in _modules(family) else ()
 
 
 @cache
 def shipped(family: str) -> tuple[str, ...]:
     """Return the members shipped with dynsim: the modules with a ``Config``. Imports all modules of the family."""
-    return tuple(name for name in _modules(family) if is_shipped(family, name))
+    return tuple(sorted(name for name in (*_modules(family), *_catalogue(family)) if is_shipped(family, name)))
 
 
 def is_shipped(family: str, name: str) -> bool:
-    """Return whether a name is in :func:`shipped`; imports at most that module."""
-    return name in _modules(family) and hasattr(_module(family, name), "Config")
+    """Return whether a name is in :func:`shipped`; imports at most that module and the catalogue."""
+    if name in _modules(family):
+        return hasattr(_module(family, name), "Config")
+    return name in _catalogue(family)
 
 
 @cache

@@ -113,6 +113,8 @@ class Servo:
         As for :class:`Motor`.
     free_drag : float
         Viscous drag of the gear while the servo is off [N m s/rad].
+    sheet : str
+        Name of its data sheet in :mod:`dynsim.config.data_sheets`; empty if its values are not from there.
     """
 
     joint: str
@@ -134,6 +136,7 @@ class Servo:
     mass_point: Array | None = None
     nominal_current: float = np.inf
     nominal_torque: float = np.inf
+    sheet: str = ""
 
     @property
     def joint_constant(self) -> float:

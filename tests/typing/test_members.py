@@ -17,7 +17,7 @@ from dynsim.library.base_paths import arc, hold, straight
 from dynsim.library.base_paths import csv as base_csv
 from dynsim.library.base_paths import waypoints as base_waypoints
 from dynsim.library.controllers import joint_pd, task_space
-from dynsim.library.motors import dc, mx_28, mx_106, servo, torque, wang_minami
+from dynsim.library.motors import catalogue, dc, servo, torque, wang_minami
 from dynsim.library.paths import circle, csv, line, waypoints
 from dynsim.library.plants import pws_arm, serial_arm, snake, urdf_arm
 from dynsim.library.surfaces import box, cylinder, height_field, plane, sphere
@@ -74,7 +74,7 @@ CONTROLLERS: Sequence[ControllerModule] = (joint_pd, task_space)
 PATHS: Sequence[PathModule] = (circle, csv, line, waypoints)
 BASE_PATHS: Sequence[BasePathModule] = (arc, base_csv, hold, straight, base_waypoints)
 SURFACES: Sequence[SurfaceModule] = (box, cylinder, height_field, plane, sphere)
-MOTORS: Sequence[MotorModule] = (dc, mx_106, mx_28, servo, torque, wang_minami)
+MOTORS: Sequence[MotorModule] = (dc, servo, torque, wang_minami)
 
 FAMILIES: dict[str, Sequence[Member]] = {
     "plant": PLANTS,
@@ -88,9 +88,10 @@ FAMILIES: dict[str, Sequence[Member]] = {
 
 @pytest.mark.parametrize("family", families.FAMILIES)
 def test_these_are_all_members_and_each_has_what_its_family_asks_for(family: str) -> None:
-    types = [get_args(module.Config.model_fields["type"].annotation) for module in FAMILIES[family]]
-    assert types == [(name,) for name in families.shipped(family)]
-    for name, module in zip(families.shipped(family), FAMILIES[family], strict=True):
+    modules = [*FAMILIES[family], *(map(catalogue.member, catalogue.NAMES) if family == "motor" else ())]
+    types = [get_args(module.Config.model_fields["type"].annotation) for module in modules]
+    assert sorted(types) == [(name,) for name in families.shipped(family)]
+    for (name,), module in zip(types, modules, strict=True):
         assert families._defect(module, family, name) == ""
 
 

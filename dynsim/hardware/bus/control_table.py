@@ -1,8 +1,8 @@
-"""Control tables and specifications of MX(2.0), XL430, XM430 and XH540 servos with Protocol 2.0.
+"""Control tables of MX(2.0) and X servos with Protocol 2.0.
 
-Source: ROBOTIS e-Manual, chapters "Specifications" and "Control Table" on the page of each model. The limits stored in
-a servo depend on its firmware version. Therefore the replay reads them from the servo; only the virtual servos use the
-defaults in this module.
+Source: ROBOTIS e-Manual, chapter "Control Table" on the page of each model; the rated values are in
+:mod:`dynsim.config.data_sheets`. The limits stored in a servo depend on its firmware version, so that the replay reads
+them from the servo; only the virtual servos use the defaults in this module.
 """
 
 from __future__ import annotations
@@ -11,7 +11,11 @@ import math
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 
+from dynsim.config.data_sheets import SERVO_SHEETS, ServoSheet
+
 TICKS_PER_TURN = 4096
+SINGLE_TURN, EXTENDED_TURNS = (0, TICKS_PER_TURN - 1), (-1_048_575, 1_048_575)
+"""Lowest and highest goal [ticks] in position mode and in extended position mode."""
 RAD_PER_TICK = 2 * math.pi / TICKS_PER_TURN
 RAD_S_PER_UNIT = 0.229 * 2 * math.pi / 60  # unit 0.229 rpm of present, goal and profile velocity
 RAD_S2_PER_UNIT = 214.577 / 60**2 * 2 * math.pi  # unit 214.577 rev/min² of the profile acceleration
@@ -86,30 +90,31 @@ class Field:
 
 
 @dataclass(frozen=True)
-class ServoModel:
-    """Specifications of one servo model from its data sheet.
+class ServoModel(ServoSheet):
+    """Specifications of one servo model: its data sheet and its control table.
 
     Attributes
     ----------
-    number : int
-        Model number at address 0.
-    no_load_speed : float
-        Maximum speed without load at 12 V [rad/s].
-    stall_torque, stall_current : float
-        Torque [N·m] and current [A] of the stalled servo at 12 V.
     ampere_per_unit : float
         Unit of the registers for the present current and the goal current, if the model has these registers [A].
     fields : dict[str, Field]
         Control table; the keys are the names of the registers.
+    indirect : tuple of (int, int, int)
+        Blocks of indirect addresses, see :data:`INDIRECT_BLOCKS`.
     """
 
-    name: str
-    number: int
-    no_load_speed: float
-    stall_torque: float
-    stall_current: float
-    fields: dict[str, Field] = field(repr=False)
-    ampere_per_unit: float
+    ampere_per_unit: float = 0.0
+    fields: dict[str, Field] = field(default_factory=dict, repr=False)
+    indirect: tuple[tuple[int, int, int], ...] = ()
+
+    @property
+    def turn_mark(self) -> Field:
+        """RAM register that marks a verified count of turns: the last indirect address of the first block.
+
+        The servo resets it, like its count of turns, when it starts. The mark has no effect on the motion.
+        """
+        pointers, data, count = self.indirect[0]
+        return Field(pointers + 2 * (count - 1), 2, data + count - 1)
 
     @property
     def measures_current(self) -> bool:
@@ -193,7 +198,6 @@ _COMMON = {
     "present_temperature": Field(146, 1, writable=False),
 }
 
-_RAD_S_PER_RPM = 2 * math.pi / 60
 _LOAD = {"present_load": Field(126, 2, writable=False, signed=True)}
 _EXTERNAL_PORTS = {f"external_port_mode_{k}": Field(55 + k, 1, 3, 0, 3) for k in (1, 2, 3)} | {
     f"external_port_data_{k}": Field(150 + 2 * k, 2) for k in (1, 2, 3)
@@ -224,35 +228,57 @@ _XL430 = (
     | {"max_voltage": Field(32, 2, 140, 60, 140), "min_voltage": Field(34, 2, 60, 60, 140)}
     | _LOAD
 )
-_XM430, _XH540 = _X | _current(1193), _X | _EXTERNAL_PORTS | _current(2047)
+_XC430 = (
+    _X
+    | _LOAD
+    | {
+        "max_voltage": Field(32, 2, 160, 60, 160),
+        "min_voltage": Field(34, 2, 60, 60, 160),
+    }
+)
+_XM430, _X540 = _X | _current(1193), _X | _EXTERNAL_PORTS | _current(2047)
+_XL330 = _delivered(_X, temperature_limit=70, velocity_i_gain=1600, velocity_p_gain=180, position_p_gain=400) | {
+    "protocol": Field(13, 1, 2, 2, 22),
+    "max_voltage": Field(32, 2, 70, 31, 70),
+    "min_voltage": Field(34, 2, 35, 31, 70),
+    "velocity_limit": Field(44, 4, 445, 0, 2047),
+    "pwm_slope": Field(62, 1, 140, 1, 255),
+    "shutdown": Field(63, 1, 0x35, 0, 0x3D),
+} | _current(1750)  # fmt: skip
+
+INDIRECT_BLOCKS = ((168, 224, 28), (578, 634, 28))
+"""Blocks of indirect addresses: address of the first two-byte pointer, address of the first data byte, and number of
+pointers."""
+INDIRECT_XL330 = ((168, 208, 20),)
+"""Block of indirect addresses of XL330 servos."""
 MODELS = {
     name: ServoModel(
-        name,
-        number,
-        rpm * _RAD_S_PER_RPM,
-        stall_torque,
-        stall_current,
-        _delivered(fields, velocity_limit=velocity_limit),
-        ampere_per_unit,
+        **vars(SERVO_SHEETS[name]),
+        ampere_per_unit=ampere_per_unit,
+        fields=_delivered(fields, velocity_limit=velocity_limit),
+        indirect=INDIRECT_XL330 if fields is _XL330 else INDIRECT_BLOCKS,
     )
-    # Name, number, no-load speed [rpm], stall torque [N·m] and current [A], default velocity limit, registers, and unit
-    # of current [A].
-    for name, number, rpm, stall_torque, stall_current, velocity_limit, fields, ampere_per_unit in (
-        ("MX-106", 321, 45, 8.4, 5.2, 210, _MX | _current(2047), 3.36e-3),
-        ("MX-28", 30, 55, 2.5, 1.4, 230, _MX | _LOAD, 3.36e-3),
-        ("XL430-W250", 1060, 61, 1.5, 1.4, 265, _XL430, 3.36e-3),
-        ("XM430-W210", 1030, 77, 3.0, 2.3, 330, _XM430, 2.69e-3),
-        ("XM430-W350", 1020, 46, 4.1, 2.3, 200, _XM430, 2.69e-3),
-        ("XH540-W150", 1110, 70, 7.1, 4.9, 300, _XH540, 2.69e-3),
-        ("XH540-W270", 1100, 39, 9.9, 4.9, 167, _XH540, 2.69e-3),
+    # Name, default velocity limit, registers, and unit of current [A].
+    for name, velocity_limit, fields, ampere_per_unit in (
+        ("MX-106", 210, _MX | _current(2047), 3.36e-3),
+        ("MX-64", 435, _MX | _current(1941), 3.36e-3),
+        ("MX-28", 230, _MX | _LOAD, 3.36e-3),
+        ("XL330-M077", 1620, _XL330, 1e-3),
+        ("XL330-M288", 445, _XL330, 1e-3),
+        ("XL430-W250", 265, _XL430, 3.36e-3),
+        ("XC430-W150", 460, _delivered(_XC430, moving_threshold=20, position_p_gain=460), 3.36e-3),
+        ("XC430-W240", 306, _delivered(_XC430, position_p_gain=700), 3.36e-3),
+        ("XM430-W210", 330, _XM430, 2.69e-3),
+        ("XM430-W350", 200, _XM430, 2.69e-3),
+        ("XM540-W150", 230, _X540, 2.69e-3),
+        ("XM540-W270", 128, _X540, 2.69e-3),
+        ("XH540-W150", 300, _X540, 2.69e-3),
+        ("XH540-W270", 167, _X540, 2.69e-3),
     )
 }
 MX_106, MX_28 = MODELS["MX-106"], MODELS["MX-28"]
 MODEL_BY_NUMBER = {model.number: model for model in MODELS.values()}
 
-INDIRECT_BLOCKS = ((168, 224, 28), (578, 634, 28))
-"""Blocks of indirect addresses: address of the first two-byte pointer, address of the first data byte, and number of
-pointers."""
 TABLE_SIZE = 662
 STATE_BLOCK = (126, 10)
 """Address and length of the block read from every servo in each cycle: effort (2), velocity (4) and position (4)."""

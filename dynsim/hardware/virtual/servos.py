@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from dynsim.hardware.bus.control_table import (
     BAUD_RATES,
     BROADCAST_ID,
-    INDIRECT_BLOCKS,
     RAD_PER_TICK,
     RAD_S2_PER_UNIT,
     RAD_S_PER_UNIT,
@@ -83,7 +82,7 @@ class ServoRegisters:
         for name, item in self.model.fields.items():
             if not item.in_eeprom:
                 self[name] = item.default
-        for pointers, data, count in INDIRECT_BLOCKS:
+        for pointers, data, count in self.model.indirect:
             for k in range(count):
                 self._table[pointers + 2 * k : pointers + 2 * k + 2] = (data + k).to_bytes(2, "little")
                 self._table[data + k] = 0
@@ -95,7 +94,7 @@ class ServoRegisters:
         """Return bytes of the table with indirect addresses resolved; None if some bytes are outside the table."""
         if length < 1 or address + length > TABLE_SIZE:
             return None
-        if address + length <= INDIRECT_BLOCKS[0][1]:
+        if address + length <= self.model.indirect[0][1]:
             return bytes(self._table[address : address + length])
         return bytes(self._table[self._resolve(a)] for a in range(address, address + length))
 
@@ -104,14 +103,14 @@ class ServoRegisters:
         if not data or address + len(data) > TABLE_SIZE:
             return StatusError.ACCESS
         end = address + len(data)
-        direct = end <= INDIRECT_BLOCKS[0][0]
+        direct = end <= self.model.indirect[0][0]
         targets = range(address, end) if direct else [self._resolve(a) for a in range(address, end)]
         pending: list[tuple[str, int]] = []
         position = 0
         while position < len(targets):
             start = targets[position]
-            pointer = any(pointers <= start < pointers + 2 * count for pointers, _, count in INDIRECT_BLOCKS)
-            unused = any(first <= start < first + count for _, first, count in INDIRECT_BLOCKS)
+            pointer = any(pointers <= start < pointers + 2 * count for pointers, _, count in self.model.indirect)
+            unused = any(first <= start < first + count for _, first, count in self.model.indirect)
             if pointer or (unused and start == address + position):
                 if pointer and self["torque_enable"]:
                     return StatusError.ACCESS
@@ -162,7 +161,7 @@ class ServoRegisters:
         return -limit, limit
 
     def _resolve(self, address: int) -> int:
-        for pointers, data, count in INDIRECT_BLOCKS:
+        for pointers, data, count in self.model.indirect:
             if data <= address < data + count:
                 at = pointers + 2 * (address - data)
                 target = int.from_bytes(self._table[at : at + 2], "little")
@@ -189,9 +188,10 @@ THERMAL_RESISTANCE = 2.0  # K/W (unverified)
 THERMAL_TIME = 300.0  # s (unverified)
 OVERLOAD_FRACTION = 0.9  # fraction of the stall torque (unverified)
 OVERLOAD_TIME = 1.0  # s (unverified)
-SUPPLY, SUPPLY_RESISTANCE = 12.0, 0.05  # V, Ω
-BROWN_OUT = 6.0
-"""Supply voltage below which the electronics of the servos stop, and above which they restart [V] (unverified)."""
+SUPPLY_RESISTANCE = 0.05  # Ω
+BROWN_OUT = 0.5
+"""Fraction of the rated voltage below which the electronics of the servos stop, and above which they restart
+(unverified)."""
 OVERHEATING, OVERLOAD, INPUT_VOLTAGE = 1 << 2, 1 << 5, 1 << 0
 
 
@@ -277,7 +277,8 @@ class VirtualServos:
         self.baud_groups = group_by_baud(self.registers)
         self._models = [table.model for table in registers.values()]
         self.plant: ServoPlant = plant or InertialLoad(self._models, np.array(list(positions), dtype=np.float64))
-        self.supply = SUPPLY
+        self.supply = min(model.rated_voltage for model in self._models)
+        self._brown_out = BROWN_OUT * self.supply
         self.time = 0.0
         self.torque_since = math.inf
         self.dead: set[int] = set()
@@ -288,7 +289,11 @@ class VirtualServos:
         count = len(self.ids)
         self.last_packet, self._set_rate, self._watchdog, self._overload = np.zeros((4, count))
         self._drive = Drive(
-            np.zeros(count, dtype=bool), np.ones(count, dtype=bool), self.plant.position.copy(), np.zeros(count), SUPPLY
+            np.zeros(count, dtype=bool),
+            np.ones(count, dtype=bool),
+            self.plant.position.copy(),
+            np.zeros(count),
+            self.supply,
         )
         self._goal_position, self._goal_velocity = self.plant.position.copy(), np.zeros(count)
         self._profile_velocity, self._profile_acceleration = np.zeros(count), np.zeros(count)
@@ -299,7 +304,7 @@ class VirtualServos:
         self._sense = [1] * count
         self._boot_until: dict[int, float] = {}
         self._overload_torque = OVERLOAD_FRACTION * np.array([model.stall_torque for model in self._models])
-        self._resistance = np.array([12.0 / model.stall_current for model in self._models])
+        self._resistance = np.array([model.rated_voltage / model.stall_current for model in self._models])
         self._ampere_per_newtonmetre = np.array([1 / model.torque_constant for model in self._models])
         for index in range(count):
             self.reload(index)
@@ -419,7 +424,7 @@ class VirtualServos:
         """Update the supply voltage for a total current [A]; servos fail below BROWN_OUT and restart above it."""
         sag = sum(fault.drop for fault in self.active_faults() if isinstance(fault, VoltageSag))
         self._drive.voltage = (self.supply - sag - SUPPLY_RESISTANCE * current) * self._switched_on
-        powered = self._drive.voltage >= BROWN_OUT
+        powered = self._drive.voltage >= self._brown_out
         if powered != self._powered:
             self._powered = powered
             for id_ in self.ids:
