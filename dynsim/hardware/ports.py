@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
 from dynsim.hardware.bus.dynamixel_bus import DynamixelBus, latency_timer, open_serial_port
-from dynsim.hardware.bus.protocol import Clock, VirtualClock
+from dynsim.hardware.bus.protocol import Clock, PacedClock, VirtualClock
 from dynsim.hardware.errors import VerificationFailed
 from dynsim.hardware.servo_map import ServoMap
 from dynsim.hardware.virtual.faults import FaultScript
@@ -45,7 +44,7 @@ def bus_on(
     posture : mapping of str to float, optional
         Initial joint angles of the virtual servos [rad].
     in_wall_time : bool, optional
-        If True, virtual servos run in real time; otherwise they use a virtual clock.
+        If True, virtual servos run in real time, or slower on a busy computer; otherwise their clock does not wait.
 
     Yields
     ------
@@ -61,7 +60,7 @@ def bus_on(
     """
     if port == VIRTUAL:
         line = line_for_map(servo_map, script=script, plant=plant, posture=posture or {})
-        clock = Clock(time.monotonic()) if in_wall_time else VirtualClock()
+        clock: Clock = PacedClock() if in_wall_time else VirtualClock()
         handler: Any = VirtualPort(line, clock, baud=servo_map.bus.baud)
     else:
         clock = Clock()

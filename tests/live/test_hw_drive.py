@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -256,6 +257,17 @@ def test_ctrl_c_stops_and_a_second_one_releases(drives: Callable[..., Drive], tm
     two.ended(130)
     assert two.measured()[1]["end_state"] in ("off", "holding")  # the second may come when it is over
     assert (two.folder / "record.h5").exists()
+
+
+def test_servos_are_not_armed_before_a_pilot_is_connected(drives: Callable[..., Drive]) -> None:
+    drive = drives()
+    # The page is served, but no browser has opened it.
+    time.sleep(1.0)
+    assert drive.process.poll() is None
+    assert not drive.servos.exists()
+    drive.process.send_signal(signal.SIGINT)
+    drive.ended(130)
+    assert not drive.servos.exists()
 
 
 def test_a_terminal_sends_its_ctrl_c_to_all_processes(drives: Callable[..., Drive]) -> None:

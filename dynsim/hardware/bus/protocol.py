@@ -151,6 +151,27 @@ class VirtualClock(Clock):
         self._time = max(self._time, deadline)
 
 
+CATCH_UP = 0.02
+"""Maximum lateness that a :class:`PacedClock` makes up [s]."""
+
+
+class PacedClock(VirtualClock):
+    """Virtual clock that keeps pace with wall time, and slows down if the computer is too slow or too busy.
+
+    Work between two waits takes no time on this clock. A lateness beyond ``CATCH_UP`` is not made up.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(time.monotonic())
+
+    def sleep_until(self, deadline: float) -> None:
+        remaining = deadline - (time.monotonic() - self._origin)
+        if remaining > 0:
+            time.sleep(remaining)
+        self._origin += max(0.0, -remaining - CATCH_UP)
+        super().sleep_until(deadline)
+
+
 # POSIX modules for serial ports and pseudo-terminals; None on systems without them, such as Windows.
 
 

@@ -3,6 +3,7 @@
     process of the servos                              process of the simulation
     ---------------------                              -------------------------
     writes its time to shared memory       ──▶         ServoFollower.ready: the next tick may be simulated
+    waits for a pilot in shared memory     ◀──         ServoFollower.report_pilot: a browser is connected
     reads a pipe without waiting           ◀──         ServoFollower.after_tick: writes a posture for each tick
 
 The control loop of the servos runs in a separate interpreter, so that compilation, browsers or disks cannot block it.
@@ -156,7 +157,7 @@ class ServoFollower:
     samples : Connection
         Pipe through which the postures are sent.
     servo_time : array
-        Shared memory that contains the time of the servos [s].
+        Shared memory that contains the time of the servos [s], and 1 if a pilot is connected.
 
     Raises
     ------
@@ -181,6 +182,9 @@ class ServoFollower:
     @property
     def ready(self) -> bool:
         return (self._session.ticks + 1) * self._session.period <= self._servo_time[0] + self._ahead
+
+    def report_pilot(self) -> None:
+        self._servo_time[1] = 1.0
 
     @property
     def steady(self) -> bool:
@@ -375,7 +379,7 @@ class SimulationProcess:
         with safe_path():
             resource_tracker.ensure_running()
         with signals_held(), safe_path():
-            servo_time = context.RawArray("d", [NOT_STARTED])
+            servo_time = context.RawArray("d", [NOT_STARTED, 0.0])
             self._process = context.Process(
                 target=simulate, args=(request, control, sender, servo_time), name="dynsim simulation", daemon=True
             )
@@ -383,6 +387,7 @@ class SimulationProcess:
         # Close these ends of the pipes in this process; otherwise it would not notice that the other process has ended.
         control.close()
         sender.close()
+        self._servo_time = servo_time
         self.feed = PipeFeed(samples, servo_time, request.servo_map)
 
     def __enter__(self) -> SimulationProcess:
@@ -411,6 +416,19 @@ class SimulationProcess:
             raise message
         assert isinstance(message, Ready)
         return message
+
+    def wait_for_pilot(self) -> None:
+        """Wait until a browser is connected, because servos must not be armed before.
+
+        Raises
+        ------
+        DynsimError
+            If the drive ends before.
+        """
+        while not self._servo_time[1]:
+            interruption.check()
+            if self._control.poll(POLL_INTERVAL):
+                raise DynsimError(f"the drive ended before a pilot was connected: {self._receive().report.ended}")
 
     def finish(self, why: str) -> Done:
         """End the drive, if it has not ended yet, and wait until it has been saved.

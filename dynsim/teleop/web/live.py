@@ -103,6 +103,9 @@ class Follower(Protocol):
     def ready(self) -> bool:
         """True if the follower is close enough to the simulation for another tick."""
 
+    def report_pilot(self) -> None:
+        """Report that a browser is connected; the follower is at rest, without torque, until then."""
+
     @property
     def steady(self) -> bool:
         """True if the robot may change its mode now, and the drive may end."""
@@ -222,6 +225,8 @@ class LiveDrive:
         while follower is not None and not follower.ready and not self._is_over(until_closed):
             if not follower.begun:
                 self.deadman.disarm()
+                if self.server.had_clients:
+                    follower.report_pilot()
                 self._show(NOT_READY, self.deadman.command()[2])
             # Do not wait for the event: it is already set if the drive only continues until its follower is steady.
             clock.sleep(WAIT)
