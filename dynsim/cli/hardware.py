@@ -94,7 +94,8 @@ def scan(
     if not answers:
         raise VerificationFailed(
             f"{port}: no servo answered at {', '.join(f'{b}' for b in bauds)} bit/s; check the power and the cable. "
-            "MX servos with Protocol 1 firmware do not answer: update them to Protocol 2.0"
+            "MX servos with Protocol 1 firmware do not answer: update them to Protocol 2.0; "
+            "AX, RX and EX servos use Protocol 1, which is unsupported"
         )
     owners = {servo.id: servo for servo in servo_map.servos} if servo_map else {}
     table = Table("ID", "model", "fw", "bit/s", "mode", "delay µs", "V", "°C", "torque", "error", "joint")
@@ -153,10 +154,10 @@ def _checked(record_file: Path, map_file: Path, rate: float | None, speed: float
 
 
 def _print_check(motion: Any, servo_map: Any) -> None:
-    table = Table("joint", "quantity", "tightest", "limit", "margin", "at [s]")
+    table = Table("joint", "quantity", "tightest", "limit", "margin", "at [s]", "origin of the limit")
     for margin in motion.margins:
         numbers = [f"{number:.4f}" for number in (margin.value, margin.limit, margin.margin)]
-        table.add_row(margin.joint, f"{margin.quantity} [{margin.unit}]", *numbers, f"{margin.time:.3f}")
+        table.add_row(margin.joint, f"{margin.quantity} [{margin.unit}]", *numbers, f"{margin.time:.3f}", margin.source)
     console.print(table)
     for warning in motion.warnings:
         console.print(f"warning: {warning}")
@@ -390,6 +391,29 @@ def virtual(
         terminal.serve(lambda: stop.count == 0)
 
 
+@hw.command("map", epilog="Example: dynsim hw map six_axis_arm --model XM430-W350 --out my_arm.yaml")
+def draft(
+    scenario: ScenarioArgument,
+    variant: VariantOption = None,
+    overrides: SetOption = None,
+    model: Annotated[
+        str | None, typer.Option("--model", help="Servo model for motors that are not Dynamixel servos.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="Output file; default: SCENARIO_map.yaml.")] = None,
+) -> None:
+    """Write a servo map for the robot of a scenario, to be completed with IDs, zeros and signs."""
+    from dynsim.hardware.map_draft import draft_map
+    from dynsim.scenario import load_scenario
+    from dynsim.system.files import write_text
+
+    loaded = load_scenario(scenario, variant, parsed_overrides(overrides))
+    target = out or Path(file_name(f"{loaded.name}_map.yaml"))
+    if target.exists():
+        raise ServoMapError(f"{target}: already exists; choose another --out")
+    write_text(target, draft_map(loaded, model))
+    console.print(f"written: {target}; set the IDs, then run `dynsim hw calibrate --map {target} --port PORT`")
+
+
 @hw.command("stop", epilog="Example: dynsim hw stop --port /dev/ttyUSB0")
 def stop_servos(
     port: Port,
@@ -442,19 +466,21 @@ def calibrate(
     With --nudge, the command moves the joints one by one instead, to find joints that turn in the wrong direction.
     """
     require_client_library()
+    from dynsim.hardware.bus.protocol import NoAnswer, RequestRefused
     from dynsim.hardware.ports import bus_on
-    from dynsim.hardware.servo_map import SHIPPED, load_servo_map, read_zero_ticks, write_into_map
+    from dynsim.hardware.servo_map import SHIPPED, load_servo_map, mark_turns, read_zero_ticks, write_into_map
 
     servo_map = load_servo_map(map_file)
     target = out or servo_map.path
     shipped = target.resolve().parent == SHIPPED
     if shipped and (write or not nudge):
         raise ServoMapError(f"{target} is a shipped map; write your own map with --out")
-    unknown = [name for name in joint or () if name not in servo_map.joints]
+    axles = list(dict.fromkeys(servo.axle for servo in servo_map.servos))
+    unknown = [name for name in joint or () if name not in axles]
     if unknown:
-        raise ServoMapError(f"{map_file} has no joint {', '.join(unknown)}; joints: {', '.join(servo_map.joints)}")
+        raise ServoMapError(f"{map_file} has no joint {', '.join(unknown)}; joints: {', '.join(axles)}")
     if nudge:
-        chosen = [servo for servo in servo_map.servos if servo.joint in (joint or servo_map.joints)]
+        chosen = [servo for servo in servo_map.servos if servo.axle in (joint or axles)]
         signs, blocked = find_directions(servo_map, chosen, port, live=live, asked=not yes)
         text = f"The sign of {', '.join(signs)} is wrong in {target}."
         if signs and (write or (not shipped and _agreed(text, "correct it?"))):
@@ -465,10 +491,14 @@ def calibrate(
         return
     if live or yes or write:
         raise ServoMapError("--live, --yes and --write require --nudge: zero ticks are read while the torque is off")
-    chosen = [servo for servo in servo_map.servos if (servo.joint in joint if joint else servo.in_position_mode)]
+    chosen = [servo for servo in servo_map.servos if (servo.axle in joint if joint else servo.in_position_mode)]
     with bus_on(port, servo_map) as (bus, _):
         ticks = read_zero_ticks(bus, chosen)
-    write_into_map(servo_map, "zero_tick", ticks, target)
+        write_into_map(servo_map, "zero_tick", ticks, target)
+        try:
+            mark_turns(bus, chosen)
+        except (NoAnswer, RequestRefused) as error:
+            raise VerificationFailed(f"{error}; the turn is not verified, repeat the command") from error
     table = Table("joint", "ID", "old zero", "new zero")
     for servo in chosen:
         table.add_row(servo.joint, str(servo.id), str(servo.zero_tick), str(ticks[servo.joint]))
@@ -546,6 +576,8 @@ def hw_drive(
             confirm_replay(servo_map, motion, port, asked=not yes, at_most=True)
         if moves:
             print_address(ready.address, "Ctrl-C stops the robot; a second Ctrl-C switches the torque off", open_=open_)
+            console.print("The servos are armed when this page is open in a browser.")
+            process.wait_for_pilot()
         posture = dict(zip(servo_map.joints, motion.start.tolist(), strict=True))
         done: Any = None
         error: DynsimError | None = None

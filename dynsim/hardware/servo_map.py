@@ -13,6 +13,7 @@ from __future__ import annotations
 import io
 import itertools
 import math
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,13 +40,14 @@ from dynsim.config.problems import Origin, dotted, explain, suggest, unknown_key
 from dynsim.errors import RecordError, brief
 from dynsim.hardware.bus.control_table import (
     BAUD_RATES,
+    EXTENDED_TURNS,
     MAX_ID,
     MODELS,
     MX_106,
     RAD_PER_TICK,
     RAD_S_PER_UNIT,
+    SINGLE_TURN,
     STATE_BLOCK,
-    TICKS_PER_TURN,
     VOLT_PER_UNIT,
     OperatingMode,
     ServoModel,
@@ -230,9 +232,6 @@ SHIPPED = _CHECKOUT if _CHECKOUT.is_dir() else _PACKAGE / "shipped_scenarios" / 
 """Folder with the servo maps that are shipped with dynsim."""
 
 
-HIGHEST_SUPPLY, RATED_SUPPLY = 14.8, 12.0
-"""Maximum recommended supply voltage of the MX series, and supply voltage for which its data sheet specifies speed and
-torque [V]; both are assumed to be proportional to the supply voltage."""
 MAX_FOLLOWING_ERROR = 1.0
 """Largest limit allowed for the following error of a position servo [rad]; a larger limit would have no effect."""
 ROOM = 20.0
@@ -281,21 +280,33 @@ class Limits(StrictConfig):
 
 # Part of the JSON schema for editors; when a map is loaded, Kind._objections checks the same rule.
 _POSITION_NEEDS_LIMITS: dict[str, Any] = {
-    "if": {"properties": {"mode": {"const": "position"}}},
+    "if": {"properties": {"mode": {"enum": ["position", "extended_position"]}}},
     "then": {
         "properties": {"limits": {"required": ["position_deg"], "properties": {"position_deg": {"type": "array"}}}}
     },
 }
 
 
+def _refuse_protocol_1(model: Any) -> Any:
+    """Reject models that support Protocol 1 only: the series AX, DX, EX and RX, and MX-12W."""
+    if isinstance(model, str) and re.match(r"(AX|DX|EX|RX)[-_]?\d|MX[-_]?12", model, re.IGNORECASE):
+        raise ValueError("uses Protocol 1, which is unsupported; use a servo with Protocol 2.0, such as XL430-W250")
+    return model
+
+
 class Kind(StrictConfig):
     """Settings that several servos share."""
 
-    model: Literal["MX-106", "MX-28", "XL430-W250", "XM430-W210", "XM430-W350", "XH540-W150", "XH540-W270"] = Field(
-        description="model of the servo"
-    )
-    mode: Literal["position", "velocity"] = Field(
-        description="operating mode: position for joints, velocity for wheels"
+    model: Annotated[
+        Literal[
+            "MX-106", "MX-64", "MX-28", "XL330-M077", "XL330-M288", "XL430-W250", "XC430-W150", "XC430-W240",
+            "XM430-W210", "XM430-W350", "XM540-W150", "XM540-W270", "XH540-W150", "XH540-W270",
+        ],
+        BeforeValidator(_refuse_protocol_1),
+    ] = Field(description="model of the servo")  # fmt: skip
+    mode: Literal["position", "velocity", "extended_position"] = Field(
+        description="operating mode: position for joints, extended_position for joints that need more than one turn of "
+        "the servo, velocity for wheels"
     )
     firmware_min: int = Field(41, description="oldest firmware version that is accepted")
     follows: Follows = Field(description="signals of the record that the servo follows")
@@ -318,11 +329,12 @@ class Kind(StrictConfig):
         """Yield objections to values that this servo and gear cannot reach, and to abort rules that can never fire."""
         model, gear, limits, error = MODELS[self.model], self.gear, self.limits, self.following_error
         position = limits.position_deg
-        speed = model.no_load_speed * HIGHEST_SUPPLY / RATED_SUPPLY / gear
-        stall = model.stall_torque * HIGHEST_SUPPLY / RATED_SUPPLY * gear
-        in_position_mode = self.mode == "position"
+        # Speed and torque are assumed to be proportional to the supply voltage.
+        highest = model.highest_voltage / model.rated_voltage
+        speed, stall = model.no_load_speed * highest / gear, model.stall_torque * highest * gear
+        in_position_mode = self.mode != "velocity"
         if in_position_mode and position is None:
-            yield "limits", "mode: position requires limits.position_deg; add it as [lowest, highest]"
+            yield "limits", f"mode: {self.mode} requires limits.position_deg; add it as [lowest, highest]"
         if position is not None and not position[0] < position[1]:
             yield "limits.position_deg", f"{position[0]} must be below {position[1]}"
         if limits.velocity > speed:
@@ -342,9 +354,10 @@ class Kind(StrictConfig):
             text = "conflicts with mode: velocity, which has no angle limits; remove it or use mode: position"
             yield "limits.position_deg", text
         if in_position_mode and position is not None:
-            if (position[1] - position[0]) * gear > 360.0:
+            if self.mode == "position" and (position[1] - position[0]) * gear > 360.0:
                 text = (
-                    f"exceeds the range of position mode, one servo turn; use {360 / gear:.4g}° of joint angle or less"
+                    f"exceeds the range of position mode, one servo turn; use {360 / gear:.4g}° of joint angle or "
+                    "less, or mode: extended_position"
                 )
                 yield "limits.position_deg", text
             if error > MAX_FOLLOWING_ERROR:
@@ -360,19 +373,31 @@ def _not_a_flag(value: Any) -> Any:
     return value
 
 
+_Sign = Annotated[Literal[1, -1], BeforeValidator(_not_a_flag)]
+_Zero = Annotated[int, Field(ge=-(1 << 20), le=1 << 20)]
+
+
+class PairedServo(StrictConfig):
+    """Second servo on the axle of a joint: the same kind and the same goals, with its own ID, direction and zero."""
+
+    id: int = Field(ge=0, le=MAX_ID, description="ID on the bus")
+    sign: _Sign = Field(-1, description="direction of rotation relative to the joint; -1 if the servos face each other")
+    zero_tick: _Zero = Field(2048, description="servo position at the zero angle of the joint [ticks of 0.088°]")
+    max_difference_deg: Annotated[Positive, Within(0.1, 30.0, "°", "must allow backlash, but not a wrong zero")] = (
+        Field(3.0, description="maximum difference between the joint angles that the two servos measure [°]")
+    )
+
+
 class ServoEntry(StrictConfig):
     """One servo: its kind, bus ID, direction of rotation, zero position, record column, and fixed angle, if any."""
 
     kind: str = Field(description="name of an entry in `kinds`")
     id: int = Field(ge=0, le=MAX_ID, description="ID on the bus")
-    sign: Annotated[Literal[1, -1], BeforeValidator(_not_a_flag)] = Field(
-        1, description="direction of rotation of the servo relative to the joint"
-    )
-    zero_tick: int = Field(
-        2048, ge=-(1 << 20), le=1 << 20, description="servo position at the zero angle of the joint [ticks of 0.088°]"
-    )
+    sign: _Sign = Field(1, description="direction of rotation of the servo relative to the joint")
+    zero_tick: _Zero = Field(2048, description="servo position at the zero angle of the joint [ticks of 0.088°]")
     label: str | None = Field(None, description="label of the column in the record; default: the name of the joint")
     hold_at_deg: float | None = Field(None, description="fixed joint angle, used instead of the record [°]")
+    pair: PairedServo | None = Field(None, description="second servo on the same axle")
 
 
 def _is_a_file_name(robot: str) -> str:
@@ -414,12 +439,18 @@ class _MapFile(StrictConfig):
             if entry.kind not in self.kinds:
                 like = suggest(entry.kind, self.kinds)
                 yield f"servos.{joint}.kind", f"must be one of {', '.join(self.kinds)}{like}"
-            if entry.id in owner:
-                yield f"servos.{joint}.id", f"is also the ID of {owner[entry.id]}"
-            owner[entry.id] = joint
+            ids = {f"servos.{joint}.id": entry.id} | ({f"servos.{joint}.pair.id": entry.pair.id} if entry.pair else {})
+            for key, id_ in ids.items():
+                if id_ in owner:
+                    yield key, f"is also the ID of {owner[id_]}"
+                owner[id_] = joint
+            if entry.pair and entry.kind in self.kinds and self.kinds[entry.kind].mode == "velocity":
+                yield f"servos.{joint}.pair", "requires a kind with mode: position or extended_position"
             column = (self.kinds[entry.kind].follows.position, entry.label or joint)
             if entry.hold_at_deg is None and (other := follower.setdefault(column, joint)) != joint:
-                yield f"servos.{joint}.label", f"{other} already follows column {column[1]!r} of signal {column[0]!r}"
+                text = f"{other} already follows column {column[1]!r} of signal {column[0]!r}"
+                hint = f"; if both servos turn one axle, use servos.{other}.pair: {{id: {entry.id}}}"
+                yield f"servos.{joint}.label", text + hint
         for joint in self.lifts.joints if self.lifts else ():
             if joint not in self.servos:
                 yield "lifts.joints", f"{joint} is not in servos"
@@ -450,7 +481,7 @@ class _MapFile(StrictConfig):
                 yield "safety.supply.highest", f"a {model.name} allows at most {high * VOLT_PER_UNIT:g} V"
         for name, kind in kinds.items():
             limits = kind.limits
-            if kind.mode == "position" and safety.approach_velocity > limits.velocity:
+            if kind.mode != "velocity" and safety.approach_velocity > limits.velocity:
                 text = f"is above kinds.{name}.limits.velocity; use {limits.velocity:g} or less"
                 yield "safety.approach_velocity", text
             if (needed := limits.velocity / safety.stop_time) > limits.acceleration:
@@ -466,18 +497,19 @@ class _MapFile(StrictConfig):
         for joint, entry in self.servos.items():
             kind = self.kinds[entry.kind]
             limits = kind.limits.position_deg
-            if kind.mode != "position" or limits is None:
+            if kind.mode == "velocity" or limits is None:
                 continue
             if entry.hold_at_deg is not None and not limits[0] <= entry.hold_at_deg <= limits[1]:
                 text = f"is outside limits.position_deg; use {limits[0]:g} to {limits[1]:g}"
                 yield f"servos.{joint}.hold_at_deg", text
-            lowest, highest = MappedServo(joint, entry, kind).tick_limits
-            if lowest > highest:
-                text = (
-                    f"puts limits.position_deg outside ticks 0 to {TICKS_PER_TURN - 1}, the range of position mode; "
-                    "measure it with `dynsim hw calibrate`"
-                )
-                yield f"servos.{joint}.zero_tick", text
+            for servo in servos_of(joint, entry, kind):
+                lowest, highest = servo.tick_limits
+                if lowest > highest:
+                    text = (
+                        f"puts limits.position_deg outside ticks {servo.turn[0]} to {servo.turn[1]}, the range of "
+                        f"{kind.mode.replace('_', ' ')} mode; measure it with `dynsim hw calibrate`"
+                    )
+                    yield f"{dotted(servo.keys)}.zero_tick", text
 
 
 class MappedServo:
@@ -485,8 +517,14 @@ class MappedServo:
 
     Attributes
     ----------
-    joint, label : str
-        Name of the joint, and label of its column in the record.
+    joint, axle, label : str
+        Name of the servo, name of its joint, and label of its column in the record. The names of servo and joint are
+        equal, except for the second servo of a pair.
+    keys : tuple of str
+        Keys of the entry in the file.
+    max_difference : float
+        Maximum difference of the joint angles that the two servos of a pair measure [rad]; NaN unless this is the
+        second servo of a pair.
     id : int
     model : ServoModel
     kind : Kind
@@ -496,14 +534,17 @@ class MappedServo:
         File, line and key of the entry or of its ``label``, for error messages.
     """
 
-    def __init__(self, joint: str, entry: ServoEntry, kind: Kind, origin: Origin | None = None) -> None:
-        self.joint = joint
-        keys = ("servos", joint, *(["label"] if entry.label else []))
+    def __init__(
+        self, joint: str, entry: ServoEntry, kind: Kind, origin: Origin | None = None, pair: PairedServo | None = None
+    ) -> None:
+        self.joint, self.axle = f"{joint}.pair" if pair else joint, joint
+        self.keys = ("servos", joint, *(["pair"] if pair else []))
+        keys = (*self.keys, *(["label"] if entry.label and not pair else []))
         self.entry = f"{origin.location(keys)}: {dotted(keys)}" if origin else dotted(keys)
         self.label = entry.label or joint
-        self.id = entry.id
-        self.sign = entry.sign
-        self.zero_tick = entry.zero_tick
+        shaft = pair or entry
+        self.id, self.sign, self.zero_tick = shaft.id, shaft.sign, shaft.zero_tick
+        self.max_difference = math.radians(pair.max_difference_deg) if pair else math.nan
         self.kind = kind
         self.gear = kind.gear
         self.hold_at = None if entry.hold_at_deg is None else math.radians(entry.hold_at_deg)
@@ -516,12 +557,29 @@ class MappedServo:
 
     @property
     def in_position_mode(self) -> bool:
-        return self.kind.mode == "position"
+        """True in position mode and in extended position mode."""
+        return self.kind.mode != "velocity"
+
+    @property
+    def counts_turns(self) -> bool:
+        """True in extended position mode."""
+        return self.kind.mode == "extended_position"
 
     @property
     def operating_mode(self) -> OperatingMode:
         """Value that the operating mode register (address 11) of this servo must contain."""
-        return OperatingMode.POSITION if self.in_position_mode else OperatingMode.VELOCITY
+        return OperatingMode[self.kind.mode.upper()]
+
+    @property
+    def turn(self) -> tuple[int, int]:
+        """Lowest and highest goal that the operating mode allows [ticks]."""
+        return EXTENDED_TURNS if self.counts_turns else SINGLE_TURN
+
+    def bound_text(self, angle: float) -> str:
+        """Describe a limit of the joint angle [rad]: tick, zero, the reason for the limit, and its entry in the map."""
+        tick, own = self.to_ticks(angle), any(math.isclose(angle, limit) for limit in self.position_limits)
+        reason = "limits.position_deg" if own else "end of the turn in position mode"
+        return f"tick {tick}, zero_tick {self.zero_tick}, {reason}, {self.entry}"
 
     def to_ticks(self, angle: float) -> int:
         """Return the servo position [ticks] for a joint angle [rad]."""
@@ -547,9 +605,14 @@ class MappedServo:
     def tick_limits(self) -> tuple[int, int]:
         """Lowest and highest goal position that may be sent to this servo [ticks]."""
         if not self.in_position_mode:
-            return (0, TICKS_PER_TURN - 1)
+            return SINGLE_TURN
         ends = [self.to_ticks(angle) for angle in self.position_limits]
-        return max(0, min(ends)), min(TICKS_PER_TURN - 1, max(ends))
+        return max(self.turn[0], min(ends)), min(self.turn[1], max(ends))
+
+
+def servos_of(joint: str, entry: ServoEntry, kind: Kind, origin: Origin | None = None) -> list[MappedServo]:
+    """Return the servo of a map entry, and the second servo if the entry has a ``pair``."""
+    return [MappedServo(joint, entry, kind, origin, pair) for pair in (None, *([entry.pair] if entry.pair else []))]
 
 
 class ServoMap:
@@ -572,7 +635,9 @@ class ServoMap:
         self.safety = content.safety
         self.lifts = content.lifts
         self.servos = tuple(
-            MappedServo(joint, entry, content.kinds[entry.kind], origin) for joint, entry in content.servos.items()
+            servo
+            for joint, entry in content.servos.items()
+            for servo in servos_of(joint, entry, content.kinds[entry.kind], origin)
         )
 
     @property
@@ -582,6 +647,11 @@ class ServoMap:
     @property
     def joints(self) -> tuple[str, ...]:
         return tuple(servo.joint for servo in self.servos)
+
+    @property
+    def pairs(self) -> list[tuple[int, int]]:
+        """Indices of the two servos of each pair."""
+        return [(index - 1, index) for index, servo in enumerate(self.servos) if servo.joint != servo.axle]
 
     @property
     def lifting(self) -> dict[str, Any]:
@@ -662,6 +732,28 @@ def read_zero_ticks(bus: Bus, servos: Iterable[MappedServo]) -> dict[str, int]:
     return {joint: int(np.median(seen)) for joint, seen in ticks.items()}
 
 
+def mark_turns(bus: Bus, servos: Iterable[MappedServo], *, verified: bool = True) -> None:
+    """Mark that the posture of servos in extended position mode was verified, or remove the mark.
+
+    The torque must be off. A servo loses the mark when it loses its count of turns, because it restarts.
+
+    Raises
+    ------
+    NoAnswer, RequestRefused
+        If a servo does not answer or refuses the write.
+    """
+    for servo in servos:
+        if servo.counts_turns:
+            mark = servo.model.turn_mark
+            bus.write(servo.id, mark, mark.default - verified)
+
+
+def turns_verified(bus: Bus, servo: MappedServo) -> bool:
+    """Return whether a servo in extended position mode still has the mark of :func:`mark_turns`."""
+    mark = servo.model.turn_mark
+    return bus.read(servo.id, mark) == mark.default - 1
+
+
 def refuse_torque(bus: Bus, servos: Iterable[MappedServo]) -> None:
     """Raise VerificationFailed if the torque of a servo is on or a servo does not answer."""
     for servo in servos:
@@ -697,8 +789,12 @@ def write_into_map(servo_map: ServoMap, key: Key, values: Mapping[str, int], pat
     yaml.preserve_quotes = True
     yaml.width = 200
     data = yaml.load(servo_map.path.read_text(encoding="utf-8"))
-    for joint, value in values.items():
-        data["servos"][joint][key] = value
+    for servo in servo_map.servos:
+        if servo.joint in values:
+            entry = data
+            for part in servo.keys:
+                entry = entry[part]
+            entry[key] = values[servo.joint]
     text = io.StringIO()
     yaml.dump(data, text)
     with TemporaryDirectory() as folder:
@@ -708,10 +804,11 @@ def write_into_map(servo_map: ServoMap, key: Key, values: Mapping[str, int], pat
             ends = (
                 sorted(servo.to_ticks(angle) for angle in servo.position_limits) if servo.in_position_mode else [0, 0]
             )
-            if servo.joint in values and (ends[0] < 0 or ends[1] > 4095):
+            if servo.joint in values and (ends[0] < servo.turn[0] or ends[1] > servo.turn[1]):
                 raise ServoMapError(
                     f"{servo.joint}: with sign {servo.sign} and zero_tick {servo.zero_tick} its limits are ticks "
-                    f"{ends[0]} to {ends[1]}, outside position mode (0 to 4095); turn the horn or narrow the limits"
+                    f"{ends[0]} to {ends[1]}, outside position mode ({servo.turn[0]} to {servo.turn[1]}); turn the "
+                    "horn or narrow the limits"
                 )
     try:
         write_text(path, text.getvalue())

@@ -25,7 +25,7 @@ from typing import ClassVar, Literal, NamedTuple, Protocol
 import numpy as np
 
 from dynsim.errors import CheckRefused
-from dynsim.hardware.bus.control_table import HEALTH_BLOCK, STATE_BLOCK, TICKS_PER_TURN
+from dynsim.hardware.bus.control_table import HEALTH_BLOCK, RAD_PER_TICK, STATE_BLOCK
 from dynsim.hardware.replay.measured import unmeasured
 from dynsim.hardware.replay.output import Stopped
 from dynsim.hardware.replay.rules import Cause, Fault, needs_of_map
@@ -103,6 +103,8 @@ class Margin:
         Value, limit and margin in SI units; a negative margin means that the limit is violated.
     time : float
         Time at which the value occurs [s of record time].
+    source : str
+        For a position: servo position at the limit, zero, and entry in the servo map.
     """
 
     joint: str
@@ -111,6 +113,7 @@ class Margin:
     limit: float
     margin: float
     time: float
+    source: str = ""
 
     @property
     def unit(self) -> str:
@@ -125,7 +128,7 @@ class Margin:
         unit = self.unit
         return (
             f"{self.joint}: {self.quantity} {self.value:.4f} {unit} at t = {self.time:.3f} s, "
-            f"limit {self.limit:.4f} {unit}, margin {self.margin:+.4f} {unit}"
+            f"limit {self.limit:.4f} {unit}{self.source and f' ({self.source})'}, margin {self.margin:+.4f} {unit}"
         )
 
 
@@ -227,6 +230,14 @@ def check_motion(
     warnings = [] if record.complete else ["the record is marked incomplete: it ends before its scenario does"]
     if limp := uncovered_joints(record, servo_map):
         warnings.append(f"joints in the record that have no servo and are limp on the robot: {'; '.join(limp)}")
+    warnings += [
+        f"{servo.joint}: its operating mode ends within limits.position_deg ({servo.bound_text(bound)}); "
+        "turn the horn, or use mode: extended_position"
+        for servo in servo_map.servos
+        if servo.in_position_mode
+        for bound, limit in zip(position_bounds(servo), servo.position_limits, strict=True)
+        if abs(bound - limit) > 1.5 * RAD_PER_TICK / servo.gear
+    ]
     if missing := long_steps(record, LONG_FACTOR, LONG_QUANTILE):
         warnings.append(
             f"{len(missing)} of {len(record) - 1} time steps are too long, samples may be missing: {missing[0]}"
@@ -357,9 +368,13 @@ class MotionLimits:
         table = np.array(columns).transpose(2, 0, 1)  # (N, quantities, 4)
         wanted = ~(table[..., 2] >= -ROUNDING) if broken else np.ones(table.shape[:2], dtype=bool)
         wanted[:, 0] &= self._in_position_mode
+        # The two servos of a pair differ only in the ticks of their positions.
+        wanted[:, 1:] &= np.array([servo.joint == servo.axle for servo in self._servos])[:, None]
         quantities: list[Quantity] = ["position", *values]
         for joint, quantity in np.argwhere(wanted):
-            yield Margin(self._servos[joint].joint, quantities[quantity], *table[joint, quantity].tolist())
+            servo, (worst, bound, margin, when) = self._servos[joint], table[joint, quantity].tolist()
+            source = servo.bound_text(bound) if quantity == 0 else ""
+            yield Margin(servo.joint, quantities[quantity], worst, bound, margin, when, source)
 
     def _tightest_position(self, position: Array, time: Array) -> tuple[Array, Array, Array, Array]:
         lowest, lowest_time = _extreme(np.negative, position, time)
@@ -381,8 +396,8 @@ def _extreme(key: Callable[[Array], Array], values: Array, times: Array) -> tupl
 
 
 def position_bounds(servo: MappedServo) -> tuple[float, float]:
-    """Return the position limits in the map [rad], restricted to the single turn that position mode allows."""
-    turn = sorted((servo.to_angle(0), servo.to_angle(TICKS_PER_TURN - 1)))
+    """Return the position limits in the map [rad], restricted to the ticks that the operating mode allows."""
+    turn = sorted(map(servo.to_angle, servo.turn))
     return max(servo.position_limits[0], turn[0]), min(servo.position_limits[1], turn[1])
 
 
@@ -394,7 +409,7 @@ def velocity_limit(servo: MappedServo) -> float:
 def _torque_margins(record: Record, servo_map: ServoMap) -> Iterator[Margin]:
     for servo in servo_map.servos:
         signal = servo.kind.follows.torque
-        if signal is None or servo.hold_at is not None:
+        if signal is None or servo.hold_at is not None or servo.joint != servo.axle:
             continue
         torque = column_of(record, signal, servo, "N m")
         highest = int(np.abs(torque).argmax())

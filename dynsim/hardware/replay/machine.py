@@ -434,7 +434,12 @@ class Ending:
             self._hold_measured(self._newly_faulty(fault.ids))
 
     def _newly_faulty(self, ids: Collection[int]) -> list[int]:
-        """Mark servos as faulty; return the indices in the map of the servos that were not marked before."""
+        """Mark servos as faulty; return the indices in the map of the servos that were not marked before.
+
+        If a servo of a pair is faulty, both servos stop.
+        """
+        axles = {servo.axle for servo in self._servos if servo.id in ids}
+        ids = {servo.id for servo in self._servos if servo.axle in axles}
         indices = [index for index, servo in enumerate(self._servos) if servo.id in ids and index not in self._faulty]
         self._faulty.update(indices)
         return indices

@@ -545,10 +545,15 @@ class Layout:
         )
 
     def groups(self) -> Iterator[tuple[str, str, list[int]]]:
-        """Yield, for each signal, its name, the quantity ("position" or "velocity"), and its columns."""
+        """Yield, for each signal, its name, the quantity ("position" or "velocity"), and its columns.
+
+        The second servo of a pair, whose label is the label of the first, has no column.
+        """
         for source, names in (("position", self.positions), ("velocity", self.velocities)):
             for name in dict.fromkeys(names):
-                yield name, source, [column for column, other in enumerate(names) if other == name]
+                columns = [column for column, other in enumerate(names) if other == name]
+                first = {self.labels[column]: column for column in reversed(columns)}
+                yield name, source, [column for column in columns if first[self.labels[column]] == column]
 
 
 class Outlet:

@@ -34,7 +34,7 @@ from dynsim.hardware.bus.control_table import (
 from dynsim.hardware.bus.protocol import Bus, NoAnswer, RequestRefused, too_busy
 from dynsim.hardware.errors import VerificationFailed
 from dynsim.hardware.replay.trajectory import QUINTIC_PEAK, CyclePlan, Needs
-from dynsim.hardware.servo_map import MappedServo, Safety, ServoMap
+from dynsim.hardware.servo_map import MappedServo, Safety, ServoMap, mark_turns, turns_verified
 
 
 class Cause(StrEnum):
@@ -49,6 +49,7 @@ class Cause(StrEnum):
     TORQUE_LOST = "torque lost"
     WATCHDOG = "watchdog tripped"
     FOLLOWING_ERROR = "following error"
+    PAIR = "pair difference"
     TORQUE = "torque"
     VOLTAGE = "voltage"
     TEMPERATURE = "temperature"
@@ -154,14 +155,25 @@ class AbortRules:
         self._following_limit = np.array([servo.kind.following_error for servo in self._servos])
         self._torque_limit = np.array([servo.kind.limits.torque for servo in self._servos])
         self._missed, self._following, self._torque = np.zeros((3, len(self._servos)), dtype=int)
+        # Indices of both servos of each pair, limit of the difference of their angles, and cycles beyond it.
+        self._pairs = np.array(servo_map.pairs, dtype=int).reshape(-1, 2)
+        self._max_difference = np.array([self._servos[second].max_difference for _, second in self._pairs])
+        self._apart = np.zeros(len(self._pairs), dtype=int)
         self._late = 0
         self._declared: set[tuple[Cause, int | None]] = set()
 
     def following_error(self, cycle: Cycle) -> NDArray[np.float64]:
-        """Return the commanded minus the measured values (N,): [rad] in position mode, [rad/s] in velocity mode."""
-        return np.where(
+        """Return the commanded minus the measured values (N,): [rad] in position mode, [rad/s] in velocity mode.
+
+        The two servos of a pair have one error, the larger one.
+        """
+        error = np.where(
             self._in_position_mode, cycle.goal_position - cycle.position, cycle.goal_velocity - cycle.velocity
         )
+        first, second = error[self._pairs].T
+        worst = np.where(np.isnan(first) | (np.abs(second) > np.abs(first)), second, first)
+        error[self._pairs] = worst[:, None]
+        return error
 
     def examine(self, cycle: Cycle) -> list[Fault]:
         """Return the faults that appear in this cycle for the first time, in order of decreasing severity."""
@@ -171,6 +183,8 @@ class AbortRules:
         # If a status is missed, the error and the torque are unknown: their counters are neither increased nor reset.
         self._following = _count(self._following, error > self._following_limit, missed)
         self._torque = _count(self._torque, np.abs(cycle.torque) > self._torque_limit, missed)
+        difference = np.abs(np.subtract(*cycle.position[self._pairs].T))
+        self._apart = _count(self._apart, difference > self._max_difference, np.isnan(difference))
         self._late = self._late + 1 if cycle.lateness > self._late_after else 0
         return [*self._faults(cycle, error)]
 
@@ -187,6 +201,15 @@ class AbortRules:
         yield from self._silent(np.flatnonzero(self._missed >= safety.missed_cycles), cycle)
         text = f"off its goal for {safety.following_cycles} cycles"
         yield from self._beyond(Cause.FOLLOWING_ERROR, self._following >= safety.following_cycles, error, text)
+        for pair in self._pairs[self._apart >= safety.following_cycles]:
+            servos = [self._servos[k] for k in pair]
+            if self._new(Cause.PAIR, servos[1].id):
+                at = ", ".join(f"{self._servos[k]} at {cycle.position[k]:.3f} rad" for k in pair)
+                text = (
+                    f"two servos on one axle differ by more than {servos[1].max_difference:.3f} rad for "
+                    f"{safety.following_cycles} cycles: {at}"
+                )
+                yield Fault(Cause.PAIR, text, tuple(servo.id for servo in servos))
         text = f"too much torque for {safety.torque_cycles} cycles"
         yield from self._beyond(Cause.TORQUE, self._torque >= safety.torque_cycles, cycle.torque, text)
         if self._late >= safety.late_cycles and self._new(Cause.DEADLINE):
@@ -271,6 +294,8 @@ TRIAL_MISSES = 2
 """Maximum number of TRIAL_READS that a servo may miss."""
 NEEDED_SHUTDOWN = 0b0010_0100  # overheating, overload
 STATUS_TO_ALL = 2
+RESTORE_RAM = 0b10
+"""Bit of the startup configuration (address 60): the servo restores saved RAM registers when it starts."""
 NO_ANSWER_HINT = (
     "check power, cable, ID and baud rate (`dynsim hw scan`); a servo with Protocol 1 firmware does not answer"
 )
@@ -314,6 +339,8 @@ def configure(bus: Bus, servo_map: ServoMap, report: Callable[[str], None]) -> N
         now = snapshot(bus, servo)
         for name, value in {"operating_mode": int(servo.operating_mode), **wanted}.items():
             if now[name] != value:
+                if name == "operating_mode":
+                    mark_turns(bus, [servo], verified=False)  # the servo may lose its count of turns
                 bus.write(servo.id, servo.model.fields[name], value)
                 report(f"{servo}: {name} {now[name]} -> {value}")
 
@@ -342,6 +369,7 @@ def verify(
     problems: list[str] = []
     rows: list[LimitRow] = []
     silent = False
+    angles: dict[str, float] = {}
     present = bus.ping_all()
     poll()
     for id_, (model, firmware) in present.items():
@@ -363,8 +391,11 @@ def verify(
         unfit = [*_unfit(servo, registers, servo_map)]
         if registers["model_number"] == servo.model.number:
             rows.append(compare_limits(servo, registers, servo_map.safety, needs))
-            unfit += [*rows[-1].refused, *_position_problem(servo, registers)]
+            angles[servo.joint] = servo.to_angle(registers["present_position"])
+            turns = _turn_problem(bus, servo, registers)
+            unfit += [*rows[-1].refused, *(turns or _position_problem(servo, registers))]
         problems += [f"{servo}: {text}" for text in unfit]
+    problems += _pair_problems(servo_map, angles)
     missed = [] if problems else _trial_reads(bus, servo_map, poll)
     if (silent or missed) and (busy := too_busy(bus)):
         missed.append(busy)
@@ -379,7 +410,7 @@ def _unfit(servo: MappedServo, registers: Registers, servo_map: ServoMap) -> Ite
         yield f"firmware {registers['firmware']} is older than firmware_min {servo.kind.firmware_min}"
     if (mode := registers["operating_mode"]) != servo.operating_mode:
         name = OperatingMode(mode).name.lower() if mode in list(OperatingMode) else str(mode)
-        yield f"is in mode {name}, must be {servo.kind.mode} (--configure sets it)"
+        yield f"is in mode {name}, must be {servo.operating_mode.name.lower()} (--configure sets it)"
     if mode := registers["drive_mode"]:
         yield f"drive mode is {mode}, must be 0 (--configure sets it); use sign in the map instead"
     delay, longest = registers["return_delay"] * RETURN_DELAY_SECONDS_PER_UNIT, servo_map.bus.return_delay
@@ -408,6 +439,36 @@ def _position_problem(servo: MappedServo, registers: Registers) -> list[str]:
         f"is at {servo.to_angle(tick):.3f} rad (tick {tick}), outside its limits "
         f"{servo.position_limits[0]:.3f} to {servo.position_limits[1]:.3f} rad; move it by hand"
     ]
+
+
+def _turn_problem(bus: Bus, servo: MappedServo, registers: Registers) -> list[str]:
+    """Return a problem if the count of turns of a servo in extended position mode is not verified."""
+    if not servo.counts_turns or registers["operating_mode"] != servo.operating_mode:
+        return []
+    if registers.get("startup_configuration", 0) & RESTORE_RAM:
+        return ["restores its RAM when it starts, which hides a lost count of turns; clear bit 1 of address 60"]
+    try:
+        if turns_verified(bus, servo):
+            return []
+    except (NoAnswer, RequestRefused) as error:
+        return [str(error)]
+    return [
+        "its count of turns is not verified since its last start; put the joint into its zero posture and run "
+        f"`dynsim hw calibrate --joint {servo.axle}`"
+    ]
+
+
+def _pair_problems(servo_map: ServoMap, angles: dict[str, float]) -> Iterator[str]:
+    """Yield a problem for each pair whose two servos measure different angles [rad] of their joint."""
+    for first, second in servo_map.pairs:
+        this, other = servo_map.servos[first], servo_map.servos[second]
+        apart = abs(angles.get(this.joint, math.nan) - angles.get(other.joint, math.nan))
+        if apart > other.max_difference:
+            yield (
+                f"{this}, {other}: their angles differ by {apart:.3f} rad (limit {other.max_difference:.3f} rad), "
+                f"so they would work against each other; check their signs, and run `dynsim hw calibrate --joint "
+                f"{other.axle}`"
+            )
 
 
 def _trial_reads(bus: Bus, servo_map: ServoMap, poll: Callable[[], None]) -> list[str]:
@@ -492,6 +553,8 @@ def _position(servo: MappedServo, registers: Registers, needs: Needs) -> _Compar
     low, high = registers["min_position"], registers["max_position"]
     own = np.degrees(sorted((servo.to_angle(low), servo.to_angle(high))))
     bounds = np.degrees(servo.position_limits)
+    if servo.counts_turns:  # in this mode the stored limits have no effect
+        return _Compared(map=f"{bounds[0]:.0f} to {bounds[1]:.0f}")
     goals, allowed = sorted((servo.to_ticks(needs.low), servo.to_ticks(needs.high))), servo.tick_limits
     refused = differs = ""
     if goals[0] < low or goals[1] > high:

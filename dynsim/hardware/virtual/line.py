@@ -184,12 +184,15 @@ def line_for_map(servo_map: ServoMap, **options: Any) -> VirtualLine:
     posture = options.pop("posture", {})
     angles, servos = [], {}
     for servo in servo_map.servos:
-        start = posture.get(servo.joint, servo.hold_at or 0.0)
+        start = posture.get(servo.axle, servo.hold_at or 0.0)
         low, high = servo.position_limits
         angles.append(servo.to_ticks(min(max(start, low), high)) * RAD_PER_TICK)
         registers = ServoRegisters(servo.model, servo.id, BAUD_RATES.index(servo_map.bus.baud))
         registers["operating_mode"] = servo.operating_mode
         registers["return_delay"] = int(servo_map.bus.return_delay / RETURN_DELAY_SECONDS_PER_UNIT)
+        if servo.counts_turns:
+            mark = servo.model.turn_mark
+            registers.write(mark.address, mark.encode(mark.default - 1))
         servos[servo.id] = registers
     return VirtualLine(servos, positions=angles, **options)
 

@@ -68,13 +68,14 @@ class MotorLaw:
     Attributes
     ----------
     stiffness, damping, stall_torque : array, shape (N,)
-        k [N·m/rad], d [N·m·s/rad], τ_stall at 12 V [N·m].
+        k [N·m/rad], d [N·m·s/rad], τ_stall at the rated voltage [N·m].
     inertia : array, shape (N,)
         Output inertia for which the position loop is critically damped, d²/(4k) [kg·m²].
     """
 
     def __init__(self, models: list[ServoModel]) -> None:
         self.stall_torque = np.array([model.stall_torque for model in models])
+        self._voltage = np.array([model.rated_voltage for model in models])
         self.damping = self.stall_torque / np.array([model.no_load_speed for model in models])
         self.stiffness = STIFFNESS_PER_STALL_TORQUE * self.stall_torque
         self.inertia = self.damping**2 / (4 * self.stiffness)
@@ -92,12 +93,12 @@ class MotorLaw:
     def servos(self, joints: list[str], gears: Array) -> list[Servo]:
         """Return the servos as motors of joints; ``gears`` (N,) contains the servo turns per joint turn.
 
-        K_m = V/ω_no_load and R = V K_m/τ_stall at 12 V, so that d = K_m²/R; the torque per volt is K_m/R.
+        K_m = V/ω_no_load and R = V K_m/τ_stall at the rated voltage, so that d = K_m²/R; the torque per volt is K_m/R.
         """
         from dynsim.model.drives import Servo
 
-        torque_constants = 12.0 / (self.stall_torque / self.damping)
-        resistances = 12.0 * torque_constants / self.stall_torque
+        torque_constants = self._voltage / (self.stall_torque / self.damping)
+        resistances = self._voltage * torque_constants / self.stall_torque
         volts = resistances / torque_constants
         return [
             Servo(
@@ -181,9 +182,9 @@ class SimulatedArm:
 
         robot, servos = build.robot(scenario), servo_map.servos
         served, labels = served_joints(robot), [servo.label for servo in servos]
-        if sorted(labels) != sorted(served):
+        if sorted(own := dict.fromkeys(labels)) != sorted(served):
             raise ServoMapError(
-                f"{servo_map.path} has servos for {', '.join(labels)}, but the plant has joints {', '.join(served)}"
+                f"{servo_map.path} has servos for {', '.join(own)}, but the plant has joints {', '.join(served)}"
             )
         # Servo k moves the joint labels[k], whose angle is q[order[k]] and whose rate is v[rows[k]].
         self._labels = labels = [served[label] for label in labels]
@@ -195,11 +196,22 @@ class SimulatedArm:
         self._law = MotorLaw([servo.model for servo in servos])
         # Each servo has the mass of the motor that it replaces.
         masses = {motor.joint: (motor.mass, motor.mass_point) for motor in robot.motors}
+        # Two servos on one axle are one motor with twice the torque per volt and twice the inertia; the first of them
+        # determines whether it is on.
         motors = [
-            replace(servo, mass=mass, mass_point=point)
-            for servo in self._law.servos(labels, np.abs(self._scale))
+            replace(
+                servo,
+                mass=mass,
+                mass_point=point,
+                resistance=servo.resistance / labels.count(servo.joint),
+                armature=servo.armature * labels.count(servo.joint),
+                free_drag=servo.free_drag * labels.count(servo.joint),
+            )
+            for k, servo in enumerate(self._law.servos(labels, np.abs(self._scale)))
+            if labels.index(servo.joint) == k
             for mass, point in [masses.get(servo.joint, (0.0, None))]
         ]
+        self._first = [labels.index(label) for label in labels]
         bare = _plant_only(scenario)
         q = _start_coordinates(bare, robot, dict(zip(served.values(), np.asarray(posture).tolist(), strict=True)))
         start = State(0.0, q, np.zeros(len(robot.links)), np.zeros(0))
@@ -228,7 +240,10 @@ class SimulatedArm:
         positions = (drive.set_position - self._zero) / self._scale
         rates = drive.set_velocity / self._scale
         for k, label in enumerate(self._labels):
-            simulation.set_brake(label, bool(self._on_stand[k] or self._jammed[k]))
+            if self._first[k] != k:
+                continue
+            jammed = any(self._jammed[j] for j, first in enumerate(self._first) if first == k)
+            simulation.set_brake(label, bool(self._on_stand[k] or jammed))
             command = ("off", 0.0, 0.0)
             if drive.enabled[k]:
                 in_position_mode = drive.in_position_mode[k]
