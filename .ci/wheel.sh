@@ -1,7 +1,8 @@
 #!/usr/bin/env bash
 # The wheel, as somebody installs it: built, checked, and in a clean environment and an empty folder it compares the
-# elbows; on every Python of those it supports that is installed, and on the oldest one with the oldest libraries that
-# pyproject.toml allows. Arguments: versions to try instead, such as 3.12, oldest.
+# elbows; on every supported Python that is installed, on the oldest one with the oldest libraries that pyproject.toml
+# allows, and on the newest one with the newest libraries, without constraints. Versions that are not installed are
+# listed at the end. Arguments: versions to try instead, such as 3.12, oldest, newest.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 root=$PWD
@@ -14,20 +15,31 @@ python3 -m venv "$scratch/tools"
 "$scratch/tools/bin/twine" check --strict "$scratch"/dist/*
 wheel=$(echo "$scratch"/dist/*.whl)
 
-python_of() {  # the interpreter of a version, of the system or of pyenv; nothing where there is none
-  command -v "/usr/bin/python$1" || { ls -d "${PYENV_ROOT:-$HOME/.pyenv}"/versions/"$1".*/bin/python 2> /dev/null || true; } | tail -1
+python_of() {  # the interpreter of a version, of the system or of pyenv; no output if it is not installed
+  command -v "/usr/bin/python$1" || { ls -d "${PYENV_ROOT:-$HOME/.pyenv}"/versions/"$1".*/bin/python 2> /dev/null || true; } | sort -V | tail -1
 }
 
-for version in ${@:-3.11 3.12 3.13 3.14 oldest}; do
+# The classifiers name the supported versions; pyproject.toml also allows 3.14 and later ones, which are tried if installed.
+supported=$(grep -o 'Python :: 3\.[0-9]*' pyproject.toml | grep -o '3\..*'; echo 3.14)
+oldest=$(echo "$supported" | sort -V | head -1)
+found=() missing=()
+for version in $({ echo "$supported"; for minor in {11..30}; do [ -z "$(python_of "3.$minor")" ] || echo "3.$minor"; done; } | sort -Vu); do
+  if [ -n "$(python_of "$version")" ]; then found+=("$version"); else missing+=("$version"); fi
+done
+
+for version in ${@:-${found[@]} oldest newest}; do
   constraints=(-c "$root/.ci/constraints.txt")
-  python=$(python_of "${version/oldest/3.11}")
+  number=${version/oldest/$oldest}
+  python=$(python_of "${number/newest/${found[-1]}}")
   if [ -z "$python" ]; then
-    echo "wheel: no Python $version here"
+    missing+=("$version")
     continue
   fi
   if [ "$version" = oldest ]; then
-    "$scratch/tools/bin/uv" pip compile --quiet --resolution lowest-direct --python-version 3.11 pyproject.toml > "$scratch/oldest.txt"
+    "$scratch/tools/bin/uv" pip compile --quiet --resolution lowest-direct --python-version "$oldest" pyproject.toml > "$scratch/oldest.txt"
     constraints=(-c "$scratch/oldest.txt")
+  elif [ "$version" = newest ]; then
+    constraints=(--upgrade numpy scipy)
   fi
   "$python" -m venv "$scratch/$version"
   "$scratch/$version/bin/pip" install --quiet --disable-pip-version-check "${constraints[@]}" "$wheel"
@@ -56,3 +68,6 @@ END
   )
   rm -rf "$scratch/$version" "$scratch/cache-$version"
 done
+if [ ${#missing[@]} != 0 ]; then
+  echo "wheel: NOT tested, because not installed: Python $(printf '%s\n' "${missing[@]}" | sort -Vu | paste -sd " ")"
+fi

@@ -38,7 +38,7 @@ from dynsim.cli.drawing import (
     warn_about_meshes,
 )
 from dynsim.cli.export import export
-from dynsim.cli.hardware import EXAMPLE, hw, hw_drive
+from dynsim.cli.hardware import EXAMPLE, IMPORT_EXAMPLE, hw, hw_drive, import_recording
 from dynsim.cli.plan import EXAMPLE as PLAN_EXAMPLE
 from dynsim.cli.plan import plan
 from dynsim.cli.sweep import sweep
@@ -279,6 +279,7 @@ def schema() -> None:
 
 app.command(epilog="Example: dynsim sweep elbow_comparison --variants all --grid contacts.friction=0:1:5")(sweep)
 # The commands `hw …` load modules for serial ports and servos only when they run.
+app.command("import", epilog=IMPORT_EXAMPLE)(import_recording)
 hw.command("drive", epilog=EXAMPLE)(hw_drive)
 app.add_typer(hw, name="hw")
 app.command(

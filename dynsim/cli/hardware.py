@@ -29,7 +29,7 @@ from dynsim.cli.teleop import (
     print_drive,
     require,
 )
-from dynsim.errors import DynsimError
+from dynsim.errors import DynsimError, RecordError
 from dynsim.hardware.errors import ReplayInterrupted, ServoMapError, VerificationFailed
 from dynsim.system import interruption
 from dynsim.system.files import file_name, json_text, write_json
@@ -647,6 +647,72 @@ def _write_page(name: str, folder: Path, result: Any, *, quiet: bool) -> None:
     if result is not None and len(result.record):
         records["measured"] = result.record
     write_view(records, folder, quiet)
+
+
+# Command ``dynsim import``: the user converts recorded joint positions to a record that servos can replay.
+IMPORT_EXAMPLE = "Example: dynsim import demonstration.csv --map arm --unit deg"
+PositionUnit = StrEnum("PositionUnit", ["rad", "deg", "tick"])
+
+
+def import_recording(
+    file: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FILE",
+            help="CSV file with columns for time and joints, MCAP file with joint states, or record with positions.",
+        ),
+    ],
+    map_file: MapFile,
+    unit: Annotated[
+        PositionUnit | None,
+        typer.Option("--unit", help="Unit of columns whose names contain no unit, as in `elbow [deg]`."),
+    ] = None,
+    bandwidth: Annotated[
+        float | None,
+        typer.Option(
+            "--bandwidth", help="Bandwidth of the motion [Hz]; default: a sixth of the sampling rate, max. 5."
+        ),
+    ] = None,
+    rate: Annotated[
+        float | None, typer.Option("--rate", help="Sampling rate of the record [Hz]; default: the rate in the map.")
+    ] = None,
+    topic: Annotated[
+        str | None, typer.Option("--topic", help="Topic in an MCAP file; default: the only one with joint states.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Output file; default: the name of FILE with the suffix .h5.")
+    ] = None,
+    trust: TrustOption = False,
+) -> None:
+    """Import recorded joint positions as a smooth motion with velocities, for `dynsim hw replay`."""
+    from dynsim.hardware.imported import import_motion
+    from dynsim.hardware.servo_map import load_servo_map
+
+    target = out or file.with_suffix(".h5")
+    if target.exists() and target.samefile(file):
+        raise RecordError(f"{file} would be overwritten; choose another file with --out")
+    record, joints, notes = import_motion(
+        file,
+        load_servo_map(map_file),
+        unit=unit.value if unit else None,
+        bandwidth=bandwidth,
+        rate=rate,
+        topic=topic,
+        trust=trust,
+    )
+    record.save(target)
+    table = Table("joint", "samples at [Hz]", "deviation: rms [mrad]", "max [mrad]", "outliers")
+    for joint in joints:
+        numbers = (f"{1 / joint.step:.4g}", f"{1e3 * joint.rms:.3g}", f"{1e3 * joint.max:.3g}")
+        table.add_row(joint.joint, *numbers, str(len(joint.outliers)))
+    console.print(table)
+    for note in notes:
+        console.print(f"note: {note}")
+    console.print(
+        f"cubic smoothing spline, bandwidth {joints[0].bandwidth:.3g} Hz (half amplitude), {len(record)} samples in "
+        f"{record.time[-1]:.2f} s"
+    )
+    console.print(f"written: {target}\nto check: dynsim hw check {target} --map {map_file}")
 
 
 # Prompts of the commands that move a robot: before a replay, and when the joints are nudged one by one.

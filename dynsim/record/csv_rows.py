@@ -17,7 +17,7 @@ from dynsim.system.inputs import read_text
 SIZE_LIMIT = 100_000_000
 # The pattern is needed because float() also accepts "1_0" and digits of other scripts, which other programs would not
 # read as numbers.
-_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?", re.ASCII | re.IGNORECASE)
+NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?", re.ASCII | re.IGNORECASE)
 
 
 def read_rows(file: str, *headers: Sequence[str], kind: str) -> list[list[float]]:
@@ -105,7 +105,7 @@ def _row(line: str, columns: Sequence[str], location: str) -> list[float]:
     if len(cells) != len(columns):
         names = f": {','.join(columns)}" if columns[0] != "1" else ", as in the first row"
         raise ValueError(f"{location}: has {len(cells)} values; there must be {len(columns)}{names}")
-    if not all(_NUMBER.fullmatch(cell) and math.isfinite(float(cell)) for cell in cells):
+    if not all(NUMBER.fullmatch(cell) and math.isfinite(float(cell)) for cell in cells):
         raise ValueError(f"{location}: {_shown(line)} must be {len(columns)} finite numbers, written in digits 0 to 9")
     return [float(cell) for cell in cells]
 
@@ -126,6 +126,6 @@ def csv_table(names: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> str:
 
 def csv_cell(value: Any) -> Any:
     """Return a cell of a table; a text that a spreadsheet would compute as a formula gets an apostrophe in front."""
-    if isinstance(value, str) and value.startswith(("=", "+", "-", "@", "\t", "\r")) and not _NUMBER.fullmatch(value):
+    if isinstance(value, str) and value.startswith(("=", "+", "-", "@", "\t", "\r")) and not NUMBER.fullmatch(value):
         return f"'{value}"
     return value

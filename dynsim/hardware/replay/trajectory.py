@@ -437,6 +437,10 @@ def column_of(record: Record, signal: str, servo: MappedServo, unit: str) -> Arr
         If the signal or column does not exist, has another unit, or contains a value that is not finite.
     """
     if signal not in record:
+        follows = servo.kind.follows
+        if signal == follows.velocity and follows.position in record:
+            fix = "add velocities with `dynsim import RECORD --map MAP --out FILE`"
+            raise CheckRefused(f"the record has positions {follows.position!r} but no velocities {signal!r}; {fix}")
         raise CheckRefused(
             f"{servo.entry}: unknown signal {signal!r}; the record has {', '.join(record)}{suggest(signal, record)}"
         )
