@@ -330,7 +330,7 @@ def compare(
     ] = None,
     trust: TrustOption = False,
 ) -> None:
-    """Compare a simulated and a measured run: delay, rms and maximum error per joint and wheel."""
+    """Compare a simulated and a measured run: delay, errors of joints and wheels, torques and currents."""
     from dynsim.hardware.replay.compare import check_gate, compare_records, draw_comparison, load_gate
     from dynsim.record import Record
 
@@ -355,6 +355,13 @@ def compare(
             angles = [f"{wheel.turned:.3f}", f"{wheel.angle_max:.4f}", f"{wheel.angle_end:+.4f}"]
             wheels.add_row(wheel.wheel, *rates, *angles)
         console.print(wheels)
+    if comparison.efforts:
+        efforts = Table("joint", "effort", "rms: simulated", "measured", "error: rms", "max", "at [s]")
+        for effort in comparison.efforts:
+            sizes = (effort.simulated_rms, effort.measured_rms, effort.rms, effort.max)
+            numbers = [f"{size:.3f}" for size in (*sizes, effort.time_of_max)]
+            efforts.add_row(effort.joint, f"{effort.quantity} [{effort.unit}]", *numbers)
+        console.print(efforts)
     why = "" if common else " (no delay explains half of the mean square error over all joints)"
     console.print(f"{comparison.delay_text}{why}, worst joint {comparison.worst.joint}")
     write_json(folder / "comparison.json", comparison.summary())

@@ -290,7 +290,8 @@ def _columns(path: Path, header: list[str]) -> tuple[tuple[int, float], dict[int
     if clock is None:
         shown = brief(",".join(header))
         raise RecordError(
-            f"{path}:1: no column with the time in {shown}; name it 'time [s]', and separate columns by commas"
+            f"{path}:1: no column with the time in {shown}; rename that column to 'time [s]', and separate columns by "
+            "commas"
         )
     return clock, joints
 

@@ -44,6 +44,7 @@ from dynsim.hardware.bus.control_table import (
     MAX_ID,
     MODELS,
     MX_106,
+    PWM_PER_UNIT,
     RAD_PER_TICK,
     RAD_S_PER_UNIT,
     SINGLE_TURN,
@@ -600,6 +601,10 @@ class MappedServo:
     def to_torque(self, effort: int) -> float:
         """Return the estimated joint torque [N·m] for a value of the register at address 126."""
         return self.sign * self.gear * self.model.torque(effort)
+
+    def to_pwm(self, units: int) -> float:
+        """Return the PWM in the direction of the joint, as a fraction of the supply voltage, for a register value."""
+        return self.sign * units * PWM_PER_UNIT
 
     @property
     def tick_limits(self) -> tuple[int, int]:

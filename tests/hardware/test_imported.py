@@ -174,7 +174,11 @@ REFUSED: dict[str, tuple[Callable[[list[list[object]]], list[list[object]]], str
     ),
     "seconds": (lambda rows: rows, "time [ms],pan [rad],lift [rad]", r"pan is sampled at 3e\+04 Hz .*correct the unit"),
     "unit": (lambda rows: rows, "time,pan,lift", r":1: column 'pan' has no unit; use --unit rad"),
-    "no time": (lambda rows: rows, "a,pan [rad],lift [rad]", r":1: no column with the time .*; name it 'time \[s\]'"),
+    "no time": (
+        lambda rows: rows,
+        "a,pan [rad],lift [rad]",
+        r":1: no column with the time .*; rename that column to 'time \[s\]'",
+    ),
     "twice": (lambda rows: rows, "time,lift.pos [rad],lift [rad]", r":1: columns .* are both positions of lift"),
     "joint": (lambda rows: rows, "time,pan [rad],lfit [rad]", r"no positions of lift \(.*:9: servos\.lift\); did you"),
     "short": (lambda rows: rows[:5], HEAD, r"pan has 5 samples; a motion requires 8 or more"),
@@ -200,7 +204,7 @@ def test_a_record_without_velocities_names_the_import(servo_map: ServoMap, tmp_p
     time = np.arange(0.0, 5.0, 1 / RATE)
     record = Record(time)
     record.add("q", exact(time), "rad", labels=("pan", "lift"))
-    with pytest.raises(CheckRefused, match=r"positions 'q' but no velocities 'v'; add .*`dynsim import"):
+    with pytest.raises(CheckRefused, match=r"no velocities 'v', only q; add velocities .*`dynsim import"):
         check_motion(record, servo_map)
 
 

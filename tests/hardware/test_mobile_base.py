@@ -40,9 +40,9 @@ def test_joints_of_the_arm_are_replayed_and_compared(
     assert list(measured.labels["q"]) == joints
     compared = compare_records(record, measured)
     assert [joint.joint for joint in compared.joints] == joints
-    # Joint 1 went to and fro by 25°; the servos are a tick, 1.5 mrad, from their goals at rest.
+    # Joint 1 went to and fro by 25°; at each end the friction of the gear costs some mrad.
     assert np.ptp(measured["q"][:, 0]) == pytest.approx(
-        np.ptp(record["q"][:, record.labels["q"].index("joint_1")]), abs=0.01
+        np.ptp(record["q"][:, record.labels["q"].index("joint_1")]), abs=0.02
     )
     # What is left is the lag of the servos' position loops.
     assert max(joint.rms_delay_removed for joint in compared.joints) < 0.005

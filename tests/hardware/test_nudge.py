@@ -45,8 +45,8 @@ def test_a_joint_goes_out_and_back_and_nobody_else_gets_torque(rig, joint: str, 
     assert {id_ for _, id_, value in run.writes_of(64) if value and id_ != 254} == {servo.id}
     assert all(id_ == servo.id for _, id_, _ in run.goals())
     assert [servos.registers[id_]["torque_enable"] for id_ in run.map.ids] == [0, 0, 0]
-    # Back within the lag of the wheel, which counts no angle; a position servo to the tick.
-    assert servos.plant.position == pytest.approx(before, abs=0.01 if joint == "wheel" else 2 * RAD_PER_TICK)
+    # Back within the lag of the wheel, which counts no angle; a position servo within the friction of its gear.
+    assert servos.plant.position == pytest.approx(before, abs=0.01 if joint == "wheel" else 4 * RAD_PER_TICK)
 
 
 def test_goals_of_a_nudge_are_slow(rig) -> None:

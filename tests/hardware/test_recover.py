@@ -149,7 +149,7 @@ def test_a_refused_start_leaves_no_empty_files(rig: Rig, tmp_path: Path, monkeyp
 def test_a_stream_of_another_version_is_refused(streamed, tmp_path: Path) -> None:
     line, _, rows = streamed[1].partition(b"\n")
     header = json.loads(line)
-    for change in ({"format": 2}, {"row": header["row"][1:]}, {"layout": {}}):
+    for change in ({"format": 1}, {"row": header["row"][1:]}, {"layout": {}}):
         (tmp_path / PART).write_bytes(json.dumps(header | change).encode() + b"\n" + rows)
         with raises(RecordError, "measured.part"):
             recover(tmp_path)

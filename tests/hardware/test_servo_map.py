@@ -253,7 +253,7 @@ def test_calibration_refuses_torque_movement_and_impossible_zeros(rig, write_map
         read_zero_ticks(run.replay.bus, rig.map.servos[:2])
     run = rig.prepare()
     run.line.servos.plant.velocity[0] = 2.0
-    with raises(VerificationFailed, "shoulder", "2116", "2149"):
+    with raises(VerificationFailed, "shoulder", "2116", "2146"):
         read_zero_ticks(run.replay.bus, rig.map.servos[:2])
     path = write_map()
     before = path.read_text(encoding="utf-8")

@@ -20,6 +20,7 @@ from dynsim.errors import ModelError
 from dynsim.hardware.bus.control_table import MX_28, MX_106, RAD_PER_TICK
 from dynsim.hardware.errors import ServoMapError
 from dynsim.hardware.servo_map import load_servo_map
+from dynsim.hardware.virtual import simulated_plant
 from dynsim.hardware.virtual.line import VirtualLine, line_for_map
 from dynsim.hardware.virtual.servos import PHYSICS_STEP
 from dynsim.hardware.virtual.simulated_plant import (
@@ -39,6 +40,15 @@ pytestmark = pytest.mark.long
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 ARM = SCENARIOS / "elbow_comparison.yaml"
 ARM_MAP = SCENARIOS / "hardware" / "arm.yaml"
+
+
+GEAR_FRICTION = simulated_plant.GEAR_FRICTION
+
+
+@pytest.fixture(autouse=True)
+def frictionless(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Gears without friction, so that angles agree with the mechanics to rounding; friction has a separate test."""
+    monkeypatch.setattr(simulated_plant, "GEAR_FRICTION", 0.0)
 
 
 def asked(count: int, *, enabled: bool, at: np.ndarray, voltage: float = 12.0) -> Drive:
@@ -147,6 +157,21 @@ def test_a_limp_arm_falls_and_stays_above_the_floor_with_its_elbows() -> None:
     elbows = [model.point_position(body, np.zeros(3), plant.joint_positions)[2] for body in ("link_4", "link_7")]
     assert min(elbows) > -1e-9
     assert model.point_position(*model.robot.hand, plant.joint_positions)[2] < before - 0.1
+
+
+def test_gear_friction_carries_a_part_of_the_weight(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At rest the motor and the friction of the gear carry the weight together."""
+    monkeypatch.setattr(simulated_plant, "GEAR_FRICTION", GEAR_FRICTION)
+    posture = {"joint_1": 0.0} | {f"joint_{k}": 0.02 for k in range(2, 11)}
+    line, plant, model = armed("no_elbow", posture)
+    line.advance(line.time + 8.0)
+    q, law = plant.joint_positions, MotorLaw([servo.model for servo in load_servo_map(ARM_MAP).servos])
+    carried = model.bias_forces(q, np.zeros(10)) - law.stiffness * (np.array(list(posture.values())) - q)
+    # Half a tick of 1.5 mrad times 41 N·m/rad is 0.03 N·m.
+    assert (np.abs(carried) <= law.friction + 0.05).all()
+    assert (np.abs(carried) > 0.06).any()
+    line.advance(line.time + 0.5)
+    assert np.abs(plant.joint_positions - q).max() < 1e-6
 
 
 def test_it_is_the_simulation_of_the_same_arm_with_position_servos() -> None:

@@ -20,7 +20,7 @@ from dynsim.hardware.bus.control_table import BAUD_RATES, MODELS, MX_28, MX_106,
 from dynsim.hardware.bus.packet import Packet, StatusError, crc16, encode, encode_fast
 from dynsim.hardware.bus.protocol import VirtualClock
 from dynsim.hardware.virtual.line import VirtualLine, VirtualPort
-from dynsim.hardware.virtual.servos import BOOT_TIME, ServoRegisters
+from dynsim.hardware.virtual.servos import BOOT_TIME, CURRENT_NOISE, ServoRegisters
 
 F = MX_106.fields
 BAUD, BAUD_CODE = 1_000_000, 3
@@ -292,9 +292,12 @@ def test_every_model_follows_a_goal_and_tells_its_effort(model: ServoModel) -> N
     line.wait(0.01)
     effort = "present_current" if model.measures_current else "present_load"
     line.servos.measure(0)
-    assert model.torque(line.servos.registers[1][effort]) == pytest.approx(line.servos.plant.torque[0], abs=0.02)
+    noise = 4 * CURRENT_NOISE * model.stall_torque
+    assert model.torque(line.servos.registers[1][effort]) == pytest.approx(
+        line.servos.plant.torque[0], abs=0.02 + noise
+    )
     line.wait(1.0)
-    assert abs(line.read(1, "present_position") - goal) <= 1
+    assert abs(line.read(1, "present_position") - goal) <= 3, "the friction of the gear is 2.7 ticks of the stiffness"
     assert line.servos.registers[1]["velocity_limit"] * 0.229 == pytest.approx(
         model.no_load_speed * 60 / 6.2832, rel=0.6 if model.name == "MX-64" else 0.1
     ), "the factory's limit is about the no-load speed"

@@ -91,6 +91,8 @@ def servos(record: Record) -> Figure | None:
         for name, label in (
             ("torque_estimate", "torque [N m],\nestimated"),
             ("current", "current [A]"),
+            ("load", "load / stall\ntorque"),
+            ("pwm", "PWM / supply\nvoltage"),
             ("supply_voltage", "supply [V]"),
             ("temperature", "temperature\n[°C]"),
         )
@@ -288,7 +290,7 @@ def _draw(values: Axes, errors: Axes, time: Array, quantity: Compared, named: Se
     chosen = [quantity.names.index(name) for name in dict.fromkeys(named) if name in quantity.names] or ranking[
         :HIGHLIGHTED
     ]
-    looks = style.variant_styles([quantity.names[k] for k in chosen])
+    looks = style.variant_styles([quantity.names[k] for k in sorted(chosen)])
     simulated, measured = quantity.values
     coloured = {
         k: {key: looks[quantity.names[k]][key] for key in ("color", "linestyle")} | {"linewidth": 1.2} for k in chosen

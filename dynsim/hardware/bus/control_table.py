@@ -282,5 +282,9 @@ MODEL_BY_NUMBER = {model.number: model for model in MODELS.values()}
 TABLE_SIZE = 662
 STATE_BLOCK = (126, 10)
 """Address and length of the block read from every servo in each cycle: effort (2), velocity (4) and position (4)."""
+RAW_BLOCK = (124, 12)
+"""The same block with the PWM (2) before it, which is read in each cycle if the bus has time for it."""
+PWM_PER_UNIT = 1 / 885
+"""Unit of present, goal and maximum PWM, as a fraction of the supply voltage."""
 HEALTH_BLOCK = (64, 83)
 """Address and length of the block that is read from the servos in turn: registers from torque enable to temperature."""

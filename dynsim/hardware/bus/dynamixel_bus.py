@@ -217,6 +217,7 @@ class DynamixelBus:
         self._library = Protocol2PacketHandler()
         # The keys are ("address", address of the registers) for sync reads and ("id", ID) for reads from one servo.
         self._lengths: dict[tuple[str, int], RequestLengths] = {}
+        self._arrivals: dict[int, float] = {}  # time at which the last packet of each servo arrived [ms], by ID
 
     @property
     def longest_pause(self) -> float:
@@ -284,8 +285,10 @@ class DynamixelBus:
             answers, others, garbage = self._receive(ids, asked)
         if len(answers) < len(ids):
             lengths.miss(asked)
+        now = self.port.getCurrentTime()
         replies = {
-            id_: ServoReply(packet.parameters[:length], bool(packet.error & ALERT)) for id_, packet in answers.items()
+            id_: ServoReply(packet.parameters[:length], bool(packet.error & ALERT), (now - self._arrivals[id_]) * 1e-3)
+            for id_, packet in answers.items()
         }
         outdated = (id_ for id_, packet in others.items() if length <= len(packet.parameters) < length + LATE_READS)
         return BlockRead(replies, stray + garbage, frozenset(outdated))
@@ -321,6 +324,7 @@ class DynamixelBus:
                 # Skip requests echoed by the adapter.
                 if packet.instruction == STATUS and packet.id in asked_of:
                     (answers if len(packet.parameters) == asked else others)[packet.id] = packet
+                    self._arrivals[packet.id] = self.port.getCurrentTime()
 
         while len(answers) < len(ids) and not self.port.isPacketTimeout():
             sort_in(decoder.feed(self.port.readPort(total)))

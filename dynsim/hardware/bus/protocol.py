@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,10 +20,13 @@ class ServoReply(NamedTuple):
     data : bytes
     alert : bool
         True if the hardware error register of the servo is not zero.
+    age : float
+        Time from the arrival of the answer to the end of the read [s]; NaN for a read from a single servo.
     """
 
     data: bytes
     alert: bool
+    age: float = math.nan
 
 
 @dataclass(frozen=True)

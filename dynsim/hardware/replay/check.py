@@ -25,7 +25,7 @@ from typing import ClassVar, Literal, NamedTuple, Protocol
 import numpy as np
 
 from dynsim.errors import CheckRefused
-from dynsim.hardware.bus.control_table import HEALTH_BLOCK, RAD_PER_TICK, STATE_BLOCK
+from dynsim.hardware.bus.control_table import HEALTH_BLOCK, RAD_PER_TICK, RAW_BLOCK, STATE_BLOCK
 from dynsim.hardware.replay.measured import unmeasured
 from dynsim.hardware.replay.output import Stopped
 from dynsim.hardware.replay.rules import Cause, Fault, needs_of_map
@@ -304,19 +304,29 @@ def plan_cycle(servo_map: ServoMap, rate: float) -> CyclePlan:
     count = len(servo_map.servos)
     groups = [sum(servo.in_position_mode is mode for servo in servo_map.servos) for mode in (True, False)]
     written = sum(14 + 5 * members for members in groups if members)
-    read = 14 + count + count * (11 + STATE_BLOCK[1])
     byte_time = BITS_PER_BYTE / servo_map.bus.baud
     per_status = servo_map.bus.return_delay + TURNAROUND
-    cycle_time = (written + read) * byte_time + count * per_status + USB_TRANSACTION
     health_time = (14 + 11 + HEALTH_BLOCK[1]) * byte_time + per_status + USB_TRANSACTION
-    available = BUS_SHARE / rate - cycle_time
+
+    def cycle(block: tuple[int, int]) -> tuple[float, float]:
+        """Return the duration of a cycle that reads ``block``, and the time that is left for a health read [s]."""
+        read = 14 + count + count * (11 + block[1])
+        duration = (written + read) * byte_time + count * per_status + USB_TRANSACTION
+        return duration, BUS_SHARE / rate - duration
+
+    cycle_time, available = cycle(STATE_BLOCK)
     if available <= 0:
         highest = math.floor(BUS_SHARE / (cycle_time + 0.1 * health_time))
         raise CheckRefused(
             f"{count} servos at {servo_map.bus.baud / 1e6:g} Mbit/s need {cycle_time * 1e3:.2f} ms per cycle, but "
             f"{rate:g} Hz leaves {1e3 / rate:.2f} ms; use --rate {highest} or less, or a higher baud rate"
         )
-    return CyclePlan(rate, cycle_time, max(1, math.ceil(health_time / available)))
+    health_every = max(1, math.ceil(health_time / available))
+    # Also read the PWM, unless this delays the health reads, on which abort rules depend.
+    raw_time, left = cycle(RAW_BLOCK)
+    if left > 0 and max(1, math.ceil(health_time / left)) == health_every:
+        return CyclePlan(rate, raw_time, health_every, RAW_BLOCK)
+    return CyclePlan(rate, cycle_time, health_every)
 
 
 class MotionLimits:

@@ -29,6 +29,9 @@ MOVING = 3 * RAD_PER_TICK
 WHEEL_ANGLE, WHEEL_RATE = "rho", "rho_dot"
 """Signals of wheels. A wheel can turn without limit, so its rate and the angle turned since the start are compared."""
 
+EFFORTS = (("torque", "torque_estimate", "N m"), ("current", "current", "A"))
+"""Name of each effort in a simulated record and in a measured record, and its unit."""
+
 
 class Gate(StrictConfig):
     """Error bounds for a comparison.
@@ -106,6 +109,32 @@ class WheelError:
 
 
 @dataclass(frozen=True)
+class EffortError:
+    """Error of the torque or current of one joint: measured minus simulated, with the common delay removed.
+
+    Attributes
+    ----------
+    joint, quantity, unit : str
+        Name of the joint; "torque" in "N m" or "current" in "A", which is the unit of the following values.
+    simulated_rms, measured_rms : float
+        Rms values.
+    rms, max : float
+        Rms and maximum error.
+    time_of_max : float
+        Time of ``max`` [s of record time].
+    """
+
+    joint: str
+    quantity: str
+    unit: str
+    simulated_rms: float
+    measured_rms: float
+    rms: float
+    max: float
+    time_of_max: float
+
+
+@dataclass(frozen=True)
 class Comparison:
     """Comparison of simulated and measured angles at the times of the measured run.
 
@@ -116,21 +145,27 @@ class Comparison:
     joints : tuple of JointError
     wheels : tuple of WheelError
         Empty if the records have no wheels in common.
+    efforts : tuple of EffortError
+        Torques and currents that both records contain.
     time : array, shape (T,)
         Record time [s].
     simulated, measured : array, shape (T, N)
         Joint angles [rad].
     wheel_rates : array, shape (2, T, number of wheels)
         Simulated and measured wheel rates [rad/s].
+    effort_values : array, shape (2, T, number of efforts)
+        Simulated and measured efforts.
     """
 
     delay: float
     joints: tuple[JointError, ...]
     wheels: tuple[WheelError, ...]
+    efforts: tuple[EffortError, ...]
     time: Array
     simulated: Array
     measured: Array
     wheel_rates: Array
+    effort_values: Array
 
     @property
     def worst(self) -> JointError:
@@ -144,6 +179,7 @@ class Comparison:
 
     def summary(self) -> dict[str, Any]:
         """Return the results as a dictionary for JSON, with units in the keys."""
+        values = ("simulated_rms", "measured_rms", "rms", "max")
         joint_units = {"rms": "rad", "max": "rad", "rms_delay_removed": "rad", "delay": "s"}
         wheel_units = {
             "rate_rms": "rad_s", "rate_max": "rad_s", "turned": "rad", "angle_max": "rad", "angle_end": "rad"
@@ -158,6 +194,14 @@ class Comparison:
             "wheel_angle_max_rad": max((wheel.angle_max for wheel in self.wheels), default=None),
             "joints": {joint.joint: _with_units(joint, joint_units) for joint in self.joints},
             "wheels": {wheel.wheel: _with_units(wheel, wheel_units) for wheel in self.wheels},
+            **{
+                f"{quantity}s": {
+                    effort.joint: _with_units(effort, dict.fromkeys(values, unit.replace(" ", "_")))
+                    for effort in self.efforts
+                    if effort.quantity == quantity
+                }
+                for quantity, _, unit in EFFORTS
+            },
         }
 
 
@@ -165,7 +209,7 @@ def _number(value: float) -> float | None:
     return None if np.isnan(value) else value
 
 
-def _with_units(error: JointError | WheelError, units: dict[str, str]) -> dict[str, float | None]:
+def _with_units(error: JointError | WheelError | EffortError, units: dict[str, str]) -> dict[str, float | None]:
     return {f"{name}_{unit}": _number(getattr(error, name)) for name, unit in units.items()}
 
 
@@ -235,7 +279,8 @@ def compare_records(simulated: Record, measured: Record) -> Comparison:
             )
         )
     wheels, rates = _wheel_errors(simulated, measured, rows, time, speed)
-    return Comparison(common / speed, tuple(joints), wheels, time, at(time), actual, rates)
+    efforts, effort_values = _effort_errors(simulated, measured, rows, time, delay)
+    return Comparison(common / speed, tuple(joints), wheels, efforts, time, at(time), actual, rates, effort_values)
 
 
 def _rms(error: Array) -> float:
@@ -279,6 +324,31 @@ def _wheel_errors(
             )
         )
     return tuple(errors), rates
+
+
+def _effort_errors(
+    simulated: Record, measured: Record, rows: NDArray[np.bool_], time: Array, delay: float
+) -> tuple[tuple[EffortError, ...], Array]:
+    """Return the errors of torques and currents, and their values as in :class:`Comparison`."""
+    labels = measured.provenance.get("labels", {})
+    own_time = simulated.time - simulated.time[0]
+    errors, values = [], [np.zeros((2, len(time), 0))]
+    for quantity, sensor, unit in EFFORTS:
+        name = sensor if sensor in measured else quantity
+        if any(n not in record or record[n].ndim != 2 for n, record in ((quantity, simulated), (name, measured))):
+            continue
+        for column, joint in enumerate(measured.labels[name]):
+            data = np.asarray(measured[name][rows, column], dtype=np.float64)
+            label = labels.get(joint, joint)
+            if label not in simulated.labels[quantity] or not np.isfinite(data).any():
+                continue
+            ours = simulated[quantity][:, simulated.labels[quantity].index(label)]
+            pair = np.stack([np.interp(time - delay, own_time, ours), data])
+            largest, when = _largest(pair[1] - pair[0], time)
+            sizes = (_rms(pair[0]), _rms(pair[1]), _rms(pair[1] - pair[0]))
+            errors.append(EffortError(label, quantity, unit, *sizes, largest, when))
+            values.append(pair[:, :, None])
+    return tuple(errors), np.concatenate(values, axis=2)
 
 
 def _columns(simulated: Record, measured: Record, name: str) -> list[tuple[str, Array, Array]]:
@@ -383,7 +453,7 @@ def check_gate(comparison: Comparison, gate: Gate) -> None:
 
 
 def draw_comparison(comparison: Comparison, path: Path, joints: Sequence[str] = ()) -> Path:
-    """Draw measured and simulated angles of some joints, and the errors of all joints; draw the same for wheels.
+    """Draw measured and simulated angles of some joints, and the errors of all joints; the same for wheels and efforts.
 
     Parameters
     ----------
@@ -422,6 +492,17 @@ def draw_comparison(comparison: Comparison, path: Path, joints: Sequence[str] = 
         quantities.append(
             Followed("wheels", "wheel rate [rad/s]", "measured − sim. [rad/s]", 1.0, wheels, rms, texts, both)
         )
+    for quantity, _, unit in EFFORTS:
+        columns = [k for k, effort in enumerate(comparison.efforts) if effort.quantity == quantity]
+        chosen = [comparison.efforts[k] for k in columns]
+        if chosen:
+            texts = [f"{error.joint}: rms {error.rms:.3g} {unit}, max. {error.max:.3g}" for error in chosen]
+            both = comparison.effort_values[:, :, columns]
+            rms, joint_names = [error.rms for error in chosen], [error.joint for error in chosen]
+            label = f"{quantity} [{unit}]"
+            quantities.append(
+                Followed(f"{quantity}s", label, f"measured − sim. [{unit}]", 1.0, joint_names, rms, texts, both)
+            )
     title = (
         f"measured and simulated joints: {comparison.delay_text}, worst {comparison.worst.joint} "
         f"with rms {1e3 * comparison.worst.rms:.3g} mrad"

@@ -26,7 +26,7 @@ from dynsim.hardware.bus.control_table import (
     RAD_PER_TICK,
     RAD_S2_PER_UNIT,
     RAD_S_PER_UNIT,
-    STATE_BLOCK,
+    RAW_BLOCK,
     WATCHDOG_SECONDS_PER_UNIT,
     describe_hardware_error,
 )
@@ -79,8 +79,10 @@ Array = NDArray[np.float64]
 
 FIELDS = MX_106.fields
 """Control table of one model; registers that all models have in common have the same address in all models."""
+PWM = struct.Struct("<h")
 STATE = struct.Struct("<hii")
-"""Layout of effort, velocity and position in a :data:`~dynsim.hardware.bus.control_table.STATE_BLOCK`."""
+"""Layout of effort, velocity and position in a :data:`~dynsim.hardware.bus.control_table.STATE_BLOCK`, which is also
+the end of a :data:`~dynsim.hardware.bus.control_table.RAW_BLOCK`."""
 
 
 GoalRegisters = dict[str, dict[int, int]]
@@ -227,15 +229,21 @@ class Loop:
         began = self.clock.now()
         if write:
             self._send(self.goal, self.goal_rate)
-        block = self.bus.sync_read(self.map.ids, *STATE_BLOCK)
-        exchange = self.clock.now() - began
+        block = self.bus.sync_read(self.map.ids, *self.plan.state_block)
+        ended = self.clock.now()
+        exchange = ended - began
         servos = self.map.servos
         count = len(servos)
-        position, velocity, torque = np.full((3, count), np.nan)
+        position, velocity, torque, current, load, pwm, read_time = np.full((7, count), np.nan)
         alert = np.zeros(count, dtype=bool)
         for index, servo in enumerate(servos):
             if reply := block.replies.get(servo.id):
-                effort, units, ticks = STATE.unpack(reply.data)
+                effort, units, ticks = STATE.unpack(reply.data[-STATE.size :])
+                read_time[index] = ended - reply.age
+                sensor, unit = (current, servo.model.ampere_per_unit) if servo.model.measures_current else (load, 1e-3)
+                sensor[index] = servo.sign * effort * unit
+                if len(reply.data) == RAW_BLOCK[1]:
+                    pwm[index] = servo.to_pwm(PWM.unpack_from(reply.data)[0])
                 torque[index], velocity[index] = servo.to_torque(effort), servo.to_velocity(units)
                 position[index], alert[index] = servo.to_angle(ticks), reply.alert
         cycle = Cycle(
@@ -245,6 +253,11 @@ class Loop:
             position=position,
             velocity=velocity,
             torque=torque,
+            current=current,
+            load=load,
+            pwm=pwm,
+            goal_register=np.array([self._sent.get(servo.id, np.nan) for servo in servos]),
+            read_time=read_time,
             alert=alert,
             lateness=lateness,
             skipped=skipped,
@@ -259,7 +272,9 @@ class Loop:
             # Use a sync read for this servo: if it is silent, this costs one time-out, but no retries.
             answer = self.bus.sync_read((servo.id,), *HEALTH_BLOCK).replies.get(servo.id)
             if answer is not None:
-                cycle.health[servo.id] = servo.model.registers_in(HEALTH_BLOCK[0], answer.data)
+                registers = cycle.health[servo.id] = servo.model.registers_in(HEALTH_BLOCK[0], answer.data)
+                if self.plan.state_block != RAW_BLOCK:
+                    pwm[servos.index(servo)] = servo.to_pwm(registers["present_pwm"])
         now = self.clock.now()
         if self._last_contact < math.inf:
             cycle.silence, self._last_contact = max(began - self._last_contact, now - began), now
@@ -653,10 +668,12 @@ class Replay:
 
     def __post_init__(self) -> None:
         motion, servo_map = self.motion, self.map
-        provenance = {"robot": servo_map.robot, "speed": motion.speed, "rate_Hz": motion.plan.rate}
+        labels = {servo.joint: servo.label for servo in servo_map.servos if servo.label != servo.joint}
+        provenance: dict[str, Any] = {"robot": servo_map.robot, "speed": motion.speed, "rate_Hz": motion.plan.rate}
         self._servos = servo_map.servos
         self._found_holding = False
         self.recorder = Recorder(servo_map)
+        provenance |= {"labels": labels} if labels else {}
         self.layout = Layout.of(servo_map, provenance | servo_map.lifting | self.provenance)
         self.journal = Journal(self.clock, self.recorder, RunLog(), self.observer, self.stop)
         self.loop = Loop(motion.plan, servo_map, self.bus, self.clock, self.stop, self.recorder, self.journal)

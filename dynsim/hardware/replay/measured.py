@@ -36,6 +36,13 @@ from dynsim.system.files import json_text, replace_together
 
 Array = NDArray[np.float64]
 LIFTING = "lifting"
+RAW = (
+    ("current", "A", "motor current, in the direction of the joint"),
+    ("load", "1", "load of servos without a current sensor, as a fraction of the stall torque"),
+    ("pwm", "1", "motor voltage as a fraction of the supply voltage, in the direction of the joint"),
+    ("goal_register", "1", "last goal sent: ticks of 2π/4096 rad, or units of 0.229 rpm for a wheel"),
+)
+"""Names, units and descriptions of the signals with raw data of the servos."""
 FOLLOWED = "copied from the replayed record at record_time; not measured by a servo"
 END_STATE = "unknown: the program died"
 
@@ -86,6 +93,11 @@ def measured_record(rows: Rows, layout: Layout, origin: float) -> Record:
         field = f"goal_{source}" if suffix else source
         record.add(name + suffix, rows[field][:, columns], units[source], labels=labels)
     record.add("torque_estimate", rows["torque"], "N m", labels=joints, description="from motor current or load")
+    for name, unit, text in RAW:
+        if np.isfinite(rows[name]).any():
+            record.add(name, rows[name], unit, labels=joints, description=text)
+    text = "time at which the status of each servo arrived"
+    record.add("read_time", rows["read_time"] - origin, "s", labels=joints, description=text)
     record.add("supply_voltage", rows["volts"], "V", labels=joints)
     record.add("temperature", rows["celsius"], "degC", labels=joints)
     missed = np.isnan(rows["position"])

@@ -321,7 +321,7 @@ LOG_INTERVAL = 1.0
 """Time between two log lines with the following error [s]."""
 PART = "measured.part"
 """Name of the file to which the rows are written during a run; at the end, the measured record replaces it."""
-PART_FORMAT = 1
+PART_FORMAT = 2
 MEASURED, SUMMARY, LOG = "measured.h5", "summary.json", "replay.log"
 REGISTERS, REGISTERS_AFTER_FAULT = "registers.json", "registers_after_fault.json"
 FILES = (PART, MEASURED, SUMMARY, LOG, REGISTERS, REGISTERS_AFTER_FAULT, INCOMPLETE)
@@ -448,11 +448,12 @@ def row_type(servos: int) -> np.dtype[np.void]:
 
     ``time``, ``origin`` (clock time at which the path starts; NaN before the start), ``path_time``, ``lateness`` and
     ``exchange`` are in [s]. Joint positions [rad], velocities [rad/s] and torques [N·m] are NaN if a status was missed.
-    The supply voltage is in [V], the temperature in [°C].
+    The supply voltage is in [V], the temperature in [°C]. The other values are those of a ``Cycle``.
     """
     seconds = ["time", "origin", "path_time", "lateness", "exchange"]
     numbers = ["state", "stray", "skipped"]
     joints = ["goal_position", "goal_velocity", "position", "velocity", "torque", "volts", "celsius"]
+    joints += ["current", "load", "pwm", "goal_register", "read_time"]
     return np.dtype(
         [(name, "f8") for name in seconds]
         + [(name, "i4") for name in numbers]

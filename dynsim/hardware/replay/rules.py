@@ -96,6 +96,13 @@ class Cycle:
         Goals [rad], [rad/s].
     position, velocity, torque : array
         Measured values [rad], [rad/s], [N·m]; NaN if the status was missed.
+    current, load, pwm : array
+        Motor current [A], load as a fraction of the stall torque, and PWM as a fraction of the supply voltage, in the
+        direction of the joint; NaN if the servo does not measure it or it was not read in this cycle.
+    goal_register : array
+        Last goal sent to each servo: ticks in position mode, units of the velocity register in velocity mode.
+    read_time : array
+        Times at which the statuses arrived, on the clock of the replay [s].
     alert : bool array
         Alert bits in the status packets.
     lateness : float
@@ -120,6 +127,11 @@ class Cycle:
     position: NDArray[np.float64]
     velocity: NDArray[np.float64]
     torque: NDArray[np.float64]
+    current: NDArray[np.float64]
+    load: NDArray[np.float64]
+    pwm: NDArray[np.float64]
+    goal_register: NDArray[np.float64]
+    read_time: NDArray[np.float64]
     alert: NDArray[np.bool_]
     lateness: float
     skipped: int

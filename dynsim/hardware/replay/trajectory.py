@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from dynsim.config.problems import suggest
 from dynsim.errors import CheckRefused
+from dynsim.hardware.bus.control_table import STATE_BLOCK
 from dynsim.hardware.servo_map import MappedServo, ServoMap
 from dynsim.record import TIME, Record
 from dynsim.snake.lifting import grounded_pairs, lifted
@@ -115,11 +116,14 @@ class CyclePlan:
         Planned duration of writing all goals and reading all states [s].
     health_every : int
         Number of cycles from one health read to the next; each reads the health of one servo.
+    state_block : tuple of int
+        Address and length of the block that is read from all servos.
     """
 
     rate: float
     cycle_time: float
     health_every: int
+    state_block: tuple[int, int] = STATE_BLOCK
 
 
 @dataclass(frozen=True)
@@ -439,8 +443,10 @@ def column_of(record: Record, signal: str, servo: MappedServo, unit: str) -> Arr
     if signal not in record:
         follows = servo.kind.follows
         if signal == follows.velocity and follows.position in record:
-            fix = "add velocities with `dynsim import RECORD --map MAP --out FILE`"
-            raise CheckRefused(f"the record has positions {follows.position!r} but no velocities {signal!r}; {fix}")
+            raise CheckRefused(
+                f"{servo.entry}: the record has no velocities {signal!r}, only {', '.join(record)}; add velocities to "
+                "positions with `dynsim import RECORD --map MAP --out FILE`"
+            )
         raise CheckRefused(
             f"{servo.entry}: unknown signal {signal!r}; the record has {', '.join(record)}{suggest(signal, record)}"
         )

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from dynsim.hardware.bus.control_table import (
     BAUD_RATES,
     BROADCAST_ID,
+    PWM_PER_UNIT,
     RAD_PER_TICK,
     RAD_S2_PER_UNIT,
     RAD_S_PER_UNIT,
@@ -188,6 +189,8 @@ THERMAL_RESISTANCE = 2.0  # K/W (unverified)
 THERMAL_TIME = 300.0  # s (unverified)
 OVERLOAD_FRACTION = 0.9  # fraction of the stall torque (unverified)
 OVERLOAD_TIME = 1.0  # s (unverified)
+CURRENT_NOISE = 3e-3
+"""Standard deviation of the measured current as a fraction of the stall current (unverified)."""
 SUPPLY_RESISTANCE = 0.05  # Ω
 BROWN_OUT = 0.5
 """Fraction of the rated voltage below which the electronics of the servos stop, and above which they restart
@@ -298,6 +301,7 @@ class VirtualServos:
         self._goal_position, self._goal_velocity = self.plant.position.copy(), np.zeros(count)
         self._profile_velocity, self._profile_acceleration = np.zeros(count), np.zeros(count)
         self._temperature_limit, self._min_voltage = np.zeros(count), np.zeros(count)
+        self._noise = np.random.default_rng(script.seed)
         self.temperature = np.full(count, AMBIENT + 5.0)
         self.play = self.plant.position.copy()
         self._turns = np.zeros(count, dtype=np.int64)
@@ -565,7 +569,14 @@ class VirtualServos:
                 else:
                     angle = angle + fault.angle
         model = self._models[index]
-        effort = model.effort(sense * float(self.plant.torque[index]) * bool(self._drive.enabled[index]))
+        effort = pwm = 0
+        if self._drive.enabled[index]:
+            load = sense * float(self.plant.torque[index]) / model.stall_torque
+            effort = model.effort((load + CURRENT_NOISE * self._noise.standard_normal()) * model.stall_torque)
+            # The voltage of the motor is the part that drives the current and the back-EMF, in units of the rated one.
+            voltage = load + sense * float(self.plant.velocity[index]) / model.no_load_speed
+            pwm = round(voltage * self.supply / max(self._drive.voltage, self._brown_out) / PWM_PER_UNIT)
+        registers["present_pwm"] = pwm
         velocity = round(sense * float(self.plant.velocity[index]) / RAD_S_PER_UNIT)
         registers["present_current" if model.measures_current else "present_load"] = effort
         registers["present_velocity"] = velocity

@@ -39,6 +39,9 @@ VELOCITY_TIME_CONSTANT = 0.02
 FREE_DAMPING = 0.1
 """Damping of an unpowered gear train as a fraction of the back-EMF damping (unverified)."""
 
+GEAR_FRICTION = 0.02
+"""Dry friction of the gear train as a fraction of the stall torque (unverified)."""
+
 
 @dataclass
 class Drive:
@@ -71,6 +74,8 @@ class MotorLaw:
         k [N·m/rad], d [N·m·s/rad], τ_stall at the rated voltage [N·m].
     inertia : array, shape (N,)
         Output inertia for which the position loop is critically damped, d²/(4k) [kg·m²].
+    friction : array, shape (N,)
+        Dry friction of the gear train [N·m], which is not part of :meth:`torque`.
     """
 
     def __init__(self, models: list[ServoModel]) -> None:
@@ -79,6 +84,7 @@ class MotorLaw:
         self.damping = self.stall_torque / np.array([model.no_load_speed for model in models])
         self.stiffness = STIFFNESS_PER_STALL_TORQUE * self.stall_torque
         self.inertia = self.damping**2 / (4 * self.stiffness)
+        self.friction = GEAR_FRICTION * self.stall_torque
         # Imported here, because a replay on real servos imports this module but does not need the simulation.
         from dynsim.model.drives import ServoBank
 
@@ -131,7 +137,11 @@ class InertialLoad:
     def step(self, dt: float, drive: Drive) -> None:
         """Advance by ``dt`` [s]."""
         self.torque = self.law.torque(self.position, self.velocity, drive)
-        self.velocity = np.where(self._jammed, 0.0, self.velocity + dt * self.torque / self.law.inertia)
+        driven = self.velocity + dt * self.torque / self.law.inertia
+        # Dry friction cannot reverse the motion, but stops it. The integral gain of a velocity loop compensates for it.
+        friction = self.law.friction * (drive.in_position_mode | ~drive.enabled)
+        slowed = np.maximum(np.abs(driven) - dt * friction / self.law.inertia, 0.0)
+        self.velocity = np.where(self._jammed, 0.0, np.copysign(slowed, driven))
         self.position += dt * self.velocity
         self._jammed[:] = False
 
@@ -194,6 +204,8 @@ class SimulatedArm:
         self._scale = np.array([servo.sign * servo.gear for servo in servos])  # servo angle per joint angle
         self._zero = np.array([servo.zero_tick * RAD_PER_TICK for servo in servos])
         self._law = MotorLaw([servo.model for servo in servos])
+        # The integral gain of a velocity loop compensates for friction, which a wheel therefore does not have.
+        friction = self._law.friction * np.abs(self._scale) * [servo.in_position_mode for servo in servos]
         # Each servo has the mass of the motor that it replaces.
         masses = {motor.joint: (motor.mass, motor.mass_point) for motor in robot.motors}
         # Two servos on one axle are one motor with twice the torque per volt and twice the inertia; the first of them
@@ -206,6 +218,7 @@ class SimulatedArm:
                 resistance=servo.resistance / labels.count(servo.joint),
                 armature=servo.armature * labels.count(servo.joint),
                 free_drag=servo.free_drag * labels.count(servo.joint),
+                coulomb_friction=float(friction[k]) * labels.count(servo.joint),
             )
             for k, servo in enumerate(self._law.servos(labels, np.abs(self._scale)))
             if labels.index(servo.joint) == k
