@@ -20,10 +20,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from dynsim.config.problems import suggest
-from dynsim.errors import RecordError, brief
+from dynsim.errors import RecordError, brief, first_few
 from dynsim.hardware.bus.control_table import RAD_PER_TICK
 from dynsim.hardware.servo_map import MappedServo, ServoMap
 from dynsim.record import TIME, Record
@@ -163,9 +164,9 @@ def import_motion(
         If the file is invalid, or its motion cannot be reconstructed; the message states the line.
     """
     rate = servo_map.bus.rate if rate is None else rate
-    for name, value in (("--rate", rate), ("--bandwidth", bandwidth)):
-        if value is not None and not 0.0 < value < math.inf:
-            raise RecordError(f"{name} must be positive, got {value:g}")
+    for name, value, low, high in (("--rate", rate, 1.0, HIGHEST_RATE), ("--bandwidth", bandwidth, 0.1, HIGHEST_RATE)):
+        if value is not None and not low <= value <= high:
+            raise RecordError(f"{name} must be from {low:g} to {high:g} Hz, got {value:g}")
     recording = _read(path, servo_map, topic, trust)
     servos = [servo for servo in servo_map.servos if servo.hold_at is None]
     _check_columns(recording, servos)
@@ -226,13 +227,15 @@ def _read(path: Path, servo_map: ServoMap, topic: str | None, trust: bool) -> Re
 
 
 def _read_csv(path: Path) -> Recording:
-    rows = csv.reader(read_text(path, RecordError, SIZE_LIMIT).lstrip("\ufeff").splitlines())
-    header = [cell.strip() for cell in next(rows, [])]
+    lines = (
+        read_text(path, RecordError, SIZE_LIMIT).lstrip("\ufeff").replace("\r\n", "\n").replace("\r", "\n").split("\n")
+    )
+    header = [cell.strip() for cell in _cells(lines[0])]
     clock, joints = _columns(path, header)
     column, scale = clock
-    for cells in rows:
-        location = f"{path}:{rows.line_num}"
-        if not any(cell.strip() for cell in cells):
+    for number, line in enumerate(lines[1:], 2):
+        location, cells = f"{path}:{number}", _cells(line)
+        if not any(cell.strip() for cell in cells) or line.startswith("#"):
             continue
         if len(cells) != len(header):
             raise RecordError(f"{location}: has {len(cells)} values; the header has {len(header)} columns")
@@ -244,9 +247,14 @@ def _read_csv(path: Path) -> Recording:
             if value is not None:
                 samples.time.append(time * scale)
                 samples.value.append(value)
-                samples.number.append(rows.line_num)
+                samples.number.append(number)
     names = {k: _joint_name(_split(header[k])[0]) for k in joints}
     return Recording(path, ":", {names[k]: samples for k, samples in joints.items()})
+
+
+def _cells(line: str) -> list[str]:
+    """Return the cells of a line; each line is read alone, so that a quote without end spoils one line only."""
+    return next(csv.reader([line]), [])
 
 
 def _number(cell: str, location: str) -> float | None:
@@ -275,6 +283,7 @@ def _columns(path: Path, header: list[str]) -> tuple[tuple[int, float], dict[int
     clock: tuple[int, float] | None = None
     joints: dict[int, Samples] = {}
     names: dict[str, str] = {}
+    twice = ""
     for k, heading in enumerate(header):
         name, unit = _split(heading)
         if clock is None and (match := _TIME_COLUMN.fullmatch(name)):
@@ -284,8 +293,7 @@ def _columns(path: Path, header: list[str]) -> tuple[tuple[int, float], dict[int
             clock = (k, factor)
         elif (not unit or unit in UNITS) and name:
             joint = _joint_name(name)
-            if joint in names:
-                raise RecordError(f"{path}:1: columns {names[joint]!r} and {heading!r} are both positions of {joint}")
+            twice = twice or (f"columns {names[joint]!r} and {heading!r}" if joint in names else "")
             joints[k], names[joint] = Samples(UNITS.get(unit, "")), heading
     if clock is None:
         shown = brief(",".join(header))
@@ -293,6 +301,8 @@ def _columns(path: Path, header: list[str]) -> tuple[tuple[int, float], dict[int
             f"{path}:1: no column with the time in {shown}; rename that column to 'time [s]', and separate columns by "
             "commas"
         )
+    if twice:
+        raise RecordError(f"{path}:1: {twice} are positions of the same joint; remove or rename one of them")
     return clock, joints
 
 
@@ -311,7 +321,7 @@ def _read_mcap(path: Path, topic: str | None) -> Recording:
                     topics.setdefault(channel.topic, []).append(message)
     except Exception as error:
         # The reader raises exceptions of several libraries for damaged files.
-        raise RecordError(f"{path}: cannot be read as MCAP ({brief(error)})") from error
+        raise RecordError(f"{path}: cannot be read as MCAP ({brief(error)}); repair it with `mcap recover`") from error
     if not topics:
         raise RecordError(f"{path}: no topic with {JOINT_STATE} in CDR encoding")
     if topic is None and len(topics) > 1:
@@ -359,7 +369,7 @@ def _check_columns(recording: Recording, servos: Iterable[MappedServo]) -> None:
     if missing:
         shown = "; ".join(f"{servo.label} ({servo.entry}){suggest(servo.label, recording.joints)}" for servo in missing)
         raise RecordError(
-            f"{recording.path}: no positions of {shown}; it has {', '.join(recording.joints) or 'none'}; "
+            f"{recording.path}: no positions of {shown}; it has {first_few(list(recording.joints)) or 'none'}; "
             "rename the columns, or set 'label' in the map"
         )
 
@@ -453,7 +463,8 @@ def outliers(time: Array, value: Array) -> NDArray[np.bool_]:
     """Return True for the samples that differ from their neighbours like a read error.
 
     Each sample is compared with the median of three linear interpolations: between its neighbours, its second and its
-    third neighbours. The difference counts as an outlier if it is far larger than usual within half a window.
+    third neighbours. The difference counts as an outlier if it is far larger than usual in its surroundings, and larger
+    than the motion from the three samples before to the three samples after it, so that a step is not an outlier.
 
     Parameters
     ----------
@@ -469,7 +480,10 @@ def outliers(time: Array, value: Array) -> NDArray[np.bool_]:
         share = (time[at] - time[before]) / (time[after] - time[before])
         expected[j - 1, at] = value[before] + share * (value[after] - value[before])
     error = np.abs(value - np.nanmedian(expected, axis=0))
-    return np.asarray(error > np.maximum(SPIKE, SPIKE_SCALE * 1.4826 * median_filter(error, SPIKE_WINDOW)))
+    around = sliding_window_view(np.pad(value, 3, mode="edge"), 7)
+    moved = np.abs(np.median(around[:, 4:], axis=1) - np.median(around[:, :3], axis=1))
+    usual = np.maximum(SPIKE, SPIKE_SCALE * 1.4826 * median_filter(error, SPIKE_WINDOW))
+    return np.asarray(error > np.maximum(usual, moved))
 
 
 def _gaps(

@@ -149,6 +149,12 @@ def test_two_bad_samples_in_a_row_are_outliers() -> None:
     assert np.flatnonzero(outliers(time, value)).tolist() == [40, 41]
 
 
+def test_a_step_is_not_an_outlier() -> None:
+    time = np.arange(0.0, 3.0, 1 / RATE)
+    value = 0.1 * np.sin(2 * np.pi * 0.5 * time) + 0.4 * (time > 1.5)
+    assert not outliers(time, value).any()
+
+
 def shifted(rows: list[list[object]], line: int, column: int, value: object) -> list[list[object]]:
     rows[line - 2] = [*rows[line - 2]]
     rows[line - 2][column] = value
@@ -179,7 +185,7 @@ REFUSED: dict[str, tuple[Callable[[list[list[object]]], list[list[object]]], str
         "a,pan [rad],lift [rad]",
         r":1: no column with the time .*; rename that column to 'time \[s\]'",
     ),
-    "twice": (lambda rows: rows, "time,lift.pos [rad],lift [rad]", r":1: columns .* are both positions of lift"),
+    "twice": (lambda rows: rows, "time,lift.pos [rad],lift [rad]", r":1: columns .* are positions of the same joint"),
     "joint": (lambda rows: rows, "time,pan [rad],lfit [rad]", r"no positions of lift \(.*:9: servos\.lift\); did you"),
     "short": (lambda rows: rows[:5], HEAD, r"pan has 5 samples; a motion requires 8 or more"),
     "noise": (

@@ -14,6 +14,7 @@ from studies import fault_table
 
 import dynsim
 from dynsim import scenario
+from dynsim.hardware.imported import import_motion
 from dynsim.hardware.replay.check import check_motion
 from dynsim.hardware.replay.compare import compare_records
 from dynsim.hardware.servo_map import load_servo_map
@@ -80,6 +81,16 @@ def compared(change: str) -> None:
     compare_records(fault_table.swing(), measured)
 
 
+def imported(change: str, *, header: str = "time [s],shoulder [rad],elbow [rad],wheel [rad]", **options: Any) -> str:
+    """Import a recording of the rig after a change of its rows, which are lists of texts; return the notes."""
+    rows = [[f"{k / 30:.4f}", f"{math.sin(k / 30):.4f}", f"{0.5 * math.sin(k / 20):.4f}", "0"] for k in range(120)]
+    exec(change, {"rows": rows})
+    Path("rig.yaml").write_text(fault_table.MAP, encoding="utf-8")
+    lines = [header, *(",".join(row) for row in rows)]
+    Path("taught.csv").write_text("\n".join(lines), encoding="utf-8")
+    return "; ".join(import_motion(Path("taught.csv"), load_servo_map("rig.yaml"), **options)[2])
+
+
 def pilot(message: str | bytes) -> str:
     """Return the answer of a drive of two axes to a message of its page that it rejects."""
     try:
@@ -98,6 +109,7 @@ NAMES: dict[str, Any] = {
     "cut": cut,
     "dynsim": dynsim,
     "edited": edited,
+    "imported": imported,
     "math": math,
     "motion": motion,
     "np": np,

@@ -331,6 +331,8 @@ def _effort_errors(
 ) -> tuple[tuple[EffortError, ...], Array]:
     """Return the errors of torques and currents, and their values as in :class:`Comparison`."""
     labels = measured.provenance.get("labels", {})
+    if not isinstance(labels, dict):
+        raise RecordError(f"invalid labels in the provenance of the measured run: {brief(labels)}")
     own_time = simulated.time - simulated.time[0]
     errors, values = [], [np.zeros((2, len(time), 0))]
     for quantity, sensor, unit in EFFORTS:
