@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, cast
+from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
 from dynsim.cli.app import SetOption, TrustOption, VariantOption, parsed_overrides
-from dynsim.cli.tables import console
-from dynsim.errors import RecordError, ScenarioError
+from dynsim.cli.tables import console, errors
+from dynsim.errors import RecordError, ScenarioError, first_few
 from dynsim.system.terminal import escaped
+
+if TYPE_CHECKING:
+    from dynsim.model.description import Robot
+    from dynsim.record.scene import Scene, Shape
 
 
 class ExportFormat(StrEnum):
@@ -43,6 +49,14 @@ def export(
         float | None,
         typer.Option("--rate", help="Resample the joint motion to this rate [Hz]; default: no resampling."),
     ] = None,
+    joints: Annotated[
+        str | None,
+        typer.Option(
+            "--joints",
+            metavar="NAME,NAME",
+            help="Joints to write, comma-separated; default: all joints, or, for joint-trajectory, those with a motor.",
+        ),
+    ] = None,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -56,9 +70,10 @@ def export(
 ) -> None:
     """Export a record (CSV, ROS, ROS 2) or a robot (URDF, MuJoCo)."""
     if format_ in ROBOT_SUFFIXES:
-        if rate is not None or trust:
+        if rate is not None or trust or joints is not None:
             raise ScenarioError(
-                f"--rate and --trust require a record; --format {format_.value} exports the robot of a scenario"
+                "--rate, --joints and --trust require a record; "
+                f"--format {format_.value} exports the robot of a scenario"
             )
         target = _export_robot(source, format_, variant, parsed_overrides(overrides), out)
     else:
@@ -66,13 +81,16 @@ def export(
             raise RecordError(
                 f"--variant and --set require --format urdf or mjcf; --format {format_.value} exports a record"
             )
-        target = _export_record(Path(source), format_, rate, out, trust)
+        target = _export_record(Path(source), format_, rate, joints, out, trust)
     console.print(f"written: {escaped(target)}")
 
 
 def _export_robot(
     source: str, format_: ExportFormat, variant: str | None, overrides: dict[str, object], out: Path | None
 ) -> Path:
+    from dynsim.compile.model import Model
+    from dynsim.engine.recording import pictured_parts
+    from dynsim.record.scene import Scene
     from dynsim.scenario import build, build_model, load_scenario
     from dynsim.system.files import write_text
 
@@ -81,25 +99,62 @@ def _export_robot(
     scenario = load_scenario(source, variant, overrides)
     model = build_model(scenario)
     target = out or Path(f"{scenario.name}{ROBOT_SUFFIXES[format_]}")
+    robot = model.robot
     if format_ is ExportFormat.urdf:
+        files = addresses(pictured_parts(Scene(), scenario), _shapes(robot), target.parent)
+        links = tuple(replace(link, shapes=renamed(link.shapes, files)) for link in robot.links)
+        model = Model(replace(robot, links=links, fixed_shapes=renamed(robot.fixed_shapes, files)))
         write_text(target, model.to_urdf())
     else:
         write_text(target, model.to_mjcf(build.contacts(scenario), build.surfaces(scenario)))
     return target
 
 
-def _export_record(path: Path, format_: ExportFormat, rate: float | None, out: Path | None, trust: bool) -> Path:
+def _shapes(robot: Robot) -> list[Shape]:
+    return [*robot.fixed_shapes, *(shape for link in robot.links for shape in link.shapes)]
+
+
+def addresses(scene: Scene, shapes: Iterable[Shape], folder: Path | None = None) -> dict[str, str]:
+    """Return the address ``file://PATH`` of each mesh file that is found, by its name in the robot file.
+
+    Names that lead to the same file from a robot file in ``folder`` are omitted. A warning lists missing files.
+    """
+    from dynsim.draw.geometry.meshes import mesh_paths
+
+    names = dict.fromkeys(shape.file for shape in shapes if shape.kind == "mesh")
+    paths = mesh_paths(scene, names)
+    if missing := [name for name in names if name not in paths]:
+        text = f"meshes not found: {first_few(missing)}; their names are written unchanged"
+        errors.print(f"[yellow]warning:[/] {escaped(text)}")
+    near = {} if folder is None else mesh_paths(replace(scene, mesh_folders=(str(folder.absolute()),)), names)
+    return {name: f"file://{path}" for name, path in paths.items() if name not in near or not path.samefile(near[name])}
+
+
+def renamed(shapes: Iterable[Shape], files: Mapping[str, str]) -> tuple[Shape, ...]:
+    """Return the shapes with other names of mesh files."""
+    return tuple(replace(shape, file=files.get(shape.file, shape.file)) for shape in shapes)
+
+
+def _export_record(
+    path: Path, format_: ExportFormat, rate: float | None, joints: str | None, out: Path | None, trust: bool
+) -> Path:
     from dynsim.record import Record
     from dynsim.record.joint_motion import SUFFIX, Format, export_record
 
     record = Record.load(path, trust=trust)
     if format_ is not ExportFormat.mcap:
         kind = cast(Format, format_.value)
-        return export_record(record, out or path.with_suffix(SUFFIX[kind]), kind, rate=rate)
+        names = None if joints is None else [name.strip() for name in joints.split(",")]
+        return export_record(record, out or path.with_suffix(SUFFIX[kind]), kind, rate=rate, joints=names)
     from dynsim.record.mcap_file import write_mcap
 
-    if rate is not None:
+    if rate is not None or joints is not None:
         raise RecordError(
-            "--rate does not apply to mcap files, which contain the samples of the record; set record.rate_hz"
+            "--rate and --joints do not apply to mcap files, which contain the samples and joints of the record; set "
+            "record.rate_hz"
         )
+    if (scene := record.scene) is not None:
+        files = addresses(scene, (*scene.fixed, *(shape for body in scene.bodies for shape in body.shapes)))
+        bodies = tuple(replace(body, shapes=renamed(body.shapes, files)) for body in scene.bodies)
+        record.scene = replace(scene, bodies=bodies, fixed=renamed(scene.fixed, files))
     return write_mcap(record, out or path.with_suffix(".mcap"))

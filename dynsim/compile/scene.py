@@ -18,6 +18,7 @@ from dynsim.record.scene import (
     HERE,
     WORLD,
     Body,
+    FixedFrame,
     Joint,
     JointKind,
     Point,
@@ -71,6 +72,12 @@ def robot_scene(robot: Robot, contacts: Sequence[Contact], surfaces: Mapping[str
         supports,
         resistance=_shared(motor.resistance for motor in robot.motors if isinstance(motor, Motor)),
         voltage_limit=_shared(motor.voltage_limit for motor in robot.motors if isinstance(motor, Motor)),
+        frames=tuple(
+            FixedFrame(
+                frame.name, WORLD if frame.body is None else index[frame.body], vector3(frame.p), quaternion(frame.R)
+            )
+            for frame in robot.frames
+        ),
     )
 
 

@@ -6,14 +6,14 @@ import csv
 import io
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Literal, TextIO
 
 import numpy as np
 
-from dynsim.errors import RecordError
+from dynsim.errors import RecordError, brief
 from dynsim.record.csv_rows import csv_cell
 from dynsim.record.quaternion import Array
 from dynsim.record.record import Record
@@ -25,16 +25,23 @@ RATES = {"q": "v", "phi": "phi_dot", "rho": "rho_dot"}
 """Position signals of records, each with the signal of its rates."""
 ROWS_MAX = 1e7
 """Maximum number of rows of a resampled motion."""
+REST = 1e-6
+"""A motion counts as at rest if its joint speeds are below this value [rad/s or m/s]."""
+RUN_UP = 2.0
+"""Default acceleration of the run-up and run-out of a motion that starts or ends in motion [rad/s² or m/s²]."""
 _YAML_WORDS = {"y", "n", "yes", "no", "on", "off", "true", "false", "null"}
 
 
-def export_record(record: Record, path: Path, format_: Format, *, rate: float | None = None) -> Path:
+def export_record(
+    record: Record, path: Path, format_: Format, *, rate: float | None = None, joints: Sequence[str] | None = None
+) -> Path:
     """Write the joint positions and rates of a record.
 
     ``csv``: one row per sample, columns "time [s]", "<joint> [rad]", "<joint> [rad/s]", with the units of the record
     ("rad or m" if it has both kinds of joints). ``joint-trajectory``: the fields of a ROS
-    trajectory_msgs/JointTrajectory as YAML, for a joint trajectory controller. ``urdf-log``: one JSON object per line,
-    {"time", "position": {joint: rad or m}, "velocity": {joint: rad/s or m/s}}, with the joint names of the URDF.
+    trajectory_msgs/JointTrajectory as YAML, for a joint trajectory controller; it starts and ends at rest, if necessary
+    after a run-up and with a run-out of constant acceleration. ``urdf-log``: one JSON object per line, {"time",
+    "position": {joint: rad or m}, "velocity": {joint: rad/s or m/s}}, with the joint names of the URDF.
 
     Parameters
     ----------
@@ -47,6 +54,8 @@ def export_record(record: Record, path: Path, format_: Format, *, rate: float | 
     rate : float, optional
         Rate to which the record is resampled [Hz] (cubic Hermite), with a last row at the end of the record; default:
         the samples of the record.
+    joints : sequence of str, optional
+        Joints to write; default: all joints, or, for a joint trajectory, the joints with a motor.
 
     Returns
     -------
@@ -56,9 +65,13 @@ def export_record(record: Record, path: Path, format_: Format, *, rate: float | 
     Raises
     ------
     RecordError
-        If the record has no joint angles or only one sample, or if the file cannot be written.
+        If the record has no joint angles or only one sample, if a joint is unknown or would exceed its limit in the
+        run-up or run-out, or if the file cannot be written.
     """
-    joints, time, position, velocity = joint_motion(record)
+    commanded = format_ == "joint-trajectory"
+    joints, time, position, velocity = joint_motion(
+        record, driven_joints(record) if commanded and not joints else joints
+    )
     if len(time) < 2:
         raise RecordError("the record has only one sample; a motion requires two")
     if rate is not None:
@@ -75,6 +88,8 @@ def export_record(record: Record, path: Path, format_: Format, *, rate: float | 
         time = np.arange(np.ceil(end * rate * (1.0 - 1e-9))) / rate
         time = np.append(time, end)
         position, velocity = between(time), between(time, 1)
+    if commanded:
+        time, position, velocity = _at_rest_at_both_ends(record, joints, time, position, velocity)
     writers: dict[str, Callable[..., None]] = {
         "csv": partial(_write_csv, record),
         "joint-trajectory": _write_joint_trajectory,
@@ -88,19 +103,27 @@ def export_record(record: Record, path: Path, format_: Format, *, rate: float | 
     return path
 
 
-def joint_motion(record: Record) -> tuple[list[str], Array, Array, Array]:
+def joint_motion(record: Record, wanted: Sequence[str] | None = None) -> tuple[list[str], Array, Array, Array]:
     """Return joint names, times starting at 0 [s], positions and rates [rad, rad/s; m, m/s] of a record.
+
+    Parameters
+    ----------
+    record : Record
+        Record with joint positions and rates.
+    wanted : sequence of str, optional
+        Joints to return, in this order; default: all.
 
     Raises
     ------
     RecordError
-        If the record has no joint motion, no samples, or a value that is not finite.
+        If the record has no joint motion, no samples, a value that is not finite, or no joint with a wanted name.
     """
     joints: list[str] = []
     angles, rates = [], []
     for name, rate in RATES.items():
         if name in record and rate in record:
-            shared = _in_both(record, name, rate)
+            # Records of dynamic snakes contain the joints of ``q`` again in ``phi``, in the order of the controller.
+            shared = [joint for joint in _in_both(record, name, rate) if joint not in joints]
             joints += shared
             angles.append(record[name][:, [record.labels[name].index(joint) for joint in shared]])
             rates.append(record[rate][:, [record.labels[rate].index(joint) for joint in shared]])
@@ -110,6 +133,13 @@ def joint_motion(record: Record) -> tuple[list[str], Array, Array, Array]:
     if not len(record):
         raise RecordError("the record has no samples")
     position, velocity = np.hstack(angles), np.hstack(rates)
+    if wanted is not None:
+        if unknown := [name for name in wanted if name not in joints]:
+            raise RecordError(f"unknown joint {brief(unknown[0])}; joints of the record: {', '.join(joints)}")
+        if len({*wanted}) < len(wanted):
+            raise RecordError(f"each joint may be listed only once, got {', '.join(wanted)}")
+        columns = [joints.index(name) for name in wanted]
+        joints, position, velocity = list(wanted), position[:, columns], velocity[:, columns]
     for quantity, values in (("position", position), ("rate", velocity)):
         for sample, joint in np.argwhere(~np.isfinite(values))[:1]:
             raise RecordError(
@@ -117,6 +147,57 @@ def joint_motion(record: Record) -> tuple[list[str], Array, Array, Array]:
                 f"(t = {record.time[sample]:.6g} s): the record is damaged"
             )
     return joints, record.time - record.time[0], position, velocity
+
+
+def driven_joints(record: Record) -> list[str] | None:
+    """Return the joints that have a motor, or None if the record contains no torques.
+
+    Raises
+    ------
+    RecordError
+        If the record contains torques, but no joint has a motor.
+    """
+    if "torque" not in record:
+        return None
+    if not (driven := [name for name in joint_motion(record)[0] if name in record.labels["torque"]]):
+        raise RecordError("no joint of the record has a motor; list the joints of the trajectory with --joints")
+    return driven
+
+
+def ramp(rate: Array, acceleration: float) -> tuple[float, Array]:
+    """Return duration [s] and distances, (N,), of a ramp of constant acceleration between rest and joint rates, (N,).
+
+    The joint with the largest rate has the given acceleration; for rates that count as rest, the duration is 0.
+    """
+    fastest = float(np.abs(rate).max(initial=0.0))
+    duration = fastest / acceleration if fastest > REST else 0.0
+    return duration, 0.5 * duration * rate
+
+
+def _at_rest_at_both_ends(
+    record: Record, joints: list[str], time: Array, q: Array, v: Array
+) -> tuple[Array, Array, Array]:
+    """Return times starting at 0 [s], positions and rates of a motion with a run-up and a run-out if it needs them."""
+    bodies = () if record.scene is None else record.scene.bodies
+    ranges = {body.joint.labels[0]: body.joint for body in bodies if len(body.joint.labels) == 1}
+    for end, k in (("start", 0), ("end", -1)):
+        duration, distance = ramp(v[k], RUN_UP)
+        if duration > 0.0:
+            at_rest = q[k] - distance if k == 0 else q[k] + distance
+            for joint, moving, still in zip(joints, q[k], at_rest, strict=True):
+                limits = (ranges[joint].lower, ranges[joint].upper) if joint in ranges else (None, None)
+                for limit, side in zip(limits, (1.0, -1.0), strict=True):
+                    if limit is not None and side * still < side * limit <= side * moving:
+                        raise RecordError(
+                            f"{joint} is in motion at the {end}, and a ramp of {RUN_UP:g} rad/s² to rest would exceed "
+                            f"its limit {limit:.4g} (reaching {still:.4g}); let the motion {end} at rest"
+                        )
+            time = np.append(0.0, time + duration) if k == 0 else np.append(time, time[-1] + duration)
+            row = 0 if k == 0 else len(q)
+            q, v = np.insert(q, row, at_rest, axis=0), np.insert(v, row, 0.0, axis=0)
+        # Controllers reject any velocity at the end, even a negligible one.
+        v[k] = 0.0
+    return time, q, v
 
 
 def _in_both(record: Record, name: str, rate: str) -> list[str]:
@@ -134,18 +215,25 @@ def _in_both(record: Record, name: str, rate: str) -> list[str]:
 
 
 def _write_csv(record: Record, file: TextIO, joints: list[str], time: Array, q: Array, v: Array) -> None:
-    pairs = [(name, rate) for name, rate in RATES.items() if name in record and rate in record]
-    units = [[record.units[pair[k]] for pair in pairs for _ in _in_both(record, *pair)] for k in (0, 1)]
-    headings = [f"{joint} [{unit}]" for column in units for joint, unit in zip(joints, column, strict=True)]
+    units = {
+        joint: (record.units[name], record.units[rate])
+        for name, rate in reversed(RATES.items())
+        if name in record and rate in record
+        for joint in _in_both(record, name, rate)
+    }
+    headings = [f"{joint} [{units[joint][k]}]" for k in (0, 1) for joint in joints]
     rows = csv.writer(file)
     rows.writerow(["time [s]", *map(csv_cell, headings)])
     rows.writerows([f"{value:.9g}" for value in (t, *qs, *vs)] for t, qs, vs in zip(time, q, v, strict=True))
 
 
 def _write_joint_trajectory(file: TextIO, joints: list[str], time: Array, q: Array, v: Array) -> None:
+    stamps = np.rint(time * 1e9).astype(np.int64)
+    if not (np.diff(stamps) > 0).all():
+        raise RecordError("the times of a joint trajectory must increase by at least 1 ns per point; reduce --rate")
     file.write(f"joint_names: [{', '.join(map(_yaml_text, joints))}]\npoints:\n")
-    for t, qs, vs in zip(time, q, v, strict=True):
-        seconds, nanoseconds = divmod(round(t * 1e9), 1_000_000_000)
+    for stamp, qs, vs in zip(stamps.tolist(), q, v, strict=True):
+        seconds, nanoseconds = divmod(stamp, 1_000_000_000)
         file.write(f"- positions: {_flow(qs)}\n  velocities: {_flow(vs)}\n")
         file.write(f"  time_from_start: {{sec: {seconds}, nanosec: {nanoseconds}}}\n")
 

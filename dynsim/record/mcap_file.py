@@ -1,9 +1,10 @@
 """Export of a record to an MCAP file of ROS 2 messages for rosbag2, Foxglove, PlotJuggler and RViz, without ROS.
 
-Topics: ``/joint_states``, ``/tf`` and ``/tf_static`` (each body relative to its parent; the root is ``world``),
-``/robot_description`` (see :mod:`dynsim.record.urdf_text`), and ``/contacts/NAME`` for each contact point, with the
-force that the surface exerts on it. The frame ``contact_NAME`` of this force has the axes of the world. Its origin is
-the point where the force acts (for a sphere or capsule the point of contact), so that the torque is zero.
+Topics: ``/joint_states``, ``/tf`` and ``/tf_static`` (each body, including a base, and each fixed frame relative to its
+parent; the root is ``world``), ``/robot_description`` (see :mod:`dynsim.record.urdf_text`), and ``/contacts/NAME`` for
+each contact point, with the force that the surface exerts on it. The frame ``contact_NAME`` of this force has the axes
+of the world. Its origin is the point where the force acts (for a sphere or capsule the point of contact), so that the
+torque is zero.
 """
 
 from __future__ import annotations
@@ -21,8 +22,7 @@ from dynsim.record.joint_motion import joint_motion
 from dynsim.record.poses import contact_positions, relative_pose
 from dynsim.record.quaternion import Array
 from dynsim.record.record import Record
-from dynsim.record.scene import WORLD
-from dynsim.record.urdf_text import WORLD_LINK, scene_urdf
+from dynsim.record.urdf_text import WORLD_LINK, fixed_frames, scene_urdf
 from dynsim.system.files import replacing
 
 # With this setting, late subscribers also receive the last message, as is usual in ROS 2 for descriptions and static
@@ -37,7 +37,8 @@ _LATCHED = (
 def write_mcap(record: Record, path: Path) -> Path:
     """Write joint states, frames, contact forces and the robot description at all samples of a record.
 
-    Time zero is the first sample. ``effort`` is the joint torque; it is NaN for joints without a motor.
+    Time zero is the first sample. ``effort`` is the joint torque; it is NaN for joints without a motor, and empty if no
+    joint has one.
 
     Parameters
     ----------
@@ -100,13 +101,18 @@ class _Bag:
 
 def _messages(record: Record, bag: _Bag) -> list[tuple[int, str, str, Any]]:
     """Return all messages as tuples of time [ns], topic, type and content."""
-    joints, time, position, velocity = joint_motion(record)
+    labels, time, position, velocity = joint_motion(record)
     stamps = np.rint(time * 1e9).astype(np.int64).tolist()
+    # Joints have the names of the description; the pose of a joint with several rates, such as a base, is a transform.
+    names = _joint_names(record, labels)
+    columns, joints = [k for k, label in enumerate(labels) if label in names], list(names.values())
+    position, velocity = position[:, columns], velocity[:, columns]
     effort = np.zeros((len(time), 0))
     if "torque" in record:
         torque = dict(zip(record.labels["torque"], record["torque"].T, strict=True))
         missing = np.full(len(time), np.nan)
-        effort = np.stack([torque.get(joint, missing) for joint in joints], axis=1)
+        if torque.keys() & names.keys():
+            effort = np.stack([torque.get(label, missing) for label in names], axis=1)
     kind = "sensor_msgs/msg/JointState"
     messages: list[tuple[int, str, str, Any]] = []
     for k, stamp in enumerate(stamps):
@@ -122,6 +128,15 @@ def _messages(record: Record, bag: _Bag) -> list[tuple[int, str, str, Any]]:
     return messages + _frames(record, bag, stamps) + _forces(record, bag, stamps)
 
 
+def _joint_names(record: Record, labels: list[str]) -> dict[str, str]:
+    """Return the joint names of the robot description by label, for the joints with one position."""
+    if record.scene is None or not record.scene.bodies:
+        return {label: label for label in labels}
+    joints = [record.scene.bodies[rows[0]].joint for rows in record.scene.rows.values() if len(rows) == 1]
+    names = {joint.labels[0]: joint.name for joint in joints if len(joint.labels) == 1}
+    return {label: names[label] for label in labels if label in names}
+
+
 def _frames(record: Record, bag: _Bag, stamps: list[int]) -> list[tuple[int, str, str, Any]]:
     """Return the robot description and the frames of bodies and contact points; the list is empty without a scene."""
     scene = record.scene
@@ -133,14 +148,18 @@ def _frames(record: Record, bag: _Bag, stamps: list[int]) -> list[tuple[int, str
     messages = [(first, "/robot_description", text, bag.make(text, data=scene_urdf(scene, robot)))]
     kind = "tf2_msgs/msg/TFMessage"
     moving: list[tuple[str, str, Array, Array]] = []
-    fixed = []
-    for body in scene.bodies:
-        parent = WORLD_LINK if body.parent == WORLD else scene.bodies[body.parent].name
-        p, q = relative_pose(record, body)
-        if body.joint.kind == "fixed":
-            fixed.append(_transform(bag, first, parent, body.name, p[:, 0], q[:, 0]))
+    names = [body.name for body in scene.bodies] + [WORLD_LINK]  # WORLD is -1
+    fixed = [
+        _transform(bag, first, names[frame.body], frame.name, np.array(frame.position), np.array(frame.orientation))
+        for frame in fixed_frames(scene)
+    ]
+    for last, rows in scene.rows.items():
+        parent = names[scene.bodies[rows[0]].parent]
+        p, q = relative_pose(record, [scene.bodies[k] for k in rows])
+        if all(scene.bodies[k].joint.kind == "fixed" for k in rows):
+            fixed.append(_transform(bag, first, parent, names[last], p[:, 0], q[:, 0]))
         else:
-            moving.append((parent, body.name, p, q))
+            moving.append((parent, names[last], p, q))
     unturned = np.array([1.0, 0.0, 0.0, 0.0])
     for point in scene.contacts if "body_position" in record else ():
         at = contact_positions(record, point).T

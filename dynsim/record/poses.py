@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,17 +65,20 @@ def poses_at(scene: Scene, positions: Mapping[str, Mapping[str, float]]) -> Arra
     return np.array([np.concatenate(pose) for pose in poses])
 
 
-def relative_pose(record: Record, body: Body) -> tuple[Array, Array]:
-    """Return the pose of a body relative to its parent: origin, (3, T) [m], and quaternion, (4, T).
+def relative_pose(record: Record, chain: Sequence[Body]) -> tuple[Array, Array]:
+    """Return the pose of the last body of a chain relative to the parent of the first: (3, T) [m], and (4, T).
 
     Raises
     ------
     MissingEntry
-        If the record does not contain the positions of the body's joint.
+        If the record does not contain the positions of a body's joint.
     """
-    columns = _columns(record, body.joint.signal) if body.joint.labels else {}
-    moved = np.array([columns[label] for label in body.joint.labels])
-    return _pose(body, moved, None, (len(record),))
+    pose: tuple[Array, Array] | None = None
+    for body in chain:
+        columns = _columns(record, body.joint.signal) if body.joint.labels else {}
+        pose = _pose(body, np.array([columns[label] for label in body.joint.labels]), pose, (len(record),))
+    assert pose is not None
+    return pose
 
 
 def pose_columns(bodies: int) -> int:

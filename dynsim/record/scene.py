@@ -282,6 +282,16 @@ class Point(_Finite):
 
 
 @dataclass(frozen=True)
+class FixedFrame(_Finite):
+    """Named frame fixed to a body (index ``body``, or ``WORLD``), such as a tool flange, with its pose on the body."""
+
+    name: str
+    body: int
+    position: Vector3
+    orientation: Quaternion
+
+
+@dataclass(frozen=True)
 class SoftGripper(_Finite):
     """Soft gripper of a snake.
 
@@ -325,6 +335,8 @@ class Scene(_Finite):
         Gripper of a snake.
     tip : float
         Distance by which the tip of a snake's gripper is ahead of the controlled point [m].
+    frames : tuple of FixedFrame
+        Frames of the robot file that are fixed to bodies or to the world.
 
     Raises
     ------
@@ -343,12 +355,14 @@ class Scene(_Finite):
     mesh_folders: tuple[str, ...] = ()
     grip: SoftGripper | None = None
     tip: float = 0.0
+    frames: tuple[FixedFrame, ...] = ()
 
     def __post_init__(self) -> None:
         for k, body in enumerate(self.bodies):
             if not WORLD <= body.parent < k:
                 raise RecordError(f"body {body.name!r} ({k}) must come after its parent ({body.parent})")
-        for point in (*self.points, *self.supports):
+        points: tuple[Point | FixedFrame, ...] = (*self.points, *self.supports, *self.frames)
+        for point in points:
             if not WORLD <= point.body < len(self.bodies):
                 raise RecordError(f"point {point.name!r} is on body {point.body}, but only {len(self.bodies)} exist")
 
@@ -373,6 +387,19 @@ class Scene(_Finite):
         own = {body.joint.name for body in self.bodies if joint and body.joint.part_of == joint}
         wheels = [k for k, body in enumerate(self.bodies) if body.parent == base and own & set(body.joint.labels)]
         return base, *wheels
+
+    @property
+    def rows(self) -> dict[int, list[int]]:
+        """Indices of the bodies of each joint, parents first, by the last one.
+
+        A joint with several rates has a body without shape and mass for each row except the last.
+        """
+        chains: dict[int, list[int]] = {}
+        for k, body in enumerate(self.bodies):
+            part, parent = body.joint.part_of, body.parent
+            same = part and parent != WORLD and self.bodies[parent].joint.part_of == part
+            chains[k] = [*(chains.pop(parent, ()) if same else ()), k]
+        return chains
 
     @property
     def wheel_names(self) -> dict[str, str]:

@@ -10,12 +10,10 @@ from typing import Any
 import numpy as np
 
 from dynsim.record.quaternion import Array, rotated
-from dynsim.record.scene import WORLD, Scene, Shape
+from dynsim.record.scene import FixedFrame, Scene, Shape
 
 Element = ElementTree.Element
 WORLD_LINK = "world"
-# URDF has no ball joint; viewers position such bodies by their frames.
-_KINDS = {"ball": "floating"}
 # Values written for a joint without limits, because URDF requires numbers [rad or m, N m or N, rad/s or m/s].
 _UNLIMITED = 1e9
 
@@ -23,23 +21,25 @@ _UNLIMITED = 1e9
 def scene_urdf(scene: Scene, name: str) -> str:
     """Return the URDF text of the bodies of a scene: joints, limits and shapes, without masses.
 
-    Links are named after the bodies; the root is ``world``. ROS viewers display this text (``robot_description``). To
-    include masses, use ``dynsim export SCENARIO --format urdf``.
+    Links are named after the bodies and fixed frames; the root is ``world``. Ball joints and joints with several rates
+    become floating joints, whose bodies viewers position by their frames. ROS viewers display this text
+    (``robot_description``). To include masses, use ``dynsim export SCENARIO --format urdf``.
     """
     root = Element("robot", name=name)
-    names = [body.name for body in scene.bodies]
+    names = [body.name for body in scene.bodies] + [WORLD_LINK]  # WORLD is -1
     add_shapes(ElementTree.SubElement(root, "link", name=WORLD_LINK), scene.fixed)
-    for body in scene.bodies:
-        add_shapes(ElementTree.SubElement(root, "link", name=body.name), body.shapes)
-    for body in scene.bodies:
-        joint = body.joint
+    for last in scene.rows:
+        add_shapes(ElementTree.SubElement(root, "link", name=names[last]), scene.bodies[last].shapes)
+    for last, rows in scene.rows.items():
+        first = scene.bodies[rows[0]]
+        joint = first.joint
         limited = joint.lower is not None and joint.upper is not None
-        kind = _KINDS.get(joint.kind, joint.kind)
+        kind: str = "floating" if joint.kind == "ball" or len(rows) > 1 else joint.kind
         if kind == "revolute" and not limited:
             kind = "continuous"
-        element = ElementTree.SubElement(root, "joint", name=joint.name, type=kind)
-        parent = WORLD_LINK if body.parent == WORLD else names[body.parent]
-        connect(element, parent, body.name, joint.position, rotation(joint.orientation))
+        own = joint.part_of if len(rows) > 1 else joint.name
+        element = ElementTree.SubElement(root, "joint", name=own, type=kind)
+        connect(element, names[first.parent], names[last], joint.position, rotation(joint.orientation))
         if kind in ("revolute", "continuous", "prismatic", "planar"):
             ElementTree.SubElement(element, "axis", xyz=numbers(joint.axis))
         if kind in ("revolute", "prismatic"):
@@ -48,7 +48,17 @@ def scene_urdf(scene: Scene, name: str) -> str:
             ElementTree.SubElement(
                 element, "limit", lower=numbers(lower), upper=numbers(upper), effort=far, velocity=far
             )
+    for frame in fixed_frames(scene):
+        ElementTree.SubElement(root, "link", name=frame.name)
+        element = ElementTree.SubElement(root, "joint", name=f"{frame.name}_frame", type="fixed")
+        connect(element, names[frame.body], frame.name, frame.position, rotation(frame.orientation))
     return xml_text(root)
+
+
+def fixed_frames(scene: Scene) -> list[FixedFrame]:
+    """Return the fixed frames of a scene, without a frame that has the name of the world or of a body."""
+    taken = {WORLD_LINK, *(body.name for body in scene.bodies)}
+    return [frame for frame in scene.frames if frame.name not in taken]
 
 
 def add_shapes(link: Element, shapes: Sequence[Shape]) -> None:

@@ -157,8 +157,10 @@ def test_joint_trajectory_resampled_is_valid_yaml_in_order(tmp_path) -> None:
     message = YAML(typ="safe").load(path)
     assert message["joint_names"] == ["shoulder", "elbow", "wheel"]
     times = [p["time_from_start"]["sec"] + 1e-9 * p["time_from_start"]["nanosec"] for p in message["points"]]
-    assert np.allclose(np.diff(times)[:-1], 0.02)
-    assert message["points"][10]["positions"][0] == pytest.approx(0.6 * np.sin(4 * 0.2), abs=1e-6)
+    run_up = swing()["v"][0].max() / 2.0  # it starts in motion, and gets a run-up and a run-out of 2 rad/s²
+    assert times[1] == pytest.approx(run_up, abs=1e-9)
+    assert np.allclose(np.diff(times)[1:-2], 0.02)
+    assert message["points"][11]["positions"][0] == pytest.approx(0.6 * np.sin(4 * 0.2), abs=1e-6)
 
 
 def test_urdf_log_is_one_json_object_per_line(tmp_path) -> None:

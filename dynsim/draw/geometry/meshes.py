@@ -9,6 +9,7 @@ import os
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 from xml.parsers import expat
@@ -301,6 +302,14 @@ class Meshes:
             self._missing[file.rpartition("/")[2]] = None
         return None
 
+    def find(self, file: str) -> Path | None:
+        """Return the absolute path of a mesh file, or None if it is not found."""
+        for path in self._places(file):
+            with suppress(OSError, ValueError):
+                if path.is_file():
+                    return path.absolute()
+        return None
+
     def notes(self) -> list[str]:
         """Return notes about meshes that could not be drawn."""
         names = list(self._missing)
@@ -334,6 +343,13 @@ class Meshes:
             self._unreadable[str(error)] = None
             return None
         return len(self.unique) - 1
+
+
+def mesh_paths(scene: Scene, files: Iterable[str]) -> dict[str, Path]:
+    """Return the paths of the mesh files that are found in the folders of a scene, by their name in the robot file."""
+    meshes = Meshes()
+    meshes.of_robot(scene)
+    return {file: path for file in files if (path := meshes.find(file)) is not None}
 
 
 def mesh_notes(scenes: Iterable[Scene | None]) -> list[str]:

@@ -21,6 +21,7 @@ from dynsim.errors import CheckRefused
 from dynsim.hardware.bus.control_table import STATE_BLOCK
 from dynsim.hardware.servo_map import MappedServo, ServoMap
 from dynsim.record import TIME, Record
+from dynsim.record.joint_motion import ramp
 from dynsim.snake.lifting import grounded_pairs, lifted
 
 # Motions of servos: postures as functions of time, how the loop advances along them, and their demands on the servos.
@@ -158,8 +159,6 @@ def quintic(duration: float, time: float) -> tuple[float, float]:
     return u**3 * (10 + u * (-15 + 6 * u)), 30 * u * u * (1 - u) ** 2 / duration
 
 
-REST = 1e-6
-"""A record counts as at rest if its joint speeds are below this value [rad/s]."""
 GAP_FACTOR, LONG_FACTOR = 2.5, 1.5
 """A time step longer than GAP_FACTOR times the median is a gap, in which the motion is unknown. In a step longer than
 LONG_FACTOR times the quantile LONG_QUANTILE, samples are probably missing (even the median step may lack samples)."""
@@ -504,14 +503,14 @@ def _refuse_lifted_wheels(record: Record) -> None:
 def _at_rest_at_both_ends(path: Path, acceleration: float) -> Path:
     first, last = path.rate_after[0], path.rate_before[-1]
     still = np.zeros_like(first)
-    if (fastest := np.abs(last).max()) > REST:
-        duration = fastest / acceleration
-        path = path.longer(path.end + duration, path.position[-1] + 0.5 * duration * last, last, still)
-    if (fastest := np.abs(first).max()) > REST:
-        duration = fastest / acceleration
+    duration, distance = ramp(last, acceleration)
+    if duration > 0.0:
+        path = path.longer(path.end + duration, path.position[-1] + distance, last, still)
+    duration, distance = ramp(first, acceleration)
+    if duration > 0.0:
         path = Path(
             np.append(-duration, path.time),
-            np.vstack([path.position[0] - 0.5 * duration * first, path.position]),
+            np.vstack([path.position[0] - distance, path.position]),
             np.vstack([still, path.rate_after]),
             np.vstack([first, path.rate_before]),
         )
