@@ -11,13 +11,14 @@ from typing import TYPE_CHECKING, Annotated, cast
 import typer
 
 from dynsim.cli.app import SetOption, TrustOption, VariantOption, parsed_overrides
-from dynsim.cli.tables import console, errors
-from dynsim.errors import RecordError, ScenarioError, first_few
+from dynsim.cli.tables import console, errors, print_line
+from dynsim.errors import DynsimError, RecordError, ScenarioError, first_few
 from dynsim.system.terminal import escaped
 
 if TYPE_CHECKING:
     from dynsim.model.description import Robot
     from dynsim.record.scene import Scene, Shape
+    from dynsim.scenario import Scenario
 
 
 class ExportFormat(StrEnum):
@@ -29,6 +30,8 @@ class ExportFormat(StrEnum):
     mjcf = "mjcf"
 
 
+MUJOCO_TRIANGLES = 200_000
+"""Maximum number of triangles of a mesh that MuJoCo reads."""
 ROBOT_SUFFIXES = {ExportFormat.urdf: ".urdf", ExportFormat.mjcf: ".mjcf.xml"}
 EXAMPLE = "Example: dynsim export elbow_comparison --format mjcf"
 
@@ -57,6 +60,15 @@ def export(
             help="Joints to write, comma-separated; default: all joints, or, for joint-trajectory, those with a motor.",
         ),
     ] = None,
+    contacts: Annotated[
+        bool, typer.Option("--contacts", help="Let contact points and surfaces collide in MuJoCo (mjcf only).")
+    ] = False,
+    check: Annotated[
+        bool,
+        typer.Option(
+            "--check", help="Run the scenario in dynsim and in MuJoCo, and print the largest differences (mjcf only)."
+        ),
+    ] = False,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -69,13 +81,26 @@ def export(
     trust: TrustOption = False,
 ) -> None:
     """Export a record (CSV, ROS, ROS 2) or a robot (URDF, MuJoCo)."""
+    if (contacts or check) and format_ is not ExportFormat.mjcf:
+        raise ScenarioError(f"--contacts and --check require --format mjcf, got --format {format_.value}")
     if format_ in ROBOT_SUFFIXES:
         if rate is not None or trust or joints is not None:
             raise ScenarioError(
                 "--rate, --joints and --trust require a record; "
                 f"--format {format_.value} exports the robot of a scenario"
             )
-        target = _export_robot(source, format_, variant, parsed_overrides(overrides), out)
+        if Path(source).suffix == ".h5":
+            raise ScenarioError(
+                f"{source} is a record; --format {format_.value} needs a scenario (file or shipped name)"
+            )
+        from dynsim.scenario import load_scenario
+
+        scenario = load_scenario(source, variant, parsed_overrides(overrides))
+        target = out or Path(f"{scenario.name}{ROBOT_SUFFIXES[format_]}")
+        if format_ is ExportFormat.urdf:
+            _export_urdf(scenario, target)
+        else:
+            _export_mjcf(scenario, target, contacts, check)
     else:
         if variant is not None or overrides:
             raise RecordError(
@@ -85,29 +110,77 @@ def export(
     console.print(f"written: {escaped(target)}")
 
 
-def _export_robot(
-    source: str, format_: ExportFormat, variant: str | None, overrides: dict[str, object], out: Path | None
-) -> Path:
+def _export_urdf(scenario: Scenario, target: Path) -> None:
     from dynsim.compile.model import Model
     from dynsim.engine.recording import pictured_parts
     from dynsim.record.scene import Scene
-    from dynsim.scenario import build, build_model, load_scenario
+    from dynsim.scenario import build_model
     from dynsim.system.files import write_text
 
-    if Path(source).suffix == ".h5":
-        raise ScenarioError(f"{source} is a record; --format {format_.value} needs a scenario (file or shipped name)")
-    scenario = load_scenario(source, variant, overrides)
-    model = build_model(scenario)
-    target = out or Path(f"{scenario.name}{ROBOT_SUFFIXES[format_]}")
-    robot = model.robot
-    if format_ is ExportFormat.urdf:
-        files = addresses(pictured_parts(Scene(), scenario), _shapes(robot), target.parent)
-        links = tuple(replace(link, shapes=renamed(link.shapes, files)) for link in robot.links)
-        model = Model(replace(robot, links=links, fixed_shapes=renamed(robot.fixed_shapes, files)))
-        write_text(target, model.to_urdf())
-    else:
-        write_text(target, model.to_mjcf(build.contacts(scenario), build.surfaces(scenario)))
-    return target
+    robot = build_model(scenario).robot
+    files = addresses(pictured_parts(Scene(), scenario), _shapes(robot), target.parent)
+    links = tuple(replace(link, shapes=renamed(link.shapes, files)) for link in robot.links)
+    write_text(target, Model(replace(robot, links=links, fixed_shapes=renamed(robot.fixed_shapes, files))).to_urdf())
+
+
+def _export_mjcf(scenario: Scenario, target: Path, touching: bool, check: bool) -> None:
+    from dynsim.engine import mujoco_check
+    from dynsim.engine.prepare import prepare
+    from dynsim.scenario import build, build_model
+    from dynsim.system.files import replacing, write_text
+
+    model, gains, prepared = build_model(scenario), {}, None
+    try:
+        prepared = prepare(scenario)
+    except DynsimError as error:
+        if check:
+            raise
+        _warn(f"the scenario cannot run, so that its controller is not exported: {error}")
+    if prepared is not None and check:
+        mujoco_check.mujoco_for(prepared)
+    contacts = build.contacts(scenario, model.robot) if prepared is None else prepared.contacts
+    if prepared is not None:
+        model, control = prepared.model, prepared.control
+        joints = [motor.joint for motor in model.robot.motors]
+        gains = dict(zip(joints, zip(control.k_p.tolist(), control.k_d.tolist(), strict=True), strict=True))
+        for text in mujoco_check.omissions(scenario, prepared, touching):
+            _warn(text)
+    folder = target.parent / f"{target.name.split('.')[0]}_meshes"
+    files, contents = _stl_files(scenario, _shapes(model.robot), folder.name)
+    text = model.to_mjcf(contacts, build.surfaces(scenario), gains=gains, meshes=files, touching=touching)
+    for name, content in contents.items():
+        with replacing(target.parent / name) as stream:
+            stream.write(content)
+    write_text(target, text)
+    if check and prepared is not None:
+        from dynsim.engine import simulate
+
+        for step, differences in mujoco_check.compare(prepared, simulate(scenario), target).items():
+            print_line(f"largest differences from MuJoCo with steps of {1e3 * step:g} ms:")
+            for d in differences:
+                print_line(f"  {d.quantity} {d.value:.2e} {d.unit} ({d.label}, t = {d.time:.4g} s)")
+
+
+def _stl_files(scenario: Scenario, shapes: Iterable[Shape], folder: str) -> tuple[dict[str, str], dict[str, bytes]]:
+    """Return paths by mesh, and contents by path, of STL files that MuJoCo can read; a warning lists other meshes."""
+    from dynsim.draw.geometry.meshes import Meshes, simplified, stl_bytes
+    from dynsim.engine.recording import pictured_parts
+    from dynsim.record.scene import Scene
+
+    meshes = Meshes()
+    meshes.of_robot(pictured_parts(Scene(), scenario))
+    names = dict.fromkeys(shape.file for shape in shapes if shape.kind == "mesh")
+    numbers = {name: number for name in names if (number := meshes.index(name)) is not None}
+    paths = {name: f"{folder}/mesh_{number + 1}.stl" for name, number in numbers.items()}
+    for note in meshes.notes():
+        _warn(note)
+    return paths, {
+        path: stl_bytes(*simplified([meshes.unique[numbers[name]]], MUJOCO_TRIANGLES)) for name, path in paths.items()
+    }
+
+
+def _warn(text: str) -> None:
+    errors.print(f"[yellow]warning:[/] {escaped(text)}")
 
 
 def _shapes(robot: Robot) -> list[Shape]:
@@ -124,8 +197,7 @@ def addresses(scene: Scene, shapes: Iterable[Shape], folder: Path | None = None)
     names = dict.fromkeys(shape.file for shape in shapes if shape.kind == "mesh")
     paths = mesh_paths(scene, names)
     if missing := [name for name in names if name not in paths]:
-        text = f"meshes not found: {first_few(missing)}; their names are written unchanged"
-        errors.print(f"[yellow]warning:[/] {escaped(text)}")
+        _warn(f"meshes not found: {first_few(missing)}; their names are written unchanged")
     near = {} if folder is None else mesh_paths(replace(scene, mesh_folders=(str(folder.absolute()),)), names)
     return {name: f"file://{path}" for name, path in paths.items() if name not in near or not path.samefile(near[name])}
 

@@ -20,6 +20,7 @@ from dynsim.dynamics import tables as ka
 from dynsim.dynamics.tree import articulated, joints, sweep
 from dynsim.errors import ModelError, brief
 from dynsim.model.description import Array, Contact, Robot
+from dynsim.model.drives import Servo
 from dynsim.model.surfaces import Surface
 from dynsim.record import record
 from dynsim.system.arguments import names_wrong_types
@@ -175,16 +176,30 @@ class Model:
 
         return write_urdf(with_shapes(self.robot))
 
-    def to_mjcf(self, contacts: Sequence[Contact] = (), surfaces: Mapping[str, Surface] | None = None) -> str:
-        """Return the tree of bodies as MJCF text (MuJoCo's format), including the motors' rotor inertia and losses.
+    def to_mjcf(
+        self,
+        contacts: Sequence[Contact] = (),
+        surfaces: Mapping[str, Surface] | None = None,
+        *,
+        gains: Mapping[str, tuple[float, float]] | None = None,
+        meshes: Mapping[str, str] | None = None,
+        touching: bool = False,
+    ) -> str:
+        """Return the tree of bodies as MJCF text (MuJoCo's format), with motors, their loops, and losses.
 
         Parameters
         ----------
         contacts : sequence of Contact, optional
             Contact points to export as sites.
         surfaces : mapping of str to Surface, optional
-            Planes, spheres, cylinders and boxes to export as visual shapes without collision; other surfaces are
-            omitted.
+            Planes, spheres, cylinders and boxes to export as shapes; other surfaces are omitted.
+        gains : mapping of str to (float, float), optional
+            Gains k_p and k_d of the voltage controllers of DC motors, by joint [V/rad, V s/rad; V/m, V s/m]; the
+            control of an actuator is then a reference of its joint. Default: no controllers; the control is a voltage.
+        meshes : mapping of str to str, optional
+            Paths of mesh files that MuJoCo can read, by the name of the mesh in the shapes; default: no meshes.
+        touching : bool, optional
+            If True, contact points collide with their surfaces; otherwise nothing collides.
 
         Returns
         -------
@@ -204,11 +219,17 @@ class Model:
         True
         """
         from dynsim.compile.scene import drawn_surface, with_shapes
-        from dynsim.model.mjcf import write_mjcf
+        from dynsim.model.mjcf import back_emf_damping, write_mjcf
 
         drawn = [drawn_surface(name, surface) for name, surface in (surfaces or {}).items()]
         rubs = {rubbing.joint: rubbing.gear + rubbing.bearing for rubbing in dry_frictions(self.robot)}
-        return write_mjcf(with_shapes(self.robot), contacts, drawn, self.damping, self.armature, rubs)
+        damping = self.damping.copy()
+        for motor in self.robot.motors:
+            damping[self.joint_names.index(motor.joint)] += back_emf_damping(motor)
+            if isinstance(motor, Servo) and motor.coulomb_speed is not None:  # smoothed friction becomes dry
+                rubs[motor.joint] = rubs.get(motor.joint, 0.0) + motor.coulomb_friction
+        described = with_shapes(self.robot, "capsule")
+        return write_mjcf(described, contacts, drawn, damping, self.armature, rubs, gains or {}, meshes or {}, touching)
 
     @property
     def joint_names(self) -> tuple[str, ...]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -174,20 +174,20 @@ def shapes(link: Link) -> tuple[Shape, ...]:
     return link.shapes or _rod(link)
 
 
-def with_shapes(robot: Robot) -> Robot:
-    """Return the robot with the drawn shapes added to its links."""
-    return replace(robot, links=tuple(replace(link, shapes=shapes(link)) for link in robot.links))
+def with_shapes(robot: Robot, rod: Literal["cylinder", "capsule"] = "cylinder") -> Robot:
+    """Return the robot with the drawn shapes added to its links; ``rod`` is the shape of links without shapes."""
+    return replace(robot, links=tuple(replace(link, shapes=link.shapes or _rod(link, rod)) for link in robot.links))
 
 
-def _rod(link: Link) -> tuple[Shape, ...]:
-    """Return the cylinder about the body's axis; empty if its radius or end is unknown."""
+def _rod(link: Link, kind: Literal["cylinder", "capsule"] = "cylinder") -> tuple[Shape, ...]:
+    """Return the cylinder or capsule about the body's axis; empty if its radius or end is unknown."""
     if link.tip is None or not link.radius > 0.0:
         return ()
     length = float(np.linalg.norm(link.tip))
     if not length > 0.0:
         return ()
     turn = turn_from_z(link.tip / length)
-    return (Shape("cylinder", (link.radius, length), vector3(0.5 * link.tip), turn),)
+    return (Shape(kind, (link.radius, length), vector3(0.5 * link.tip), turn),)
 
 
 def turn_from_z(direction: Array) -> Quaternion:

@@ -1,9 +1,18 @@
-"""MJCF export: a robot as a MuJoCo file with the same mass matrix and bias forces.
+"""MJCF export: a robot as a MuJoCo file with the same mass matrix, bias forces and motors.
 
 The export contains bodies, joints with limits, viscous losses, dry friction and rotor inertia, couplings, gravity and
-the initial posture. MuJoCo's format represents all of these exactly. Motors become torques on their joints, bounded by
-their current limits; circuits, smoothed gear friction and controllers are omitted. Contact points become sites and
-surfaces become shapes without contact, because MuJoCo's contacts are soft.
+the initial posture. MuJoCo's format represents all of these exactly. DC motors become ``dcmotor`` actuators with their
+circuits and voltage loops. Servos become ``position`` actuators, ``general`` ones in velocity mode, or ``dcmotor``
+actuators without inductance if their current is limited. Contact points become sites; on request, they and the surfaces
+also become colliding geoms, whose contacts are soft in MuJoCo.
+
+Every actuator has one control c, in the unit of the reference. Notation: gains k_p and k_d, torque constant K,
+resistance R, reference q_d with rate v_d, feed-forward voltage u_f.
+
+- DC motor with k_p > 0: u = k_p (c − q) − k_d v, so that c = q_d + (k_d v_d + u_f)/k_p is dynsim's controller.
+- DC motor with k_p = 0 < k_d: u = (k_d + K) c − k_d v, so that c = (k_d v_d + u_f)/(k_d + K). Without gains: c = u.
+- Servo: c = q_d + k_d v_d/k_p, in velocity mode c = v_d. For a ``position`` or ``general`` actuator, the back-EMF is a
+  damping K²/R of the joint, so that the force of the actuator is within ±K U/R exactly if the voltage is within ±U.
 """
 
 from __future__ import annotations
@@ -16,7 +25,7 @@ import numpy as np
 
 from dynsim.errors import ModelError
 from dynsim.model.description import Array, Contact, Link, Robot
-from dynsim.model.drives import TorqueSource
+from dynsim.model.drives import Drive, Servo, TorqueSource
 from dynsim.record.quaternion import of_matrix
 from dynsim.record.scene import HERE, SceneSurface, Shape
 from dynsim.record.urdf_text import Element, numbers, xml_text
@@ -27,6 +36,12 @@ LEAST = 1e-12
 _PLANE = 5.0
 _SIMPLE = {"revolute": "hinge", "prismatic": "slide"}
 _BALL = ["ball_x", "ball_y", "ball_z"]
+# Radius that is added to a contact geom and subtracted again by the margin of its contact [m]: points need a size.
+_PAD = 1e-3
+# Stiffest constraint that steps of 1 ms resolve: time constant [s] and damping ratio, and impedances close to one.
+_STIFF = {"solref": "0.002 1", "solimp": "0.9999 0.9999 0.001 0.5 2"}
+Gains = Mapping[str, tuple[float, float]]
+"""Gains of the voltage controllers of DC motors by joint [V/rad, V s/rad; V/m, V s/m]."""
 
 
 def write_mjcf(
@@ -36,8 +51,11 @@ def write_mjcf(
     damping: Array,
     armature: Array,
     rubs: Mapping[str, float],
+    gains: Gains,
+    meshes: Mapping[str, str],
+    touching: bool,
 ) -> str:
-    """Write the bodies, joints, torques and visual shapes of a robot as MJCF text.
+    """Write the bodies, joints, motors and shapes of a robot as MJCF text.
 
     Parameters
     ----------
@@ -51,6 +69,12 @@ def write_mjcf(
         Damping and armature of each row of the joints [N m s/rad, kg m²; N s/m, kg].
     rubs : mapping of str to float
         Dry friction of bearing and gear, for each joint that has any [N m or N].
+    gains : mapping
+        Gains of the voltage controllers of DC motors.
+    meshes : mapping of str to str
+        Paths of mesh files that MuJoCo can read, by the name of the mesh; other meshes are omitted.
+    touching : bool
+        Whether contact points and surfaces collide.
 
     Raises
     ------
@@ -61,14 +85,15 @@ def write_mjcf(
         raise ModelError(f"{robot.ties[0].name}: ties between bodies cannot be exported to MJCF")
     root = Element("mujoco", model=robot.name)
     ElementTree.SubElement(root, "compiler", angle="radian", autolimits="true", inertiafromgeom="false")
-    ElementTree.SubElement(root, "option", timestep="0.001", integrator="implicitfast", gravity=numbers(robot.gravity))
+    option = {"timestep": "0.001", "integrator": "implicitfast", "gravity": numbers(robot.gravity)}
+    ElementTree.SubElement(root, "option", option | ({"cone": "elliptic"} if touching else {}))
     looks = ElementTree.SubElement(ElementTree.SubElement(root, "default"), "geom")
     looks.attrib.update(contype="0", conaffinity="0", group="1", mass="0")
     world = ElementTree.SubElement(root, "worldbody")
     ElementTree.SubElement(world, "light", pos="0 0 5", dir="0 0 -1", directional="true")
-    for surface in surfaces:
-        _add_surface(world, surface)
-    _add_shapes(world, robot.fixed_shapes)
+    solid = {surface.name for surface in surfaces if _add_surface(world, surface)}
+    assets = _add_meshes(root, robot, meshes)
+    _add_shapes(world, robot.fixed_shapes, assets)
     elements: dict[str | None, Element] = {None: world}
     below: dict[str | None, list[list[Link]]] = {}
     for group in _joints(robot):
@@ -84,7 +109,7 @@ def write_mjcf(
             elements[link.name] = body
             _add_inertial(body, link)
             _add_joints(body, group, rubs, damping[[row[link.joint] for link in group]], armature[row[link.joint]])
-            _add_shapes(body, link.shapes)
+            _add_shapes(body, link.shapes, assets)
             order.extend(group)
             add(link.name)
 
@@ -95,13 +120,22 @@ def write_mjcf(
         index, on_body = robot.attach(contact.body, contact.point)
         site = {"name": f"contact_{contact.name}", "pos": numbers(on_body), "size": "0.005", "rgba": "1 0.5 0 1"}
         ElementTree.SubElement(elements[robot.links[index].name], "site", site)
+    if touching:
+        _add_contacts(root, robot, [contact for contact in contacts if contact.surface_name in solid], elements)
     _add_couplings(root, robot)
-    _add_motors(root, robot)
+    if robot.motors:
+        actuators = ElementTree.SubElement(root, "actuator")
+        for motor in robot.motors:
+            tag, attributes = _actuator(motor, *gains.get(motor.joint, (0.0, 0.0)))
+            ElementTree.SubElement(actuators, tag, {"name": motor.joint, "joint": motor.joint, **attributes})
     q, first = robot.initial, dict(zip((link.joint for link in robot.links), robot.position_index, strict=True))
     posture = [q[first[link.joint] : first[link.joint] + len(link.row.neutral)] for link in order]
-    ElementTree.SubElement(
-        ElementTree.SubElement(root, "keyframe"), "key", name="initial", qpos=numbers(np.concatenate(posture))
-    )
+    key = {"name": "initial", "qpos": numbers(np.concatenate(posture))}
+    if robot.motors:
+        # References are positions, except for torque sources; factors of the others are zero.
+        follows = [(m, control_scale(m, *gains.get(m.joint, (0.0, 0.0)))[0]) for m in robot.motors]
+        key["ctrl"] = numbers([0.0 if isinstance(m, TorqueSource) else k * q[first[m.joint]] for m, k in follows])
+    ElementTree.SubElement(ElementTree.SubElement(root, "keyframe"), "key", key)
     return xml_text(root)
 
 
@@ -137,15 +171,22 @@ def _add_joints(
         elif link.kind in _SIMPLE:
             joint = {**common, "type": _SIMPLE[link.kind], "axis": numbers(link.axis)}
             if link.joint in rubs:
-                joint["frictionloss"] = numbers(rubs[link.joint])
+                joint |= {"frictionloss": numbers(rubs[link.joint]), **_stiff("friction")}
             if math.isfinite(link.lower) and math.isfinite(link.upper):
-                joint["range"] = numbers([link.lower, link.upper])
+                joint |= {"range": numbers([link.lower, link.upper]), **_stiff("limit")}
             ElementTree.SubElement(body, "joint", joint)
+
+
+def _stiff(kind: str) -> dict[str, str]:
+    return {f"{name}{kind}": value for name, value in _STIFF.items()}
 
 
 def _add_inertial(body: Element, link: Link) -> None:
     inertia = link.inertia
-    tensor = np.asarray(inertia.tensor) + max(0.0, LEAST - float(np.linalg.eigvalsh(inertia.tensor)[0])) * np.eye(3)
+    least, middle, largest = np.linalg.eigvalsh(inertia.tensor).tolist()
+    # MuJoCo accepts no moment that exceeds the sum of the two others by rounding.
+    lacking = max(LEAST - least, largest - least - middle + 1e-12 * largest)
+    tensor = np.asarray(inertia.tensor) + max(0.0, lacking) * np.eye(3)
     off = tensor[[0, 0, 1], [1, 2, 2]]
     moments = (
         {"fullinertia": numbers([*np.diag(tensor), *off])} if off.any() else {"diaginertia": numbers(np.diag(tensor))}
@@ -154,25 +195,44 @@ def _add_inertial(body: Element, link: Link) -> None:
     ElementTree.SubElement(body, "inertial", {**origin, **moments})
 
 
-def _add_shapes(body: Element, shapes: Sequence[Shape]) -> None:
-    """Add shapes as geoms, without meshes, whose files MuJoCo may not be able to read."""
+_Assets = dict[tuple[str, tuple[float, ...]], str]
+
+
+def _add_meshes(root: Element, robot: Robot, meshes: Mapping[str, str]) -> _Assets:
+    """Add the meshes with a path as assets; return the names of the assets by mesh and scale."""
+    assets: _Assets = {}
+    shapes = [*robot.fixed_shapes, *(shape for link in robot.links for shape in link.shapes)]
     for shape in shapes:
+        if shape.kind == "mesh" and shape.file in meshes and (shape.file, shape.size) not in assets:
+            assets[shape.file, shape.size] = f"mesh_{len(assets) + 1}"
+    if assets:
+        asset = ElementTree.SubElement(root, "asset")
+        for (file, scale), name in assets.items():
+            # The mass of a body does not depend on its meshes; as a shell, an open mesh is valid too.
+            attributes = {"name": name, "file": meshes[file], "scale": numbers(scale), "inertia": "shell"}
+            ElementTree.SubElement(asset, "mesh", attributes)
+    return assets
+
+
+def _add_shapes(body: Element, shapes: Sequence[Shape], assets: _Assets) -> None:
+    """Add shapes as geoms, without meshes that are not assets."""
+    for shape in shapes:
+        geom = {"type": shape.kind, "pos": numbers(shape.position), "quat": numbers(shape.orientation)}
         if shape.kind == "mesh":
-            continue
-        size = {
-            "box": lambda s: [0.5 * edge for edge in s],
-            "sphere": lambda s: list(s),
-            "cylinder": lambda s: [s[0], 0.5 * s[1]],
-            "capsule": lambda s: [s[0], 0.5 * s[1]],
-        }[shape.kind](shape.size)
-        geom = {"type": shape.kind, "size": numbers(size), "pos": numbers(shape.position)}
-        geom["quat"] = numbers(shape.orientation)
+            if (shape.file, shape.size) not in assets:
+                continue
+            geom["mesh"] = assets[shape.file, shape.size]
+        elif shape.kind == "box":
+            geom["size"] = numbers([0.5 * edge for edge in shape.size])
+        else:
+            geom["size"] = numbers([shape.size[0], *(0.5 * length for length in shape.size[1:])])
         if shape.colour is not None:
             geom["rgba"] = numbers(shape.colour)
         ElementTree.SubElement(body, "geom", geom)
 
 
-def _add_surface(world: Element, surface: SceneSurface) -> None:
+def _add_surface(world: Element, surface: SceneSurface) -> bool:
+    """Add a surface as a geom; return False if MJCF has no such shape."""
     geom = {"name": f"surface_{surface.name}", "rgba": "0.7 0.7 0.7 0.5"}
     # A drawn surface that encloses its free side would hide everything on that side.
     if surface.kind == "plane":
@@ -185,8 +245,29 @@ def _add_surface(world: Element, surface: SceneSurface) -> None:
         edges = np.array(surface.edges)
         geom |= {"type": "box", "size": numbers(0.5 * edges), "quat": numbers(surface.orientation or HERE)}
     else:
-        return
+        return False
     ElementTree.SubElement(world, "geom", {**geom, "pos": numbers(surface.position)})
+    return True
+
+
+def _add_contacts(
+    root: Element, robot: Robot, contacts: Sequence[Contact], elements: Mapping[str | None, Element]
+) -> None:
+    """Add a sphere or capsule for each contact, which collides only with the surface of the contact."""
+    pairs = ElementTree.SubElement(root, "contact")
+    for contact in contacts:
+        index, start = robot.attach(contact.body, contact.point)
+        name = f"contact_{contact.name}"
+        geom = {"name": name, "type": "sphere", "group": "3", "size": numbers(contact.radius + _PAD)}
+        if contact.tip is None:
+            geom["pos"] = numbers(start)
+        else:
+            ends = numbers([*start, *robot.attach(contact.body, contact.tip)[1]])
+            geom |= {"type": "capsule", "fromto": ends}
+        ElementTree.SubElement(elements[robot.links[index].name], "geom", geom)
+        pair = {"geom1": f"surface_{contact.surface_name}", "geom2": name, "margin": numbers(-_PAD)}
+        friction = numbers([contact.friction, contact.friction, 0.0, 0.0, 0.0])
+        ElementTree.SubElement(pairs, "pair", {**pair, "condim": "3", "friction": friction, **_STIFF})
 
 
 def _add_couplings(root: Element, robot: Robot) -> None:
@@ -195,16 +276,60 @@ def _add_couplings(root: Element, robot: Robot) -> None:
     equality = ElementTree.SubElement(root, "equality")
     for coupling in robot.couplings:
         law = numbers([coupling.offset, coupling.ratio, 0.0, 0.0, 0.0])
-        ElementTree.SubElement(equality, "joint", joint1=coupling.joint, joint2=coupling.leader, polycoef=law)
+        joints = {"joint1": coupling.joint, "joint2": coupling.leader, "polycoef": law}
+        ElementTree.SubElement(equality, "joint", joints | _STIFF)
 
 
-def _add_motors(root: Element, robot: Robot) -> None:
-    if not robot.motors:
-        return
-    actuator = ElementTree.SubElement(root, "actuator")
-    for motor in robot.motors:
-        torque = (
-            motor.torque_limit if isinstance(motor, TorqueSource) else motor.joint_constant * motor.greatest_current
-        )
-        limit = {"ctrlrange": numbers([-torque, torque])} if math.isfinite(torque) else {}
-        ElementTree.SubElement(actuator, "motor", {"name": motor.joint, "joint": motor.joint, **limit})
+def current_limited(servo: Servo) -> bool:
+    """Return whether the current limit of a servo, not its voltage, bounds its torque at rest."""
+    return servo.greatest_current < servo.voltage_limit / servo.resistance
+
+
+def back_emf_damping(motor: Drive) -> float:
+    """Return the damping K²/R of a servo's joint, which its actuator then omits [N m s/rad or N s/m]."""
+    if not isinstance(motor, Servo) or current_limited(motor):
+        return 0.0
+    return motor.torque_constant**2 / motor.resistance
+
+
+def control_scale(motor: Drive, k_p: float, k_d: float) -> tuple[float, float, float]:
+    """Return the factors of reference, rate of the reference, and feed-forward voltage in the control of an actuator.
+
+    ``k_p`` and ``k_d`` are the gains of a DC motor [V/rad, V s/rad].
+    """
+    if isinstance(motor, TorqueSource):
+        return 1.0, 0.0, 0.0
+    if isinstance(motor, Servo):
+        return (0.0, 1.0, 0.0) if motor.velocity_mode else (1.0, motor.k_d / motor.k_p, 0.0)
+    if k_p > 0.0:
+        return 1.0, k_d / k_p, 1.0 / k_p
+    total = k_d + motor.joint_constant
+    return (0.0, k_d / total, 1.0 / total) if k_d > 0.0 else (0.0, 0.0, 1.0)
+
+
+def _actuator(motor: Drive, k_p: float, k_d: float) -> tuple[str, dict[str, str]]:
+    """Return tag and attributes of the actuator of a motor; see the notation of this module."""
+    if isinstance(motor, TorqueSource):
+        limit = motor.torque_limit
+        return "motor", {"ctrlrange": numbers([-limit, limit])} if math.isfinite(limit) else {}
+    k, R, inductance = motor.joint_constant, motor.resistance, 0.0
+    if isinstance(motor, Servo):
+        if not current_limited(motor):
+            stall = motor.stall_torque
+            limited = {"forcerange": numbers([-stall, stall])} if math.isfinite(stall) else {}
+            if motor.velocity_mode:
+                bias = {"biastype": "affine", "biasprm": numbers([0.0, 0.0, k / R * (k - motor.k_v)])}
+                return "general", {"gainprm": numbers(k / R * motor.k_v), **bias, **limited}
+            return "position", {"kp": numbers(k / R * motor.k_p), "kv": numbers(k / R * motor.k_d), **limited}
+        k_p, k_d = (0.0, motor.k_v - k) if motor.velocity_mode else (motor.k_p, motor.k_d)
+    else:
+        inductance = motor.inductance
+    circuit = {"resistance": numbers(R), "motorconst": numbers([k, k]), "inductance": numbers([inductance, 0.0])}
+    if math.isfinite(motor.greatest_current):
+        circuit["saturation"] = numbers([k * motor.greatest_current, 0.0, 0.0])
+    limit = motor.voltage_limit if math.isfinite(motor.voltage_limit) else 0.0
+    if k_p == k_d == 0.0:
+        return "dcmotor", circuit | ({"ctrlrange": numbers([-limit, limit])} if limit else {})
+    # MuJoCo's controller commands a torque and compensates the back-EMF: u = R/K (k_p' (c − q) − k_d' v) + K v.
+    loop = numbers([k / R * k_p, 0.0, k / R * (k_d + k), 0.0, 0.0, limit])
+    return "dcmotor", circuit | {"input": "pos" if k_p > 0.0 else "vel", "controller": loop}

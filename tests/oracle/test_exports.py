@@ -52,6 +52,7 @@ def test_mujoco_has_the_mass_matrix_bias_and_accelerations_of_an_exported_arm(na
     peer, data = in_mujoco(model.to_mjcf(build.contacts(scenario), build.surfaces(scenario)))
     order = [peer.joint(joint).dofadr[0] for joint in model.joint_names]
     assert peer.nv == model.n
+    peer.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
     rng = np.random.default_rng(1)
     inside = [
         (max(link.lower, -1.0), min(link.upper, 1.0)) if link.lower < link.upper else (0.0, 0.0)

@@ -36,6 +36,8 @@ MUJOCO = {
 }
 SNAKES = (DYNSIM, *MUJOCO)
 Z, BETA = 2, 4
+# MuJoCo's default softness of limits and friction: solref and solimp.
+SOFT = [0.02, 1.0], [0.9, 0.95, 0.001, 0.5, 2.0]
 
 
 class Manoeuvre(NamedTuple):
@@ -58,32 +60,18 @@ class Commands(NamedTuple):
 def build_snake(prepared: Prepared, step: float, stiff: bool = False) -> Any:
     """Return a compiled scenario of the dynamic snake as a ``mujoco.MjModel``, with servos and a floor.
 
-    A servo's torque is K/R (u − K v) with u = k_p (q_d − q), or u = k_v (v_d − v) + K v, within ±U. Here K²/R is the
-    damping of the joint, and the rest is an actuator whose force is within ±K U/R: the same law, fully implicit.
-    MuJoCo's ``frictionloss`` is the friction of gears: it is soft, and less so with ``stiff``. Wheels touch the floor
-    as stiffly as the step allows.
+    Servos are those of the export: the same voltage law, fully implicit. MuJoCo's ``frictionloss`` is the friction of
+    gears: it is soft, and less so with ``stiff``. Wheels touch the floor as stiffly as the step allows.
     """
     import mujoco
 
-    robot, drives = prepared.model.robot, prepared.system.drives
+    robot = prepared.model.robot
     spec = mujoco.MjSpec.from_string(prepared.model.to_mjcf())
     spec.option.timestep, spec.option.integrator = step, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    for actuator in list(spec.actuators):
-        spec.delete(actuator)
-    for a, motor in enumerate(robot.motors):
-        k_m, k_p, k_v = drives.motor[a, [ka.K_M, ka.K_P, ka.K_V]]
-        per_volt = k_m / drives.motor[a, ka.RESISTANCE]
-        joint = spec.joint(motor.joint)
-        joint.damping[0] += per_volt * k_m
-        if stiff:
-            joint.solref_friction, joint.solimp_friction = [2.0 * step, 1.0], STIFFEST
-        actuator = spec.add_actuator(name=motor.joint, target=motor.joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
-        actuator.biastype = mujoco.mjtBias.mjBIAS_AFFINE
-        rates = drives.table[a, ka.SERVO_MODE] == ka.VELOCITY_MODE
-        actuator.gainprm[0] = per_volt * (k_v if rates else k_p)
-        actuator.biasprm[1], actuator.biasprm[2] = (0.0, -per_volt * (k_v - k_m)) if rates else (-per_volt * k_p, 0.0)
-        actuator.forcelimited, actuator.forcerange = True, per_volt * drives.motor[a, ka.U_MAX] * np.array([-1.0, 1.0])
+    for joint in spec.joints:
+        joint.solref_limit, joint.solimp_limit = SOFT
+        joint.solref_friction, joint.solimp_friction = ([2.0 * step, 1.0], STIFFEST) if stiff else SOFT
     touch = {"contype": 0, "conaffinity": 0}
     spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[10, 10, 1], **touch)
     for k, foot in enumerate(robot.feet):
