@@ -57,7 +57,7 @@ def export(
         typer.Option(
             "--joints",
             metavar="NAME,NAME",
-            help="Joints to write, comma-separated; default: all joints, or, for joint-trajectory, those with a motor.",
+            help="Joints to write, comma-separated; default: all joints, for joint-trajectory all with a motor.",
         ),
     ] = None,
     contacts: Annotated[

@@ -23,7 +23,7 @@ STEPS = (1e-3, 1e-4)
 
 
 def omissions(scenario: Scenario, prepared: Prepared, touching: bool) -> list[str]:
-    """Return the features of a scenario that its MJCF export omits or approximates, by name.
+    """Return a text for each feature of a scenario that its MJCF export omits or approximates.
 
     Parameters
     ----------
@@ -53,7 +53,6 @@ def omissions(scenario: Scenario, prepared: Prepared, touching: bool) -> list[st
             if c.friction_at_rest != c.friction or c.stribeck or c.viscous_friction or c.grip != 1.0
         ],
         "contact stiffness and damping are omitted": [c.name for c in kept if c.stiffness > 0.0],
-        "edges of boxes are sharp": [s.name for s in surfaces if touching and s.kind == "box" and s.radius],
         "loads are omitted": [load.name for load in prepared.loads],
         "the current limit bounds the torque, not the voltage": [m.joint for m in dc if np.isfinite(m.current_limit)],
         "smoothed gear friction becomes dry friction": [
@@ -143,16 +142,16 @@ def _differences(mujoco: Any, model: Any, prepared: Prepared, record: Record, st
             raise ModelError(f"MuJoCo's simulation with steps of {1e3 * step:g} ms diverges at t = {t:.4g} s")
     own = np.stack([record["energy_kinetic"], record["energy_potential"] - record["energy_potential"][0]], axis=1)
     energy[:, 1] -= energy[0, 1]
-    units = {link.joint: link.units for link in robot.links}
+    of_rates = {link.joint: link.units[1] for link in robot.links}
+    of_positions = {name: link.units[0] for link in robot.links for name in link.coordinates}
     for quantity, error, labels, unit in (
-        ("position", peer_q - q, record.labels["q"], lambda name: units.get(name, ("1 or m",))[0]),
-        ("velocity", peer_v - v, record.labels["v"], lambda name: units[name][1]),
-        ("energy", energy - own, ("kinetic", "potential"), lambda _: "J"),
+        ("position", peer_q - q, record.labels["q"], of_positions),
+        ("velocity", peer_v - v, record.labels["v"], of_rates),
+        ("energy", energy - own, ("kinetic", "potential"), dict.fromkeys(("kinetic", "potential"), "J")),
     ):
         k, column = np.unravel_index(np.abs(error).argmax(), error.shape) if error.size else (0, 0)
-        yield Difference(
-            quantity, float(np.abs(error[k, column])), unit(labels[column]), labels[column], float(time[k])
-        )
+        label = labels[column]
+        yield Difference(quantity, float(np.abs(error[k, column])), unit[label], label, float(time[k]))
 
 
 def _coordinates(model: Any, robot: Robot) -> tuple[Array, Array]:

@@ -38,6 +38,8 @@ _SIMPLE = {"revolute": "hinge", "prismatic": "slide"}
 _BALL = ["ball_x", "ball_y", "ball_z"]
 # Radius that is added to a contact geom and subtracted again by the margin of its contact [m]: points need a size.
 _PAD = 1e-3
+# Smallest half edge of a box [m].
+_LEAST_SIZE = 1e-6
 # Stiffest constraint that steps of 1 ms resolve: time constant [s] and damping ratio, and impedances close to one.
 _STIFF = {"solref": "0.002 1", "solimp": "0.9999 0.9999 0.001 0.5 2"}
 Gains = Mapping[str, tuple[float, float]]
@@ -91,7 +93,7 @@ def write_mjcf(
     looks.attrib.update(contype="0", conaffinity="0", group="1", mass="0")
     world = ElementTree.SubElement(root, "worldbody")
     ElementTree.SubElement(world, "light", pos="0 0 5", dir="0 0 -1", directional="true")
-    solid = {surface.name for surface in surfaces if _add_surface(world, surface)}
+    solid = {surface.name: surface for surface in surfaces if _add_surface(world, surface, touching)}
     assets = _add_meshes(root, robot, meshes)
     _add_shapes(world, robot.fixed_shapes, assets)
     elements: dict[str | None, Element] = {None: world}
@@ -121,7 +123,7 @@ def write_mjcf(
         site = {"name": f"contact_{contact.name}", "pos": numbers(on_body), "size": "0.005", "rgba": "1 0.5 0 1"}
         ElementTree.SubElement(elements[robot.links[index].name], "site", site)
     if touching:
-        _add_contacts(root, robot, [contact for contact in contacts if contact.surface_name in solid], elements)
+        _add_contacts(root, robot, contacts, solid, elements)
     _add_couplings(root, robot)
     if robot.motors:
         actuators = ElementTree.SubElement(root, "actuator")
@@ -132,7 +134,7 @@ def write_mjcf(
     posture = [q[first[link.joint] : first[link.joint] + len(link.row.neutral)] for link in order]
     key = {"name": "initial", "qpos": numbers(np.concatenate(posture))}
     if robot.motors:
-        # References are positions, except for torque sources; factors of the others are zero.
+        # The first reference is the start, except for torque sources; other controls are zero.
         follows = [(m, control_scale(m, *gains.get(m.joint, (0.0, 0.0)))[0]) for m in robot.motors]
         key["ctrl"] = numbers([0.0 if isinstance(m, TorqueSource) else k * q[first[m.joint]] for m, k in follows])
     ElementTree.SubElement(ElementTree.SubElement(root, "keyframe"), "key", key)
@@ -231,7 +233,12 @@ def _add_shapes(body: Element, shapes: Sequence[Shape], assets: _Assets) -> None
         ElementTree.SubElement(body, "geom", geom)
 
 
-def _add_surface(world: Element, surface: SceneSurface) -> bool:
+def _edge_radius(surface: SceneSurface) -> float:
+    """Return the radius of a box's edges, to which the margin of its contacts inflates a smaller, sharp box [m]."""
+    return (surface.radius or 0.0) if surface.kind == "box" else 0.0
+
+
+def _add_surface(world: Element, surface: SceneSurface, touching: bool) -> bool:
     """Add a surface as a geom; return False if MJCF has no such shape."""
     geom = {"name": f"surface_{surface.name}", "rgba": "0.7 0.7 0.7 0.5"}
     # A drawn surface that encloses its free side would hide everything on that side.
@@ -242,8 +249,9 @@ def _add_surface(world: Element, surface: SceneSurface) -> bool:
     elif surface.kind == "cylinder" and (surface.radius or 0.0) > 0.0:
         geom |= {"type": "cylinder", "size": numbers([surface.radius, _PLANE]), "zaxis": numbers(surface.direction)}
     elif surface.kind == "box":
-        edges = np.array(surface.edges)
-        geom |= {"type": "box", "size": numbers(0.5 * edges), "quat": numbers(surface.orientation or HERE)}
+        half = 0.5 * np.array(surface.edges) - (_edge_radius(surface) if touching else 0.0)
+        size = numbers(np.maximum(half, _LEAST_SIZE))
+        geom |= {"type": "box", "size": size, "quat": numbers(surface.orientation or HERE)}
     else:
         return False
     ElementTree.SubElement(world, "geom", {**geom, "pos": numbers(surface.position)})
@@ -251,11 +259,17 @@ def _add_surface(world: Element, surface: SceneSurface) -> bool:
 
 
 def _add_contacts(
-    root: Element, robot: Robot, contacts: Sequence[Contact], elements: Mapping[str | None, Element]
+    root: Element,
+    robot: Robot,
+    contacts: Sequence[Contact],
+    surfaces: Mapping[str, SceneSurface],
+    elements: Mapping[str | None, Element],
 ) -> None:
     """Add a sphere or capsule for each contact, which collides only with the surface of the contact."""
     pairs = ElementTree.SubElement(root, "contact")
     for contact in contacts:
+        if contact.surface_name not in surfaces:
+            continue
         index, start = robot.attach(contact.body, contact.point)
         name = f"contact_{contact.name}"
         geom = {"name": name, "type": "sphere", "group": "3", "size": numbers(contact.radius + _PAD)}
@@ -265,7 +279,8 @@ def _add_contacts(
             ends = numbers([*start, *robot.attach(contact.body, contact.tip)[1]])
             geom |= {"type": "capsule", "fromto": ends}
         ElementTree.SubElement(elements[robot.links[index].name], "geom", geom)
-        pair = {"geom1": f"surface_{contact.surface_name}", "geom2": name, "margin": numbers(-_PAD)}
+        pair = {"geom1": f"surface_{contact.surface_name}", "geom2": name}
+        pair["margin"] = numbers(_edge_radius(surfaces[contact.surface_name]) - _PAD)
         friction = numbers([contact.friction, contact.friction, 0.0, 0.0, 0.0])
         ElementTree.SubElement(pairs, "pair", {**pair, "condim": "3", "friction": friction, **_STIFF})
 

@@ -340,7 +340,8 @@ def _describe(own: Run, folder: Path) -> str:
     """Convert the model to URDF, which does not support wheels that roll without slip, and to MJCF."""
     assert own.resolved is not None
     model = build_model(own.resolved)
-    for text in (model.to_urdf, lambda: model.to_mjcf(build.contacts(own.resolved), build.surfaces(own.resolved))):
+    scene = build.contacts(own.resolved), build.surfaces(own.resolved)
+    for text in (model.to_urdf, lambda: model.to_mjcf(*scene, touching=True)):
         with suppress(DynsimError):
             text()
     return ""

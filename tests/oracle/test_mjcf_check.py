@@ -197,7 +197,7 @@ URDF = """<robot name="arm"><link name="base"/><link name="rod">
 <joint name="turn" type="continuous"><parent link="base"/><child link="rod"/><axis xyz="0 1 0"/></joint></robot>"""
 
 
-def test_meshes_are_written_beside_the_file_and_stand_where_they_are(tmp_path: Path) -> None:
+def test_meshes_are_stl_files_with_their_poses(tmp_path: Path) -> None:
     corners = np.array([[0, 0, 0], [300, 0, 0], [0, 200, 0], [0, 0, 100]], dtype=np.float32)
     faces = [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)]
     rows = b"".join(struct.pack("<12fH", 0, 0, 0, *corners[list(face)].ravel(), 0) for face in faces)
@@ -265,3 +265,20 @@ def test_check_of_other_exports_is_refused(
     assert done.exit_code != 0
     text = done.output + str(done.exception)
     check_message("\n".join(line for line in text.splitlines() if not line.startswith("warning: ")), *names)
+
+
+ROOT = Path(__file__).parents[2]
+ROW = re.compile(r"^\| `(\w+)`(?:, (\w+))? \|((?: [\d.e+-]+ \|){4})$", re.MULTILINE)
+ROWS = ROW.findall((ROOT / "docs" / "how-to" / "export.md").read_text(encoding="utf-8"))
+
+
+def test_page_lists_scenarios() -> None:
+    assert len(ROWS) >= 10
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("name", "variant", "numbers"), ROWS)
+def test_differences_agree_with_the_page(name: str, variant: str, numbers: str, tmp_path: Path) -> None:
+    coarse, fine = worst(*exported(name, tmp_path, True, variant=variant or None))
+    actual = [coarse["position"], fine["position"], fine["velocity"], fine["energy"]]
+    np.testing.assert_allclose(actual, [float(number) for number in numbers.split("|")[:4]], rtol=0.1)

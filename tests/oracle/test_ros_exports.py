@@ -112,7 +112,7 @@ def test_residual_velocity_below_the_threshold_of_rest_becomes_zero(tmp_path: Pa
     assert controller_problems(trajectory, ["driven"]) == []
 
 
-def test_joints_are_selected_by_name(tmp_path: Path) -> None:
+def test_trajectory_contains_selected_joints(tmp_path: Path) -> None:
     both = exported(moving(), tmp_path, joints=["passive", "driven"])
     assert controller_problems(both, ["passive", "driven"]) == []
     assert both["points"][-1]["positions"] == pytest.approx([3.0 + 2.25, np.sin(1.0) + 0.75 * np.cos(1.0)], abs=1e-8)

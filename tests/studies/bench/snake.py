@@ -60,8 +60,8 @@ class Commands(NamedTuple):
 def build_snake(prepared: Prepared, step: float, stiff: bool = False) -> Any:
     """Return a compiled scenario of the dynamic snake as a ``mujoco.MjModel``, with servos and a floor.
 
-    Servos are those of the export: the same voltage law, fully implicit. MuJoCo's ``frictionloss`` is the friction of
-    gears: it is soft, and less so with ``stiff``. Wheels touch the floor as stiffly as the step allows.
+    The export contains the servos, with the same voltage law, fully implicit. MuJoCo's ``frictionloss`` is the friction
+    of gears: it is soft, and less so with ``stiff``. Wheels touch the floor as stiffly as the step allows.
     """
     import mujoco
 
