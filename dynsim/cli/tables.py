@@ -239,6 +239,8 @@ def print_starts(console: Console, starts: Mapping[str, Start]) -> None:
         values |= {f"gap of {name}": f"{gap:+.4g} m" for name, gap in start.gaps.items()}
         for joint, (to, was, unit) in start.solved.items():
             values[joint] = f"{to!r} {unit}, set by `initial`; was {was:.6g}"
+        for joint, (at, unit) in start.nearest.items():
+            values[joint] = f"{at!r} {unit}, the legal position nearest to 0, because none is set"
         if start.tip_margin is not None:
             braced = ""
             if start.tip_margin_braced is not None:

@@ -200,6 +200,8 @@ def joint_stops(
 ) -> list[JointStop]:
     """Return the joint stops of a robot, one for each finite limit; the lower stop of a joint comes first.
 
+    Only the unilateral law has stops. Under both laws no joint may start beyond a limit.
+
     Parameters
     ----------
     q : (nq,) ndarray
@@ -210,22 +212,21 @@ def joint_stops(
     Raises
     ------
     ModelError
-        If a joint starts beyond its stop.
+        If joints start beyond a limit; the message lists all of them.
     """
-    remedy = "change its initial position or its limit" if q is None else "start from a state within its stops"
-    stops, q = list[JointStop](), robot.initial if q is None else q
+    remedy = "change the initial position or the limit" if q is None else "start from a state within the limits"
+    stops, beyond, q = list[JointStop](), dict[str, Link](), robot.initial if q is None else q
     for link, k in zip(robot.links, robot.position_index, strict=True):
         for side, limit in ((1.0, link.lower), (-1.0, link.upper)):
             if np.isfinite(limit):
-                beyond = side * (limit - q[k])
-                if beyond > tolerance:
-                    raise ModelError(
-                        f"{link.joint}: starts at {format_quantity(q[k], link.units[0])}, beyond its "
-                        f"stop at {format_quantity(limit, link.units[0])}, which "
-                        f"contacts.law: unilateral enforces; {remedy}",
-                        keys=("plant",),
-                    )
+                if side * (limit - q[k]) > tolerance:
+                    starts, bound = (format_quantity(value, link.units[0]) for value in (q[k], limit))
+                    beyond[f"{link.joint}: starts at {starts}, beyond its limit of {bound}"] = link
                 stops.append(JointStop(link.joint, side, float(limit)))
+    if beyond:
+        first = next(iter(beyond.values()))
+        key = "initial_deg" if first.units[0] == "rad" else "initial_m"
+        raise ModelError(f"{'; '.join(beyond)}; {remedy}", keys=("plant", key, first.joint))
     return stops
 
 

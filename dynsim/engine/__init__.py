@@ -56,6 +56,8 @@ class Start:
         Scenario line that would put all declared contact points onto their surfaces; empty if all of them touch.
     solved : dict of str to (float, float, str)
         Joints that ``initial`` moved: new position, previous position and unit [deg or m].
+    nearest : dict of str to (float, str)
+        Joints without a set position that start at the legal position nearest to zero: position and unit [deg or m].
     tip_margin : float or None
         Tip margin of a mobile base at rest under weight and loads; None for a fixed or floating base.
     tip_margin_braced : float or None
@@ -80,6 +82,7 @@ class Start:
     warnings: Sequence[str] = ()
     off_path: float | None = None
     scene: Scene | None = None
+    nearest: Mapping[str, tuple[float, str]] = field(default_factory=dict)
 
 
 @names_wrong_types

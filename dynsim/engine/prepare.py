@@ -286,7 +286,7 @@ def prepare(
         loads = [*loads, *pushes]
     n, na, c = model.n, len(robot.motors), len(contacts)
     real = scenario.config.contacts.law == "unilateral"
-    stops = joint_stops(robot) if real else []
+    stops = joint_stops(robot)[: None if real else 0]
     stepped = scenario.integrator.method == "time_stepping"
     dry = dry_frictions(robot) if real else []
     watched = real and bool(contacts or stops or dry)

@@ -1640,7 +1640,18 @@ def start_of(scenario: Scenario) -> Start:
         *_below(scenario, robot),
         *build.left_out_warnings(scenario, contacts),
     ]
-    return Start(hand, points, gaps, key, solved, *_margins(scenario, model, contacts), warnings)
+    start = Start(hand, points, gaps, key, solved, *_margins(scenario, model, contacts), warnings)
+    return replace(start, nearest={name: at for name, at in _nearest(robot).items() if name not in solved})
+
+
+def _nearest(robot: Robot) -> dict[str, tuple[float, str]]:
+    """Return the positions [deg or m] of joints that start at the legal position nearest to zero, and their units."""
+    q, joints = robot.initial, zip(robot.links, robot.position_index, strict=True)
+    return {
+        link.joint: (float(np.degrees(q[k])), "deg") if link.units[0] == "rad" else (float(q[k]), link.units[0])
+        for link, k in joints
+        if link.joint in robot.nearest
+    }
 
 
 def _touching(model: Model, contacts: Sequence[Contact]) -> tuple[dict[str, Array], dict[str, float]]:
@@ -1716,6 +1727,9 @@ class _WholeRun(Simulation):
             period = self._prepared.control.sample_time or 1.0 if self._operator is None else self._operator.period
         self._load()
         self._look()
+        if nearest := _nearest(self._prepared.model.robot):
+            text = ", ".join(f"{joint} {value:.6g} {unit}" for joint, (value, unit) in nearest.items())
+            log.info("%s: joints without a position start within their limits: %s", self._scenario.title, text)
         log.info("%s: integrating %g s by %s", self._scenario.title, end, method)
         while self._time < end and not self.finished:
             ticks += TICKS

@@ -81,6 +81,17 @@ class Inertia:
             tensor += part.tensor + part.mass * (d @ d * np.eye(3) - np.outer(d, d))
         return cls(mass, com, tensor)
 
+    def nearest(self) -> Inertia:
+        """Return a possible inertia with the same mass and axes, and the least change of the tensor (Frobenius norm).
+
+        Principal moments are possible if and only if they are sums of two second moments that are not negative.
+        """
+        from scipy.optimize import nnls
+
+        moments, axes = np.linalg.eigh(self.tensor)
+        sums = np.ones((3, 3)) - np.eye(3)
+        return replace(self, tensor=axes @ np.diag(sums @ nnls(sums, moments)[0]) @ axes.T)
+
     def check(self, name: str) -> None:
         """Raise :class:`ModelError` unless a real body can have these mass properties.
 
@@ -448,6 +459,8 @@ class Robot:
         Parts designed to touch surfaces, such as wheels.
     hand_frame : (3, 3) ndarray
         Axes of the hand's frame, whose orientation is controlled, in the axes of the body that carries the hand.
+    nearest : tuple of str
+        Joints without a set position whose limits exclude zero; they start at the legal position nearest to zero.
     """
 
     name: str
@@ -464,6 +477,7 @@ class Robot:
     fixed_inertia: Inertia = field(default_factory=lambda: Inertia(0.0))
     feet: tuple[Foot, ...] = ()
     hand_frame: Array = field(default_factory=lambda: np.eye(3))
+    nearest: tuple[str, ...] = ()
 
     def holding(self, name: str) -> list[Tie]:
         """Return the ties by which a gripper of the robot can hold the named object; empty without a gripper."""
@@ -535,25 +549,40 @@ class Robot:
     def configuration(self, positions: Mapping[str, float]) -> Array:
         """Return coordinates [rad or m], (nq,), from values by joint.
 
-        Followers follow their leaders; all other joints are neutral.
+        Followers follow their leaders. Other joints start at the position nearest to zero at which they and their
+        followers are within their limits; joints with several rates are neutral.
         """
         leads = {coupling.joint: coupling for coupling in self.couplings if coupling.joint not in positions}
         q = np.array([value for link in self.links for value in link.row.neutral])
+        limits = {link.joint: (link.lower, link.upper) for link in self.links}
 
-        def position(joint: str) -> float:
-            chain: list[Coupling] = []
+        def chain(joint: str) -> list[Coupling]:
+            couplings: list[Coupling] = []
             # A cycle of couplings determines no position; compilation rejects it.
-            while joint in leads and len(chain) <= len(leads):
-                chain.append(leads[joint])
-                joint = chain[-1].leader
-            value = float(positions.get(joint, 0.0))
-            for coupling in reversed(chain):
+            while joint in leads and len(couplings) <= len(leads):
+                couplings.append(leads[joint])
+                joint = couplings[-1].leader
+            return couplings
+
+        def follow(couplings: Sequence[Coupling], value: float) -> float:
+            for coupling in reversed(couplings):
                 value = coupling.ratio * value + coupling.offset
             return value
 
+        chains = {joint: chain(joint) for joint in leads}
+        for joint, couplings in chains.items():
+            leader, offset = couplings[-1].leader, follow(couplings, 0.0)
+            ratio = follow(couplings, 1.0) - offset
+            if ratio and joint in limits and leader in limits:
+                ends = sorted((limit - offset) / ratio for limit in limits[joint])
+                low, high = limits[leader]
+                limits[leader] = max(low, ends[0]), min(high, ends[1])
         for joint, k in zip(self.joint_names, self.position_index, strict=True):
-            if joint in positions or joint in leads:
-                q[k] = position(joint)
+            if joint in positions or joint in leads or np.isfinite(limits[joint]).any():
+                couplings = chains.get(joint, [])
+                leader = couplings[-1].leader if couplings else joint
+                low, high = limits.get(leader, (0.0, 0.0))
+                q[k] = follow(couplings, float(positions.get(leader, min(max(0.0, low), high))))
         return q
 
     @property

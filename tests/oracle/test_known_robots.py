@@ -258,7 +258,7 @@ def free(request: pytest.FixtureRequest, tmp_path: Path) -> Free:
     name, feet = FREE[request.param]
     path = next(path for path in packaged() if path.name == name)
     joint = f'''<link name="the_world"/><joint name="root" type="floating"><parent link="the_world"/>
-        <child link="{read_tree(path).root}"/></joint></robot>'''
+        <child link="{read_tree(path).roots[0]}"/></joint></robot>'''
     (tmp_path / name).write_text(path.read_text().replace("</robot>", joint))
     return Free(tmp_path / name, feet, pinocchio.buildModelFromUrdf(str(path), pinocchio.JointModelFreeFlyer()))
 

@@ -45,12 +45,15 @@ def plain_text(root: Element, name: str) -> str:
         # Pinocchio refuses dynamics without a loss, which the specification allows.
         if element.tag == "dynamics" and not attributes:
             return ""
-        inside = "".join(
-            written(child, _CHILDREN.get(child.tag, ())) for child in element.children if child.tag in tags
-        )
+        inside = "".join(written(child, _CHILDREN.get(child.tag, ())) for child in single(element, tags))
         return f"<{element.tag}{attributes}>{inside}</{element.tag}>"
 
-    inside = "".join(written(child, _CHILDREN[child.tag]) for child in root.children if child.tag in ("link", "joint"))
+    def single(element: Element, tags: tuple[str, ...]) -> list[Element]:
+        """Children with a tag, without equal repetitions."""
+        children = [child for child in element.children if child.tag in tags]
+        return [child for k, child in enumerate(children) if not any(map(child.equals, children[:k]))]
+
+    inside = "".join(written(child, _CHILDREN[child.tag]) for child in single(root, ("link", "joint")))
     return f"<robot name={quoteattr(name)}>{inside}</robot>"
 
 

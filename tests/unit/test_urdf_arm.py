@@ -298,8 +298,8 @@ def test_limits_behind_a_free_body_are_looked_at_in_their_own_coordinate(free: P
     text = (FREE % "0 0 1").replace('"hinge" type="continuous"', '"hinge" type="revolute"')
     (free.parent / "slide.urdf").write_text(text.replace('<axis xyz="0 1 0"/></joint></robot>', limited))
     overrides = {"plant.initial_deg": {"hinge": 18}, "plant.initial_pose": {"root": {"position_m": [5, 5, 5]}}}
-    (warning,) = lines_with(run(free, overrides).summary["warnings"], "hinge")
-    check_message(warning, "11.46°", "0.2 rad", re.compile(r"\b6\.5\d*°"), "0.114 rad")
+    with raises(ModelError, "hinge", "18°", "11.459°"):
+        run(free, overrides)
 
 
 def test_motors_hold_and_the_hand_is_led_behind_a_free_body(free: Path):

@@ -111,8 +111,7 @@ class Config(StrictConfig):
     @model_validator(mode="after")
     def _check_arm(self) -> Self:
         # Accept the default pose, because resolved scenarios contain it.
-        own = getattr(self.arm, "base", None)
-        if own is not None and own != type(own)():
+        if self.arm.base not in ("fixed", type(self.arm).model_fields["base"].default):
             raise error_at("arm.base", "conflicts with plant.base.mount, the pose of the arm; remove arm.base")
         return self
 

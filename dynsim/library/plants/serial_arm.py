@@ -59,8 +59,12 @@ class LinkKeys(StrictConfig):
     motor: MotorChoice | None = default(None, "motor of the joint; default: no motor")
     limit_deg: Limits | None = default(None, "lower and upper stop of a revolute joint; default: no stops")
     limit_m: Limits | None = default(None, "lower and upper stop of a prismatic joint; default: no stops")
-    initial_deg: float = default(0.0, "initial angle of a revolute joint")
-    initial_m: float = default(0.0, "initial position of a prismatic joint")
+    initial_deg: float | None = default(
+        None, "initial angle of a revolute joint; default: the angle within its limits that is nearest to 0"
+    )
+    initial_m: float | None = default(
+        None, "initial position of a prismatic joint; default: the position within its limits that is nearest to 0"
+    )
 
     @field_validator("axis")
     @classmethod
@@ -97,8 +101,15 @@ class LinkConfig(LinkKeys):
 
     @property
     def initial(self) -> float:
-        """Initial position [rad, or m if prismatic]."""
-        return self.initial_m if self.kind == "prismatic" else float(np.deg2rad(self.initial_deg))
+        """Initial position [rad, or m if prismatic]; by default the position within the limits nearest to zero."""
+        if not self.placed:
+            return min(max(0.0, self.limits[0]), self.limits[1])
+        return float(self.initial_m or 0.0 if self.kind == "prismatic" else np.deg2rad(self.initial_deg or 0.0))
+
+    @property
+    def placed(self) -> bool:
+        """Whether the entry sets the initial position."""
+        return (self.initial_m if self.kind == "prismatic" else self.initial_deg) is not None
 
     @property
     def limits(self) -> tuple[float, float]:
@@ -203,6 +214,7 @@ def build(config: Config, context: BuildContext) -> Robot:
     links: list[Link] = []
     motors: list[Drive] = []
     initial: list[float] = []
+    nearest: list[str] = []
     reach = 0.0
     for group in config.chain:
         for _ in range(group.count):
@@ -230,9 +242,11 @@ def build(config: Config, context: BuildContext) -> Robot:
             if group.motor is not None:
                 motors.append(families.build("motor", group.motor, context.at_joint(f"joint_{number}"), Drive))
             initial.append(group.initial)
+            if initial[-1] and not group.placed:
+                nearest.append(f"joint_{number}")
             reach = group.length_m
     if config.initial_deg is not None:
-        initial = list(np.deg2rad(config.initial_deg))
+        initial, nearest = list(np.deg2rad(config.initial_deg)), []
     hand = (links[-1].name, vector(0.0, 0.0, reach))
     if config.hand is not None:
         hand = (config.hand.body, np.array(config.hand.point_m))
@@ -243,4 +257,5 @@ def build(config: Config, context: BuildContext) -> Robot:
         hand=hand,
         gravity=np.array(config.gravity_m_s2),
         q0=np.array(initial),
+        nearest=tuple(nearest),
     )

@@ -1,8 +1,8 @@
 """URDF import: strict reading of links and joints, lenient reading of visual shapes, and conversion to a robot.
 
-All numbers are checked, and errors name element and line. Elements that are optional in the URDF specification get its
-defaults (a link without ``<inertial>`` has no mass, a joint without ``<axis>`` turns about x). Other elements that are
-missing, misspelt, repeated or not numeric are errors.
+All numbers are checked, and one error lists all problems with element and line. Elements that are optional in the URDF
+specification get its defaults (a link without ``<inertial>`` has no mass, a joint without ``<axis>`` turns about x).
+Other elements that are missing, misspelt, repeated or not numeric are errors.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ import heapq
 import math
 import re
 import warnings
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -23,10 +23,11 @@ from xml.parsers import expat
 import numpy as np
 
 from dynsim.config.problems import suggest
-from dynsim.errors import ModelError
-from dynsim.model.description import Array, Coupling, Frame, Inertia, Link, Robot
+from dynsim.errors import ModelError, first_few
+from dynsim.model.description import WORLD, Array, Coupling, Frame, Inertia, Link, Robot
 from dynsim.model.joints.ball import floating
 from dynsim.model.joints.planar import planar
+from dynsim.model.urdf.solid import solid_inertia
 from dynsim.record.quaternion import of_turn, product
 from dynsim.record.scene import Shape, ShapeKind, quaternion
 from dynsim.system.inputs import read_bytes
@@ -40,6 +41,11 @@ ATTRIBUTES_MAX, NAME_LENGTH_MAX, _NUMBER_LENGTH_MAX = 100, 200, 400
 # Maximum magnitude of a number: no robot needs larger numbers, and their products could overflow.
 _MAGNITUDE_MAX = 1e15
 
+# An XML declaration after white space or comments, and its encoding.
+_LATE_DECLARATION = re.compile(
+    rb"""\A(?:\xef\xbb\xbf)?(?:\s|<!--(?:(?!-->).)*-->)+(<\?xml\s(?:[^>]*\sencoding\s*=\s*["']([\w.-]+))?[^>]*\?>)""",
+    re.DOTALL,
+)
 # Elements that define physics. Their values are attributes, so text inside them is an error.
 _WITHOUT_TEXT = {"mass", "inertia", "origin", "axis", "limit", "dynamics", "mimic"}
 
@@ -66,7 +72,66 @@ _ATTRIBUTES = {
 }
 _EXTENDED = ("limit", "dynamics")
 _EXAMPLE = {1: '"0.25"', 3: '"0 0 0.25"', 4: '"0 0 1 1"'}
-_ZERO = (0.0, 0.0, 0.0)
+_ZERO: tuple[float, ...] = (0.0, 0.0, 0.0)
+
+
+# Maximum number of problems in one message.
+_PROBLEMS_MAX = 100
+
+
+class _Reported(ModelError):
+    """Consequence of a problem that is already in the list."""
+
+
+@dataclass
+class Findings:
+    """Problems of a file, each with its line, and harmless extras, which are ignored."""
+
+    problems: list[ModelError] = field(default_factory=list)
+    extras: list[str] = field(default_factory=list)
+    unread: set[str] = field(default_factory=set)  # links with an invalid name
+
+    @contextmanager
+    def collecting(self) -> Iterator[None]:
+        """Add an error of the block to the problems."""
+        try:
+            yield
+        except _Reported:
+            pass
+        except ModelError as error:
+            self.problems.append(error)
+
+    def check(self) -> None:
+        """Raise the only problem, or one error with all problems, one per line."""
+        if len(self.problems) == 1:
+            raise self.problems[0]
+        texts = list(dict.fromkeys(map(str, self.problems)))
+        if len(texts) > _PROBLEMS_MAX:
+            texts[_PROBLEMS_MAX:] = [f"and {len(texts) - _PROBLEMS_MAX} more problems"]
+        if texts:
+            raise ModelError("\n  ".join(texts))
+
+
+@dataclass(frozen=True)
+class Corrections:
+    """Values that replace numbers of a file.
+
+    Attributes
+    ----------
+    links : mapping
+        By link: mass [kg], com (3,) [m], tensor (3, 3) about it [kg m²], or density of its shapes [kg/m³].
+    joints : mapping
+        By joint: attributes of :class:`Link`, such as lower, upper, damping and friction.
+    nearest : bool
+        Replace impossible moments of inertia by the nearest possible ones.
+    floating : bool
+        Let the root link float on a joint named ``root``; otherwise it is the world.
+    """
+
+    links: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    joints: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    nearest: bool = False
+    floating: bool = False
 
 
 @dataclass
@@ -78,11 +143,24 @@ class Element:
     tag: str
     attributes: dict[str, str]
     owner: str
+    findings: Findings
     children: list[Element] = field(default_factory=list)
+    faulty: set[str] = field(default_factory=set)  # tags of children that are reported
 
     def child(self, tag: str) -> Element | None:
         """Return the first child with this tag, or None."""
+        if tag in self.faulty:
+            raise _Reported("")
         return next((child for child in self.children if child.tag == tag), None)
+
+    def equals(self, other: Element) -> bool:
+        """Return True if both elements have the same tag, attributes and children."""
+        same = (self.tag, self.attributes, len(self.children)) == (other.tag, other.attributes, len(other.children))
+        return same and all(a.equals(b) for a, b in zip(self.children, other.children, strict=True))
+
+    def ignore(self, text: str) -> None:
+        """Add a harmless extra to the findings."""
+        self.findings.extras.append(f"{text} (line {self.line})")
 
     def error(self, text: str) -> ModelError:
         """Return an error about the element."""
@@ -108,25 +186,50 @@ class Element:
             )
         return name
 
-    def check_children(self) -> None:
-        """Reject repeated, misplaced or misspelt elements, which other readers silently ignore."""
-        known, seen = _CHILDREN[self.tag], set()
+    def check_children(self, replaced: Collection[str] = ()) -> None:
+        """Report repeated, misplaced or misspelt elements, which other readers silently ignore.
+
+        Elements whose tag is in ``replaced`` are not read.
+        """
+        known, seen = _CHILDREN[self.tag], dict[str, Element]()
         for child in self.children:
-            if child.tag in known:
-                if child.tag in seen and self.tag != "robot":
-                    raise child.error(f"{self.owner} has more than one <{child.tag}>; remove one")
-                seen.add(child.tag)
-                child._check_attributes()
-            elif meant := _near(child.tag, known):
-                raise child.error(f"{self.owner}: unknown element <{cut(child.tag)}>; did you mean <{meant}>?")
-            elif child.tag in ("link", "joint", "inertial", "mass", "inertia"):
-                raise child.error(f"{self.owner}: <{child.tag}> does not belong in <{self.tag}>")
+            meant = _near(child.tag, known)
+            if meant in replaced:
+                continue
+            reported = len(self.findings.problems)
+            with self.findings.collecting():
+                if child.tag in known:
+                    first = seen.setdefault(child.tag, child)
+                    if first is not child and self.tag != "robot":
+                        if not child.equals(first):
+                            raise child.error(f"{self.owner} has more than one <{child.tag}>; remove one")
+                        child.ignore(f"second <{child.tag}> of {self.owner}")
+                    child._check_attributes()
+                elif meant:
+                    raise child.error(f"{self.owner}: unknown element <{cut(child.tag)}>; did you mean <{meant}>?")
+                elif child.tag in ("link", "joint", "inertial", "mass", "inertia"):
+                    raise child.error(f"{self.owner}: <{child.tag}> does not belong in <{self.tag}>")
+            if meant and len(self.findings.problems) > reported:
+                self.faulty.add(meant)
 
     def _check_attributes(self) -> None:
         known = _ATTRIBUTES.get(self.tag, ())
         for key in self.attributes if known else ():
+            if key in known:
+                continue
+            twin = f"i{key[2:]}{key[1:2]}"
+            if (self.tag, key) == ("axis", "rpy") or (self.tag == "inertia" and twin in known):
+                value = self.attributes.get(twin)
+                if (
+                    value is not None
+                    and _words(value) != _words(self.attributes[key])
+                    and self.number(twin) != self.number(key)
+                ):
+                    raise self.fault(f"{key} and {twin} of <inertia> differ; remove {key}")
+                self.ignore(f"{key} of <{self.tag}> of {self.owner}")
+                continue
             meant = _near(key, known)
-            if key not in known and (meant or self.tag not in _EXTENDED):
+            if meant or self.tag not in _EXTENDED:
                 hint = f"did you mean {meant}?" if meant else f"known: {', '.join(known)}"
                 raise self.fault(f"unknown attribute {cut(key)} of <{self.tag}>; {hint}")
 
@@ -163,9 +266,11 @@ class Element:
             raise self.fault(f"{stated} has {len(words)} entries, {count} are needed, e.g. {example}")
         for word in words:
             if len(word) > _NUMBER_LENGTH_MAX or not _NUMBER.fullmatch(word):
-                raise self.fault(
-                    f"{stated} is not a finite number; write decimal digits 0–9 with a point, e.g. {example}"
-                )
+                spaced = " ".join(text.replace(",", " ").split())
+                fix = "write decimal digits 0–9 with a point"
+                if "," in text and len(spaced.split()) == count:
+                    fix, example = "separate numbers by spaces only", f'"{cut(spaced)}"'
+                raise self.fault(f"{stated} is not a finite number; {fix}, e.g. {example}")
             value = float(word)
             vanished = value == 0.0 and re.search("[1-9]", re.split("[eE]", word)[0])
             # Limits may be arbitrarily large, which means that there is no limit.
@@ -200,18 +305,24 @@ def read_xml(path: Path) -> Element:
     data = read_bytes(path, ModelError, BYTES_MAX)
     if not data.strip():
         raise ModelError(f"{path}: is empty; a URDF file has <robot> with links and joints")
-    parser = expat.ParserCreate()
+    findings, declared = Findings(), _LATE_DECLARATION.search(data)
+    if declared is not None:
+        # Blank the declaration, so that line numbers remain.
+        data = data[: declared.start(1)] + b" " * len(declared[1]) + data[declared.end(1) :]
+        findings.extras.append("an XML declaration after the first character of the file")
+    encoding = declared[2] if declared is not None else None
+    parser = expat.ParserCreate(None if encoding is None else encoding.decode("ascii"))
     open_elements: list[Element] = []
     roots: list[Element] = []
-    count = 0
+    count, lost = 0, None  # an element that does not belong where it is
 
     def begin(tag: str, attributes: dict[str, str]) -> None:
-        nonlocal count
+        nonlocal count, lost
         count += 1
         around = [element.tag for element in open_elements]
         own = f"{tag} {quoted(attributes.get('name', ''))}" if around else "the robot"
         owner = open_elements[-1].owner if len(around) > 1 else own
-        element = Element(path, parser.CurrentLineNumber, tag, attributes, owner)
+        element = Element(path, parser.CurrentLineNumber, tag, attributes, owner, findings)
         if tag.startswith("xacro:"):
             raise element.error(f"<{cut(tag)}>: {_expand(path)}")
         if count > ELEMENTS_MAX:
@@ -222,22 +333,28 @@ def read_xml(path: Path) -> Element:
             raise element.error(f"<{cut(tag)}> has more than {ATTRIBUTES_MAX} attributes; simplify the model")
         parents = {"link": ["robot"], "inertial": ["robot", "link"]}.get(tag, around)
         in_robot = around[:1] == ["robot"] and "gazebo" not in around
-        if in_robot and around != parents and not (tag == "inertial" and around[:2] == parents):
-            raise element.error(
-                f"<{tag}> in <{cut(around[-1])}> would be ignored; it belongs in <{parents[-1]}>, move it there"
-            )
-        (open_elements[-1].children if open_elements else roots).append(element)
+        if lost is not None:
+            pass
+        elif in_robot and around != parents and not (tag == "inertial" and around[:2] == parents):
+            lost = element
+            text = f"<{tag}> in <{cut(around[-1])}> would be ignored; it belongs in <{parents[-1]}>, move it there"
+            findings.problems.append(element.error(text))
+        else:
+            (open_elements[-1].children if open_elements else roots).append(element)
         open_elements.append(element)
 
     def end(_: str) -> None:
-        open_elements.pop()
+        nonlocal lost
+        if open_elements.pop() is lost:
+            lost = None
 
     def text(content: str) -> None:
         tag, content = open_elements[-1].tag, content.strip()
         # An element without attributes is refused for missing attributes.
         if content and tag in _WITHOUT_TEXT and open_elements[-1].attributes:
             stated = f"<{tag}> contains the text {quoted(content)}"
-            raise _error(path, parser.CurrentLineNumber, f"{stated}; URDF has values in attributes only")
+            fix = "URDF has values in attributes only"
+            findings.problems.append(_error(path, parser.CurrentLineNumber, f"{stated}; {fix}"))
 
     def document_type(*_: object) -> None:
         problem = "has a DOCTYPE; entities and DTDs are not supported: expand and remove them"
@@ -261,12 +378,12 @@ def _expand(path: Path) -> str:
 
 
 def _near(word: str, known: tuple[str, ...]) -> str:
-    """Return the known word of which ``word`` looks like a misspelling, or "".
+    """Return ``word`` if it is known, otherwise the known word that it seems to misspell, or "".
 
     Words that are merely similar may be extensions of other programs.
     """
     if word in known:
-        return ""
+        return word
     near = difflib.get_close_matches(word[:40].casefold(), known, n=1, cutoff=0.8)
     return near[0] if near else ""
 
@@ -292,11 +409,11 @@ def cut(text: str) -> str:
 Colour = tuple[float, float, float, float]
 
 
-def _shapes_of(link: Element, named_colours: Mapping[str, Colour | None]) -> tuple[Shape, ...]:
+def _shapes_of(link: Element, named_colours: Mapping[str, Colour | None], tag: str = "visual") -> tuple[Shape, ...]:
     """Return the shapes of a link in its frame that can be drawn; ``named_colours`` maps names to colours."""
     shapes = []
     for visual in link.children:
-        if visual.tag == "visual":
+        if visual.tag == tag:
             with suppress(ModelError, ValueError):
                 shapes.append(_shape(visual, named_colours))
     return tuple(shapes)
@@ -394,29 +511,38 @@ class UrdfJoint:
 
 @dataclass(frozen=True)
 class UrdfTree:
-    """Links and joints by their names, in the order of the file, and the root link."""
+    """Links and joints by their names, in the order of the file, and the root links: one in a file without problems."""
 
     path: Path
     name: str
     links: dict[str, UrdfLink]
     joints: dict[str, UrdfJoint]
-    root: str
+    roots: tuple[str, ...]
+    findings: Findings
 
     def error(self, line: int, text: str) -> ModelError:
         """Return an error about a line of the file."""
         return _error(self.path, line, text)
 
 
-def read_tree(path: Path) -> UrdfTree:
+def read_tree(path: Path, corrections: Corrections | None = None) -> UrdfTree:
     """Read the links and joints of a URDF file.
 
     Raises
     ------
     ModelError
-        If the file cannot be read, is not URDF, or is ambiguous; the message contains file, line, link or joint,
-        attribute, value and a fix.
+        If the file cannot be read, is not URDF, or is ambiguous; the message lists all problems with file, line, link
+        or joint, attribute, value and a fix.
     """
+    tree = _parse(path, corrections or Corrections())
+    tree.findings.check()
+    return tree
+
+
+def _parse(path: Path, corrections: Corrections) -> UrdfTree:
+    """Read a file as far as possible, and collect its problems."""
     root = read_xml(path)
+    findings = root.findings
     if root.tag != "robot":
         raise root.error(f"the root element is <{cut(root.tag)}>, must be <robot>")
     root.check_children()
@@ -424,88 +550,182 @@ def read_tree(path: Path) -> UrdfTree:
     joints: dict[str, UrdfJoint] = {}
     materials = [child for child in root.children if child.tag == "material"]
     colours = {material.attributes.get("name", ""): _colour(material, {}) for material in materials}
-    for element in root.children:
-        if element.tag == "link":
-            link = _link(element, links, colours)
-            links[link.name] = link
-            if len(links) > LINKS_MAX:
-                raise element.error(f"more than {LINKS_MAX} links; simplify the model")
-    for element in root.children:
-        if element.tag == "joint":
-            joint = _joint(element, joints, links)
-            joints[joint.name] = joint
+    named: dict[tuple[str, str], Element] = {}
+    elements = [element for element in root.children if element.tag in ("link", "joint")]
+    if sum(element.tag == "link" for element in elements) > LINKS_MAX:
+        raise root.error(f"more than {LINKS_MAX} links; simplify the model")
+    # Joints name links that may follow them in the file.
+    for element in sorted(elements, key=lambda element: element.tag, reverse=True):
+        name = element.attributes.get("name", "")
+        twin = named.setdefault((element.tag, name), element)
+        if twin is not element and element.equals(twin):
+            element.ignore(f"second definition of {element.owner}")
+            continue
+        with findings.collecting():
+            if element.tag == "link":
+                links[name] = _link(element, links, colours, corrections.links.get(name, {}))
+            else:
+                joints[name] = _joint(element, joints, links, corrections.joints.get(name, {}))
+        if element.tag == "link" and name not in links:
+            findings.unread.add(name)
     if not links:
-        raise ModelError(f"{path}: has no <link>; a URDF file has links and joints")
-    return UrdfTree(path, root.attributes.get("name", "") or path.stem, links, joints, _root(path, links, joints))
+        findings.problems.append(ModelError(f"{path}: has no <link>; a URDF file has links and joints"))
+    for key, stated, known in (("links", corrections.links, links), ("joints", corrections.joints, joints)):
+        for name in stated.keys() - known.keys():
+            findings.problems.append(ModelError(f"{path}: plant.{key}: no {key[:-1]} {name!r}{suggest(name, known)}"))
+    roots: tuple[str, ...] = ()
+    with findings.collecting():
+        roots = _roots(path, links, joints)
+        if len(roots) > 1 and len(joints) == sum(tag == "joint" for tag, _ in named):
+            names, line = first_few([quoted(name) for name in roots]), links[roots[1]].line
+            findings.problems.append(
+                _error(path, line, f"a tree has one root link; found: {names}; connect them with joints")
+            )
+    tree = UrdfTree(path, root.attributes.get("name", "") or path.stem, links, joints, roots, findings)
+    return _floating(tree) if corrections.floating and len(roots) == 1 else tree
 
 
-def _link(element: Element, others: Mapping[str, UrdfLink], named_colours: Mapping[str, Colour | None]) -> UrdfLink:
-    name = element.name(others)
-    element.check_children()
+def _floating(tree: UrdfTree) -> UrdfTree:
+    """Return the tree with a floating joint between the world and its root link."""
+    (root,) = tree.roots
+    if ROOT in tree.joints or any(joint.kind == "floating" for joint in tree.joints.values() if joint.parent == root):
+        text = (
+            f"plant.base: floating adds a joint {ROOT!r}, but the file has a floating or equally named joint; remove it"
+        )
+        tree.findings.problems.append(ModelError(f"{tree.path}: {text}"))
+        return tree
+    world = WORLD
+    while world in tree.links:
+        world += "_"
+    line = tree.links[root].line
+    joint = UrdfJoint(Link(root, ROOT, world, "floating", np.array([1.0, 0.0, 0.0]), Inertia(0.0)), line, None)
+    links = {world: UrdfLink(world, line, None, shaped=False), **tree.links}
+    return replace(tree, links=links, joints={ROOT: joint, **tree.joints}, roots=(world,))
+
+
+def _link(
+    element: Element,
+    others: Mapping[str, UrdfLink],
+    named_colours: Mapping[str, Colour | None],
+    correction: Mapping[str, Any],
+) -> UrdfLink:
+    name, findings = element.name(others), element.findings
+    whole = correction.keys() >= {"mass", "com", "tensor"} or "density" in correction
+    element.check_children(("inertial",) if whole else ())
     for shape in element.children:
-        for lost in shape.children if shape.tag not in ("inertial", "gazebo") else ():
+        for lost in shape.children if shape.tag != "gazebo" and not _near(shape.tag, ("inertial",)) else ():
             if lost.tag in ("inertial", "mass", "inertia"):
                 target = "directly below <link>" if lost.tag == "inertial" else "into <inertial>"
-                raise lost.fault(f"<{lost.tag}> is inside <{cut(shape.tag)}>; move it {target}")
+                text = f"<{lost.tag}> is inside <{cut(shape.tag)}>; move it {target}"
+                findings.problems.append(lost.fault(text))
     shaped = any(child.tag in ("visual", "collision") for child in element.children)
-    inertial = element.child("inertial")
-    inertia = None if inertial is None else _inertia(inertial)
-    return UrdfLink(name, element.line, inertia, shaped, _shapes_of(element, named_colours))
+    shapes, inertia = _shapes_of(element, named_colours), None
+    with findings.collecting():
+        if "density" in correction:
+            solids = shapes or _shapes_of(element, {}, "collision")
+            inertia = solid_inertia(solids, correction["density"], element.path.parent, f"plant.links.{name}")
+            inertia = replace(inertia, com=correction.get("com", inertia.com))
+        elif whole:
+            inertia = Inertia(**correction)
+        elif (inertial := element.child("inertial")) is not None:
+            inertia = _inertia(inertial, correction)
+        elif correction:
+            inertia = Inertia(**{"mass": 0.0, **correction})
+    return UrdfLink(name, element.line, inertia, shaped, shapes)
 
 
-def _inertia(element: Element) -> Inertia:
-    element.check_children()
-    mass = element.required("mass", "add both, or remove <inertial> for a link without mass")
-    moments = element.required("inertia", "add all six moments (zero for a point mass), or remove <inertial>")
-    com, rpy = element.origin()
-    R, kilograms = rotation(*rpy), mass.number("value")
-    if kilograms < 0.0:
-        raise mass.fault(f"mass {kilograms:g} kg must not be negative")
-    xx, xy, xz, yy, yz, zz = map(moments.number, MOMENTS)
-    tensor = R @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ R.T
-    return Inertia(kilograms, np.array(com), 0.5 * (tensor + tensor.T))
+def _inertia(element: Element, correction: Mapping[str, Any]) -> Inertia | None:
+    """Return the mass properties of a link; None if a number is missing or invalid."""
+    findings, corrected = element.findings, {"mass": "mass", "tensor": "inertia", "com": "origin"}
+    reported = len(findings.problems)
+    # The angles of <origin> turn the axes of <inertia>.
+    unread = [corrected[key] for key in correction if key != "com" or "tensor" in correction]
+    element.check_children(unread)
+    values: dict[str, Any] = {}
+    name = element.owner.removeprefix("link ").strip("'")
+    with findings.collecting():
+        if "mass" not in correction:
+            mass = element.required("mass", f"add it, or set plant.links.{name}.mass_kg")
+            values["mass"] = mass.number("value")
+            if values["mass"] < 0.0:
+                raise mass.fault(f"mass {values['mass']:g} kg must not be negative")
+    with findings.collecting():
+        com, rpy = element.origin() if "origin" not in unread else (_ZERO, _ZERO)
+        values["com"], R = np.array(com), rotation(*rpy)
+    with findings.collecting():
+        if "tensor" not in correction:
+            moments = element.required(
+                "inertia", f"add all six moments, set plant.links.{name}.inertia_kg_m2 or density_kg_m3"
+            )
+            xx, xy, xz, yy, yz, zz = map(moments.number, MOMENTS)
+            if "com" in values:
+                tensor = R @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ R.T
+                values["tensor"] = 0.5 * (tensor + tensor.T)
+    return Inertia(**{**values, **correction}) if len(findings.problems) == reported else None
 
 
-def _joint(element: Element, others: Mapping[str, UrdfJoint], links: Mapping[str, UrdfLink]) -> UrdfJoint:
-    name = element.name(others)
-    element.check_children()
+def _joint(
+    element: Element,
+    others: Mapping[str, UrdfJoint],
+    links: Mapping[str, UrdfLink],
+    correction: Mapping[str, float],
+) -> UrdfJoint:
+    name, findings = element.name(others), element.findings
+    limited, lossy = "lower" in correction, correction.keys() >= {"damping", "friction"}
+    element.check_children([tag for tag, known in (("limit", limited), ("dynamics", lossy)) if known])
     kind, known = element.attributes.get("type"), (*MOVING, "fixed", *SEVERAL)
     if kind not in known:
         stated = "has no type" if kind is None else f"is {quoted(kind)}{suggest(kind, known)}"
         raise element.error(f"{element.owner} {stated}; known: {', '.join(known)}")
-    ends = {}
+    ends: dict[str, str] = {}
     for tag in ("parent", "child"):
-        end = element.required(tag, f'add it, e.g. <{tag} link="arm"/>')
-        ends[tag] = end.text("link")
-        if ends[tag] not in links:
-            raise end.fault(f"its {tag} link {quoted(ends[tag])} is not in the file{suggest(ends[tag], links)}")
+        with findings.collecting():
+            end = element.required(tag, f'add it, e.g. <{tag} link="arm"/>')
+            ends[tag] = end.text("link")
+            if ends[tag] in findings.unread:
+                ends.pop(tag)
+            elif ends[tag] not in links:
+                stated = f"its {tag} link {quoted(ends[tag])} is not in the file"
+                raise end.fault(f"{stated}; add it or remove the joint{suggest(ends.pop(tag), links)}")
     for tag in ("limit", "dynamics") if kind in SEVERAL else ():
-        if (single := element.child(tag)) is not None:
-            raise single.error(
-                f"{element.owner} is {kind}: <{tag}> has one number but the joint several rates; remove <{tag}>"
-            )
-    p, rpy = element.origin()
-    limits = _limits(element, kind)
-    losses: dict[str, Any] = {}
-    if (dynamics := element.child("dynamics")) is not None:
-        losses = {key: dynamics.number(key, 0.0) for key in ("damping", "friction")}
-        if min(losses.values()) < 0.0:
-            stated = " and ".join(f"{key} {loss:g}" for key, loss in losses.items())
-            raise dynamics.fault(f"{stated} must not be negative")
-    coupling = None
-    if (mimic := element.child("mimic")) is not None:
-        coupling = Coupling(name, mimic.text("joint"), mimic.number("multiplier", 1.0), mimic.number("offset", 0.0))
+        with findings.collecting():
+            if (single := element.child(tag)) is not None:
+                raise single.error(
+                    f"{element.owner} is {kind}: <{tag}> has one number but the joint several rates; remove <{tag}>"
+                )
+    p, rpy, axis, coupling = _ZERO, _ZERO, np.array([1.0, 0.0, 0.0]), None
+    values: dict[str, Any] = {}
+    with findings.collecting():
+        p, rpy = element.origin()
+    with findings.collecting():
+        if not limited:
+            values |= _limits(element, kind)
+        elif (limit := element.child("limit")) is not None:
+            values |= _bounds(limit, kind)
+    with findings.collecting():
+        if not lossy and (dynamics := element.child("dynamics")) is not None:
+            losses = {key: dynamics.number(key, 0.0) for key in ("damping", "friction") if key not in correction}
+            if min(losses.values()) < 0.0:
+                stated = " and ".join(f"{key} {loss:g}" for key, loss in losses.items())
+                raise dynamics.fault(f"{stated} must not be negative")
+            values |= losses
+    with findings.collecting():
+        if (mimic := element.child("mimic")) is not None:
+            coupling = Coupling(name, mimic.text("joint"), mimic.number("multiplier", 1.0), mimic.number("offset", 0.0))
+    with findings.collecting():
+        axis = _axis(element, kind)
+    if len(ends) < 2:
+        raise _Reported("")
     link = Link(
         name=ends["child"],
         joint=name,
         parent=ends["parent"],
         kind=kind,
-        axis=_axis(element, kind),
+        axis=axis,
         inertia=Inertia(0.0),
         R_PJ=rotation(*rpy),
         p_PJ=np.array(p),
-        **limits,
-        **losses,
+        **{**values, **correction},
     )
     return UrdfJoint(link, element.line, coupling)
 
@@ -518,20 +738,25 @@ def _limits(element: Element, kind: str) -> dict[str, Any]:
             raise element.error(f"{element.owner} is {kind} and has no <limit>; add it, or make the joint continuous")
         return {}
     lower, upper = limit.number("lower", 0.0), limit.number("upper", 0.0)
-    bounds = [limit.number(key, None if kind in MOVING else 0.0) for key in ("velocity", "effort")]
-    if min(bounds) < 0.0:
-        raise limit.fault("velocity and effort limits must not be negative; 0: unlimited")
-    velocity, effort = (size if 0.0 < size < UNLIMITED else math.inf for size in bounds)
+    bounds = _bounds(limit, kind)
     if kind == "continuous":
         lower, upper = -math.inf, math.inf
     if lower > upper:
-        raise limit.fault(f"lower limit {lower:g} is above upper limit {upper:g}; swap them")
+        key = f"plant.joints.{element.attributes['name']}.limit_{'m' if kind == 'prismatic' else 'deg'}"
+        raise limit.fault(f"lower limit {lower:g} is above upper limit {upper:g}; swap them, or set {key}")
     return {
         "lower": -math.inf if lower <= -UNLIMITED else lower,
         "upper": math.inf if upper >= UNLIMITED else upper,
-        "velocity_limit": velocity,
-        "effort_limit": effort,
+        **bounds,
     }
+
+
+def _bounds(limit: Element, kind: str) -> dict[str, float]:
+    """Return the limits of velocity and effort; zero means unknown."""
+    bounds = {f"{key}_limit": limit.number(key, None if kind in MOVING else 0.0) for key in ("velocity", "effort")}
+    if min(bounds.values()) < 0.0:
+        raise limit.fault("velocity and effort limits must not be negative; 0: unlimited")
+    return {key: size if 0.0 < size < UNLIMITED else math.inf for key, size in bounds.items()}
 
 
 def _axis(element: Element, kind: str) -> Array:
@@ -554,8 +779,8 @@ def _axis(element: Element, kind: str) -> Array:
     return axis if abs(length - 1.0) < 1e-15 else axis / length
 
 
-def _root(path: Path, links: Mapping[str, UrdfLink], joints: Mapping[str, UrdfJoint]) -> str:
-    """Return the only link that is not a child; all others must be reached from it."""
+def _roots(path: Path, links: Iterable[str], joints: Mapping[str, UrdfJoint]) -> tuple[str, ...]:
+    """Return the links that are not a child; all others must be reached from them."""
     above: dict[str, UrdfJoint] = {}
     for joint in joints.values():
         other = above.setdefault(joint.child, joint)
@@ -577,12 +802,7 @@ def _root(path: Path, links: Mapping[str, UrdfLink], joints: Mapping[str, UrdfJo
             f"joint {quoted(lost.name)} is part of a kinematic loop without a root link; "
             "the joints of a URDF file must form a tree",
         ) from None
-    roots = [name for name in links if name not in above]
-    if len(roots) > 1:
-        names = ", ".join(quoted(name) for name in roots[:5]) + (", …" if len(roots) > 5 else "")
-        line = links[roots[1]].line
-        raise _error(path, line, f"a tree has one root link; found: {names}; connect them with joints")
-    return roots[0]
+    return tuple(name for name in links if name not in above)
 
 
 def rotation(roll: float, pitch: float, yaw: float) -> Array:
@@ -600,7 +820,7 @@ def rotation(roll: float, pitch: float, yaw: float) -> Array:
 # Conversion to a robot: bodies, joints, limits, viscous losses, couplings, frames and shapes.
 
 
-HAND = "hand"
+HAND, ROOT = "hand", "root"
 # Functions that make the rows of joints with several rows.
 ROWS = {"floating": floating, "planar": planar}
 
@@ -616,7 +836,7 @@ class _Place:
     joints: int
 
 
-def read_urdf(path: Path, lock: Mapping[str, float] | None = None) -> Robot:
+def read_urdf(path: Path, lock: Mapping[str, float] | None = None, corrections: Corrections | None = None) -> Robot:
     """Read the bodies and joints of a URDF file.
 
     Joints keep their names and their order in the file (except that a parent always comes first); each body is named
@@ -631,36 +851,40 @@ def read_urdf(path: Path, lock: Mapping[str, float] | None = None) -> Robot:
         URDF file.
     lock : mapping, optional
         Positions [rad or m] of joints to fix, with the joint names as keys.
+    corrections : Corrections, optional
+        Values that replace numbers of the file.
 
     Raises
     ------
     ModelError
         If the file does not exist or is not URDF, a number or an inertia is invalid, the leader of a mimic joint does
-        not exist, or ``lock`` names an unknown joint or one without a single position. The message contains file, line,
-        link or joint, value and a fix.
+        not exist, or ``lock`` names an unknown joint or one without a single position. The message lists all problems,
+        each with file, line, link or joint, value and a fix.
 
     Warns
     -----
     UserWarning
-        If a link with a shape has no mass, the moments of inertia of a link are impossible for a body, or a joint is
-        locked beyond its limits.
+        If a link with a shape has no mass, the moments of inertia of a link are impossible for a body, a joint is
+        locked beyond its limits, or the file has harmless extras.
     """
-    tree = read_tree(path)
-    locked = _locked(tree, {**_locked_followers(tree, lock or {}), **(lock or {})})
+    corrections = corrections or Corrections()
+    locked = tree = _parse(path, corrections)
+    with tree.findings.collecting():
+        locked = _locked(tree, {**_locked_followers(tree, lock or {}), **(lock or {})})
     places = _places(locked)
-    links = _links(locked, places)
-    if not links:
-        raise ModelError(f"{path}: has no moving joints")
-    _warn(locked, places, links)
+    links = _possible(locked, places, _links(locked, places), corrections.nearest)
+    if not links and not tree.findings.problems:
+        raise ModelError(f"{path}: has no moving joints; set plant.base: floating to let the root link move")
     frames = [Frame(name, pose.body, pose.R, pose.p) for name, pose in places.items() if pose.body != name]
     rows = tuple(row for link in links for row in (ROWS[link.kind](link) if link.kind in ROWS else (link,)))
     followers = [(joint, coupling) for joint in locked.joints.values() if (coupling := joint.coupling) is not None]
     for joint, coupling in followers:
         for name in (joint.name, coupling.leader):
-            if locked.joints[name].kind in SEVERAL:
-                raise tree.error(
-                    joint.line, f"joint {joint.name!r} mimics {coupling.leader!r}, but {name!r} has several positions"
-                )
+            if name in locked.joints and locked.joints[name].kind in SEVERAL:
+                text = f"joint {joint.name!r} mimics {coupling.leader!r}, but {name!r} has several positions"
+                tree.findings.problems.append(tree.error(joint.line, text))
+    tree.findings.check()
+    _warn(locked, places, links)
     hand = _hand(tree, places)
     return Robot(
         name=tree.name,
@@ -742,7 +966,7 @@ def _places(tree: UrdfTree) -> dict[str, _Place]:
     below: dict[str, list[tuple[int, UrdfJoint]]] = {name: [] for name in tree.links}
     for order, joint in enumerate(tree.joints.values()):
         below[joint.parent].append((order, joint))
-    places = {tree.root: _Place(None, np.eye(3), np.zeros(3), 0, 0)}
+    places = {root: _Place(None, np.eye(3), np.zeros(3), 0, 0) for root in tree.roots}
     # Follow fixed joints first, because links behind them belong to an existing body and may carry joints early in the
     # file.
     pending: list[tuple[bool, int, str]] = []
@@ -752,7 +976,8 @@ def _places(tree: UrdfTree) -> dict[str, _Place]:
         for order, joint in below[link]:
             heapq.heappush(pending, (joint.kind != "fixed", order, joint.name))
 
-    open_up(tree.root)
+    for root in tree.roots:
+        open_up(root)
     while pending:
         moves, _, name = heapq.heappop(pending)
         joint, parent = joints[name], places[joints[name].parent]
@@ -817,10 +1042,45 @@ def _hand(tree: UrdfTree, places: Mapping[str, _Place]) -> _Place:
     return places[tip]
 
 
-def _warn(tree: UrdfTree, places: Mapping[str, _Place], links: tuple[Link, ...]) -> None:
-    """Reject impossible bodies and warn about missing masses."""
+def _possible(tree: UrdfTree, places: Mapping[str, _Place], links: Iterable[Link], nearest: bool) -> tuple[Link, ...]:
+    """Return bodies whose moments of inertia are possible: report the others, or replace them by the nearest ones."""
+    possible = []
     for link in links:
-        link.inertia.check(f"{tree.path}:{tree.links[link.name].line}: link {link.name!r}, with everything fixed to it")
+        name = f"{tree.path}:{tree.links[link.name].line}: link {link.name!r}, with everything fixed to it"
+        try:
+            link.inertia.check(name)
+        except ModelError as error:
+            if nearest:
+                made = link.inertia.nearest()
+                change = float(np.linalg.norm(made.tensor - link.inertia.tensor) / np.linalg.norm(link.inertia.tensor))
+                before, after = (np.linalg.eigvalsh(inertia.tensor) for inertia in (link.inertia, made))
+                text = f"principal moments {before} kg m² are impossible; {after} are used instead"
+                warnings.warn(f"{name}: {text} (a change of {100.0 * change:.3g} % of the norm)", stacklevel=3)
+                link = replace(link, inertia=made)
+            else:
+                odd = [part for part in _odd(tree, places) if places[part].body == link.name] or [link.name]
+                fix = f"set plant.links.{odd[0]}.inertia_kg_m2, or plant.inertia: nearest for the smallest change"
+                tree.findings.problems.append(ModelError(f"{error}; {fix}"))
+        possible.append(link)
+    return tuple(possible)
+
+
+def _odd(tree: UrdfTree, places: Mapping[str, _Place]) -> list[str]:
+    """Return the moving links whose own moments of inertia are impossible."""
+    odd = []
+    for name, pose in places.items():
+        if pose.body is not None:
+            try:
+                (tree.links[name].inertia or Inertia(0.0)).check(name)
+            except ModelError:
+                odd.append(name)
+    return odd
+
+
+def _warn(tree: UrdfTree, places: Mapping[str, _Place], links: tuple[Link, ...]) -> None:
+    """Warn about harmless extras, missing masses, and impossible moments of parts."""
+    if tree.findings.extras:
+        warnings.warn(f"{tree.path}: harmless extras are ignored: {first_few(tree.findings.extras)}", stacklevel=3)
     loaded: set[str | None] = set()
     for link in reversed(links):
         if link.name in loaded or link.inertia.mass > 0.0 or link.inertia.tensor.any():
@@ -834,13 +1094,7 @@ def _warn(tree: UrdfTree, places: Mapping[str, _Place], links: tuple[Link, ...])
         warnings.warn(
             f"{tree.path}: links with a shape but without <inertial> have no mass ({', '.join(bare)})", stacklevel=3
         )
-    odd = []
-    for part in moving:
-        try:
-            (part.inertia or Inertia(0.0)).check(part.name)
-        except ModelError:
-            odd.append(part.name)
-    if odd:
+    if odd := _odd(tree, places):
         warnings.warn(
             f"{tree.path}: impossible moments of inertia were accepted, because the sums with the links fixed to these "
             f"links are possible ({', '.join(odd)})",
