@@ -73,6 +73,11 @@ def validation() -> Any:
     return data("reference/validation.json")
 
 
+def robot_files(read: str = "") -> str:
+    """Return the number of robot files whose reading begins with ``read``."""
+    return str(sum(row["read"].startswith(read) for row in data("reference/robot_files.json").values()))
+
+
 def contact() -> Any:
     return data("contact/comparison.json")
 
@@ -1093,6 +1098,9 @@ for _name, _runs in {
         NUMBERS[f"{_name}_{_k}_ledger"] = lambda name=_run: residual(name)
         NUMBERS[f"{_name}_{_k}_J"] = lambda name=_run: energy(name)
 NUMBERS |= {
+    "robot_files": robot_files,
+    "robot_files_loaded": lambda: robot_files("loads"),
+    "robot_files_corrected": lambda: robot_files("loads after"),
     "slope_slip_s": lambda: fixed(run("block_on_slope pulled")["first_at_s"]["slip_start"], 4),
     "bounces_half": lambda: str(run("bouncing_link half")["events"].get("bounce", 0)),
     "bounces_dead": lambda: str(run("bouncing_link dead")["events"].get("bounce", 0)),

@@ -26,8 +26,9 @@ SAME = 1e-9
 # Positions along the axis of a capsule at which its row is examined, as fractions of its length.
 SHARES = (0.0, 0.3, 0.7, 1.0)
 # The inertia of a joint counts as zero below this fraction of Σ m l² + tr I of the bodies that it moves, and below this
-# fraction of their Σ m r² about the world origin, the rounding error of the sweep.
-NOTHING, CANCELLED = 1e-12, 1e-14
+# fraction of their Σ m r² about the world origin, the rounding error of the sweep. Axes that robot files round to six
+# digits miss each other by up to 1e-5 of their distance from a point mass.
+NOTHING, CANCELLED = 1e-10, 1e-14
 # Maximum rounding error of the sweep as a fraction of Σ m l² + tr I; beyond it the inertia of a joint is unknown.
 KNOWN = 1e-3
 
@@ -137,8 +138,11 @@ def mobility_floors(
     return floors
 
 
-def without_inertia(model: Model, q: Array) -> list[int]:
-    """Return the indices of joints that move no inertia at coordinates q (nq,); only the last one in a series."""
+def without_inertia(model: Model, q: Array) -> list[tuple[int, list[int]]]:
+    """Return the indices of joints that move no inertia at coordinates q (nq,), and of the bodies behind them.
+
+    Of joints in a series only the last one is returned; of the bodies behind it, those with mass, or all of them.
+    """
     links = model.robot.links
     felt = model.articulated_inertia(q)
     mass = np.array([link.inertia.mass for link in links])
@@ -159,7 +163,12 @@ def without_inertia(model: Model, q: Array) -> list[int]:
     # If bodies have diverged, rounding errors dominate and the inertia is unknown.
     known = rounding <= KNOWN * about_joint
     none = (felt <= np.maximum(NOTHING * about_joint, rounding)) & (known | (about_joint == 0.0))
-    return [k for k in np.flatnonzero(none).tolist() if np.count_nonzero(none & behind[k]) == 1]
+    last = [k for k in np.flatnonzero(none).tolist() if np.count_nonzero(none & behind[k]) == 1]
+    bodies = behind & np.array([link.name not in model.robot.carriers for link in links])
+    return [
+        (k, np.flatnonzero(bodies[k] & (mass > 0.0) if (bodies[k] & (mass > 0.0)).any() else bodies[k]).tolist())
+        for k in last
+    ]
 
 
 def moving_nothing(model: Model, q: Array) -> str:
@@ -169,11 +178,12 @@ def moving_nothing(model: Model, q: Array) -> str:
     none = without_inertia(model, q)
     if not none:
         return ""
-    joints = listed([model.robot.links[k].joint for k in none])
-    bodies = listed([model.robot.links[k].name for k in none])
+    joints = listed([model.robot.links[k].joint for k, _ in none])
+    bodies = listed([model.robot.links[k].name for _, behind in none for k in behind])
     return (
         f"joint {joints} moves no inertia in this posture: the mass behind it ({bodies}) is zero, or on its axis "
-        "without moments of inertia; add moments of inertia or a rotor inertia, change the posture, or lock the joint"
+        "without moments of inertia; set mass_kg and inertia_kg_m2 of the link or a rotor inertia, change the posture, "
+        "or lock the joint"
     )
 
 

@@ -17,7 +17,7 @@ from dynsim.dynamics.derivative import System
 from dynsim.dynamics.tree import loads as kl
 from dynsim.dynamics.tree import support as ks
 from dynsim.dynamics.tree.loads import LoadArrays
-from dynsim.errors import ModelError, brief
+from dynsim.errors import ModelError, brief, first_few
 from dynsim.jit.kernel import integers, reals
 from dynsim.model.description import WORLD, Contact, Coupling, Link, Load, Quadric, Robot, Tie
 from dynsim.model.drives import Drive, Motor, Servo, TorqueSource, servo_row
@@ -617,15 +617,17 @@ def _check_motor(motor: Drive, joints: dict[str, Link]) -> None:
 
 def _check_movable(robot: Robot, tree: np.ndarray, body: np.ndarray) -> None:
     """Raise ModelError for a joint that has no equation of motion: no motor inertia, and no mass beyond it."""
+    empty: list[str] = []
     carried = np.abs(body[:, ka.MASS]) + np.abs(body[:, ka.INERTIA : ka.INERTIA + 6]).sum(axis=1)
     for i in range(len(tree) - 1, -1, -1):
         if carried[i] + body[i, ka.ARMATURE] <= 0.0:
-            raise ModelError(
-                f"{robot.links[i].joint} moves no mass and has no motor inertia; set the mass of a link beyond it, or "
-                "the rotor inertia of its motor"
-            )
+            empty.append(robot.links[i].joint)
         if tree[i, ka.PARENT] >= 0:
             carried[tree[i, ka.PARENT]] += carried[i]
+    if empty:
+        text = "move no mass and have" if len(empty) > 1 else "moves no mass and has"
+        fix = "set the mass of a link beyond it (mass_kg), or the rotor inertia of its motor"
+        raise ModelError(f"{first_few(empty[::-1], 20)} {text} no motor inertia; {fix}")
 
 
 # Empty shape tables for time stepping, so that one compiled program fits all scenes.

@@ -132,6 +132,15 @@ def test_free_flyer() -> None:
         assert max(abs(joint[-1] - joint[0]) for joint in joints) < 1e-3
 
 
+def test_corrected_arm() -> None:
+    fixed, floating = (run("corrected_arm", each) for each in ("fixed", "floating"))
+    swings = [np.rad2deg(column(record, "q", "shoulder")[-1]) for record in (fixed, floating)]
+    assert swings[0] == pytest.approx(28.2, **ROUNDED)
+    assert abs(swings[1]) < 0.01
+    assert turn_deg(floating) == pytest.approx(17.2, **ROUNDED)
+    assert [column(record, "q", "elbow")[0] for record in (fixed, floating)] == pytest.approx(np.deg2rad([10, 10]))
+
+
 def test_snake_short() -> None:
     waits = {"circle": 0.0, "door": 0.0, "sideways": 4.78, "backward": 8.87}
     for variant, seconds in waits.items():

@@ -356,6 +356,17 @@ CHANGES: dict[tuple[str, str], dict[str, Any]] = {
         "controller.operator.base_acceleration_rad_s2": 3,
         "controller.operator.commands.0.base": [0.25, -0.4],
     },
+    ("corrected_arm", "fixed"): {
+        "plant.base": "floating",
+        "plant.links.upper_arm.mass_kg": 0.7,
+        "plant.links.upper_arm.com_m": [0, 0, 0.13],
+        "plant.links.upper_arm.inertia_kg_m2": [0.005, 0, 0, 0.005, 0, 0.0004],
+        "plant.links.forearm.density_kg_m3": 1500,
+        "plant.joints.shoulder.damping": 0.2,
+        "plant.joints.shoulder.friction": 0.1,
+        "plant.joints.elbow.limit_deg": [5, 140],
+        "plant.joints.grip.limit_m": [0.008, 0.03],
+    },
     ("free_flyer", "cycle"): {
         "plant.gravity_m_s2": [0, 0, -0.1],
         "plant.initial_pose.root.position_m": [0, 0.5, 1],
@@ -449,6 +460,7 @@ CHANGES: dict[tuple[str, str], dict[str, Any]] = {
 }
 # Keys that limit a run: a value at which it is refused or stops, and a part of the message.
 LIMITS: dict[tuple[str, str], dict[str, tuple[Any, str]]] = {
+    ("corrected_arm", "fixed"): {"plant.inertia": ("strict", "plant.inertia: nearest")},
     ("sampled_arm", "encoders"): {
         "controller.hand.tolerance_m": (1e-17, "out of reach"),
         "integrator.wall_limit_s": (1e-4, "integrator.wall_limit_s"),

@@ -204,7 +204,7 @@ def test_a_joint_that_moves_no_inertia_is_named(shift):
         at_origin.hand,
     )
     for angles in ([0.0, 0.0], [0.7, -1.1]):
-        assert without_inertia(Model(robot), np.array(angles)) == [1]
+        assert without_inertia(Model(robot), np.array(angles)) == [(1, [1])]
     text = moving_nothing(Model(robot), np.zeros(2))
     check_message(text, "wrist_joint", "wrist")
 

@@ -326,6 +326,14 @@ def edges(mesh: Mesh) -> tuple[int, int]:
     return int((count == 1).sum()), int((count > 2).sum())
 
 
+def test_meshes_are_merged_without_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "fast_simplification", None)
+    (few,) = simplified([welded(ball())], 3000)
+    assert 500 < len(few.triangles) < 4500
+    # All corners are those of the ball.
+    assert np.linalg.norm(few.corners, axis=1) == pytest.approx(1.0, rel=1e-9)
+
+
 def test_meshes_are_simplified_together() -> None:
     """The largest come down, to solids of the same size without a hole; small ones stay as they are."""
     large, small = welded(ball()), welded(Mesh(CORNERS, FACES))

@@ -129,8 +129,8 @@ def simplified(meshes: Sequence[Mesh], most: int = TRIANGLES) -> list[Mesh]:
     """Simplify meshes to about ``most`` triangles in total; smaller meshes are unchanged.
 
     Edges are collapsed in the places where this changes the surface least (quadric error metrics, Garland and Heckbert
-    1997). Parts with different colours are simplified separately, the largest first, and keep their borders, so that no
-    gaps open between them.
+    1997). Without the extra ``meshes``, corners are merged on a grid instead. Parts with different colours are
+    simplified separately, the largest first, and keep their borders, so that no gaps open between them.
     """
     limit = _limit([len(rows) for mesh in meshes for rows in _by_colour(mesh)], most)
     return [_simplified(mesh, limit) for mesh in meshes]
@@ -177,8 +177,10 @@ def _decimated(mesh: Mesh, rows: NDArray[np.intp], most: int) -> Mesh:
     paint = None if mesh.colours is None else mesh.colours[rows]
     if len(faces) <= most:
         return Mesh(corners, faces, paint)
-    from fast_simplification import simplify
-
+    try:
+        from fast_simplification import simplify
+    except ImportError:  # an extra; merging of corners alone is coarser
+        return Mesh(corners, faces, paint)
     # Scale to unit size, because the thresholds are lengths and a mesh may be in millimetres.
     low, size = _box(corners)
     unit = (corners - low) / size

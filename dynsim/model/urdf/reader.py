@@ -365,7 +365,10 @@ def read_xml(path: Path) -> Element:
     try:
         parser.Parse(data, True)
     except expat.ExpatError as error:
-        raise _error(path, error.lineno, f"invalid XML: {expat.ErrorString(error.code)}") from None
+        problem = f"invalid XML: {expat.ErrorString(error.code)}"
+        if not roots or open_elements:
+            raise _error(path, error.lineno, problem) from None
+        findings.problems.append(_error(path, error.lineno, f"{problem}; remove the text after </robot>"))
     except (LookupError, ValueError) as error:
         raise ModelError(f"{path}: unknown encoding ({error}); save it as UTF-8") from None
     return roots[0]
@@ -570,9 +573,14 @@ def _parse(path: Path, corrections: Corrections) -> UrdfTree:
             findings.unread.add(name)
     if not links:
         findings.problems.append(ModelError(f"{path}: has no <link>; a URDF file has links and joints"))
-    for key, stated, known in (("links", corrections.links, links), ("joints", corrections.joints, joints)):
-        for name in stated.keys() - known.keys():
-            findings.problems.append(ModelError(f"{path}: plant.{key}: no {key[:-1]} {name!r}{suggest(name, known)}"))
+    floats = corrections.floating
+    if (
+        links
+        and not floats
+        and all(joint.attributes.get("type") == "fixed" for joint in elements if joint.tag == "joint")
+    ):
+        floats = True  # so that the mass properties are checked too
+        findings.problems.append(_immobile(path))
     roots: tuple[str, ...] = ()
     with findings.collecting():
         roots = _roots(path, links, joints)
@@ -582,7 +590,11 @@ def _parse(path: Path, corrections: Corrections) -> UrdfTree:
                 _error(path, line, f"a tree has one root link; found: {names}; connect them with joints")
             )
     tree = UrdfTree(path, root.attributes.get("name", "") or path.stem, links, joints, roots, findings)
-    return _floating(tree) if corrections.floating and len(roots) == 1 else tree
+    return _floating(tree) if floats and len(roots) == 1 else tree
+
+
+def _immobile(path: Path) -> ModelError:
+    return ModelError(f"{path}: has no moving joints; set plant.base: floating to let the root link move")
 
 
 def _floating(tree: UrdfTree) -> UrdfTree:
@@ -676,7 +688,9 @@ def _joint(
     kind, known = element.attributes.get("type"), (*MOVING, "fixed", *SEVERAL)
     if kind not in known:
         stated = "has no type" if kind is None else f"is {quoted(kind)}{suggest(kind, known)}"
-        raise element.error(f"{element.owner} {stated}; known: {', '.join(known)}")
+        several = "; three revolute joints about one point are a ball joint" if kind in ("spherical", "ball") else ""
+        findings.problems.append(element.error(f"{element.owner} {stated}; known: {', '.join(known)}{several}"))
+        kind = "continuous"  # to find further problems
     ends: dict[str, str] = {}
     for tag in ("parent", "child"):
         with findings.collecting():
@@ -733,17 +747,20 @@ def _joint(
 def _limits(element: Element, kind: str) -> dict[str, Any]:
     """Return the limits of a joint by their names in `Link`; zero velocity or effort means unknown."""
     limit = element.child("limit")
+    key = f"plant.joints.{element.attributes['name']}.limit_{'m' if kind == 'prismatic' else 'deg'}"
     if limit is None:
         if kind in ("revolute", "prismatic"):
-            raise element.error(f"{element.owner} is {kind} and has no <limit>; add it, or make the joint continuous")
+            raise element.error(f"{element.owner} is {kind} and has no <limit>; add it or set {key}")
         return {}
-    lower, upper = limit.number("lower", 0.0), limit.number("upper", 0.0)
+    try:
+        lower, upper = limit.number("lower", 0.0), limit.number("upper", 0.0)
+        if kind == "continuous":
+            lower, upper = -math.inf, math.inf
+        if lower > upper:
+            raise limit.fault(f"lower limit {lower:g} is above upper limit {upper:g}; swap them")
+    except ModelError as error:
+        raise ModelError(f"{error}; or set {key}") from None
     bounds = _bounds(limit, kind)
-    if kind == "continuous":
-        lower, upper = -math.inf, math.inf
-    if lower > upper:
-        key = f"plant.joints.{element.attributes['name']}.limit_{'m' if kind == 'prismatic' else 'deg'}"
-        raise limit.fault(f"lower limit {lower:g} is above upper limit {upper:g}; swap them, or set {key}")
     return {
         "lower": -math.inf if lower <= -UNLIMITED else lower,
         "upper": math.inf if upper >= UNLIMITED else upper,
@@ -869,12 +886,21 @@ def read_urdf(path: Path, lock: Mapping[str, float] | None = None, corrections: 
     """
     corrections = corrections or Corrections()
     locked = tree = _parse(path, corrections)
+    for key, corrected, known in (
+        ("links", corrections.links, tree.links),
+        ("joints", corrections.joints, tree.joints),
+    ):
+        for name in corrected.keys() - known.keys():
+            tree.findings.problems.append(
+                ModelError(f"{path}: plant.{key}: no {key[:-1]} {name!r}{suggest(name, known)}")
+            )
     with tree.findings.collecting():
         locked = _locked(tree, {**_locked_followers(tree, lock or {}), **(lock or {})})
     places = _places(locked)
-    links = _possible(locked, places, _links(locked, places), corrections.nearest)
+    stated = _links(locked, places)
+    links = _possible(locked, places, stated, corrections.nearest)
     if not links and not tree.findings.problems:
-        raise ModelError(f"{path}: has no moving joints; set plant.base: floating to let the root link move")
+        raise _immobile(path)
     frames = [Frame(name, pose.body, pose.R, pose.p) for name, pose in places.items() if pose.body != name]
     rows = tuple(row for link in links for row in (ROWS[link.kind](link) if link.kind in ROWS else (link,)))
     followers = [(joint, coupling) for joint in locked.joints.values() if (coupling := joint.coupling) is not None]
@@ -884,7 +910,7 @@ def read_urdf(path: Path, lock: Mapping[str, float] | None = None, corrections: 
                 text = f"joint {joint.name!r} mimics {coupling.leader!r}, but {name!r} has several positions"
                 tree.findings.problems.append(tree.error(joint.line, text))
     tree.findings.check()
-    _warn(locked, places, links)
+    _warn(locked, places, links, {link.name for link, old in zip(links, stated, strict=True) if link is not old})
     hand = _hand(tree, places)
     return Robot(
         name=tree.name,
@@ -1077,8 +1103,8 @@ def _odd(tree: UrdfTree, places: Mapping[str, _Place]) -> list[str]:
     return odd
 
 
-def _warn(tree: UrdfTree, places: Mapping[str, _Place], links: tuple[Link, ...]) -> None:
-    """Warn about harmless extras, missing masses, and impossible moments of parts."""
+def _warn(tree: UrdfTree, places: Mapping[str, _Place], links: tuple[Link, ...], repaired: Collection[str]) -> None:
+    """Warn about harmless extras, missing masses, and impossible moments of parts of bodies that are not repaired."""
     if tree.findings.extras:
         warnings.warn(f"{tree.path}: harmless extras are ignored: {first_few(tree.findings.extras)}", stacklevel=3)
     loaded: set[str | None] = set()
@@ -1094,7 +1120,7 @@ def _warn(tree: UrdfTree, places: Mapping[str, _Place], links: tuple[Link, ...])
         warnings.warn(
             f"{tree.path}: links with a shape but without <inertial> have no mass ({', '.join(bare)})", stacklevel=3
         )
-    if odd := _odd(tree, places):
+    if odd := [name for name in _odd(tree, places) if places[name].body not in repaired]:
         warnings.warn(
             f"{tree.path}: impossible moments of inertia were accepted, because the sums with the links fixed to these "
             f"links are possible ({', '.join(odd)})",
