@@ -214,19 +214,20 @@ def joint_stops(
     ModelError
         If joints start beyond a limit; the message lists all of them.
     """
-    remedy = "change the initial position or the limit" if q is None else "start from a state within the limits"
-    stops, beyond, q = list[JointStop](), dict[str, Link](), robot.initial if q is None else q
+    stops, beyond, at = list[JointStop](), dict[str, Link](), robot.initial if q is None else q
     for link, k in zip(robot.links, robot.position_index, strict=True):
         for side, limit in ((1.0, link.lower), (-1.0, link.upper)):
             if np.isfinite(limit):
-                if side * (limit - q[k]) > tolerance:
-                    starts, bound = (format_quantity(value, link.units[0]) for value in (q[k], limit))
+                if side * (limit - at[k]) > tolerance:
+                    starts, bound = (format_quantity(value, link.units[0]) for value in (at[k], limit))
                     beyond[f"{link.joint}: starts at {starts}, beyond its limit of {bound}"] = link
                 stops.append(JointStop(link.joint, side, float(limit)))
     if beyond:
-        first = next(iter(beyond.values()))
-        key = "initial_deg" if first.units[0] == "rad" else "initial_m"
-        raise ModelError(f"{'; '.join(beyond)}; {remedy}", keys=("plant", key, first.joint))
+        units = ["deg" if link.units[0] == "rad" else "m" for link in beyond.values()]
+        keys = [f"{key}_{unit}" for key in ("initial", "limit") for unit in dict.fromkeys(units)]
+        remedy = f"change {' or '.join(keys)}" if q is None else "start from a state within the limits"
+        at_key = ("plant", f"initial_{units[0]}", next(iter(beyond.values())).joint)
+        raise ModelError(f"{'; '.join(beyond)}; {remedy}", keys=at_key)
     return stops
 
 

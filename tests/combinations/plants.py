@@ -169,14 +169,19 @@ def _urdf(random: Generator, name: str, levels: Levels, light: float) -> Plant:
             f'<origin xyz="{xyz}"/>{along}{inner}</joint>'
         )
 
-    text = ['<robot name="combined">', '  <link name="ground"/>', link("trunk", 3.0, 0.1)]
+    # Half of the files have faults, which the scenario corrects; then a floating base is a key.
+    corrected = pitch > 118.0
+    text = ['<robot name="combined">', link("trunk", 3.0, 0.1)]
+    if not (corrected and root == "floating"):
+        text.append('  <link name="ground"/>')
     if root is None:
         text.append(joint("stand", "fixed", "ground", "trunk", "0 0 0"))
-    else:
+    elif not corrected or root == "planar":
         text.append(joint("root", root, "ground", "trunk", "0 0 0", "0 0 1" if root == "planar" else ""))
     limit = '<limit lower="-3" upper="3" effort="0" velocity="0"/>'
     text += [
-        link("turret", masses[0], 0.05), link("upper", masses[1], lengths[0]), link("fore", masses[2], lengths[1]),
+        link("turret", masses[0], 0.05), link("upper", masses[1], lengths[0]),
+        link("fore", (3.0 if corrected else 1.0) * masses[2], lengths[1]),
         '  <link name="tool0"/>', link("finger", 0.1 * light, 0.05),
         joint("shoulder", "continuous", "trunk", "turret", "0 0 0.01", "0 0 1", dynamics),
         joint("lift", "revolute", "turret", "upper", "0 0 0", "0 1 0", limit + dynamics),
@@ -206,6 +211,10 @@ def _urdf(random: Generator, name: str, levels: Levels, light: float) -> Plant:
         "initial_m": {own.name: own.start for own in joints if not own.turns},
         "hand": {"body": "tool0"},
     }
+    if corrected:
+        across, along = masses[2] * (lengths[1] ** 2 + 3e-3) / 12.0, masses[2] * 3e-4
+        section["links"] = {"fore": {"mass_kg": masses[2], "inertia_kg_m2": [across, 0.0, 0.0, across, 0.0, along]}}
+        section["base"] = "floating" if root == "floating" else "fixed"
     if root is not None:
         spot = random.uniform(-0.2, 0.2, size=3).tolist()
         turn = [0.0, 0.0, float(random.uniform(-180, 180))]
@@ -222,6 +231,10 @@ def set_limits(robot: Plant, joint: Joint, lower: float, upper: float) -> None:
     """Set stops of a joint [° or m]."""
     if robot.serial:
         robot.entry(joint)["limit_deg" if joint.turns else "limit_m"] = [lower, upper]
+        return
+    if "links" in robot.section:
+        key = "limit_deg" if joint.turns else "limit_m"
+        robot.section.setdefault("joints", {}).setdefault(joint.name, {})[key] = [lower, upper]
         return
     text = robot.files["robot.urdf"]
     start = text.index(f'<joint name="{joint.name}"')
@@ -261,7 +274,11 @@ def set_losses(robot: Plant, random: Generator, level: str) -> None:
 def set_motors(robot: Plant, motors: Mapping[str, Mapping[str, Any]]) -> None:
     """Set the motors of joints, with the joint names as keys."""
     if not robot.serial:
-        robot.section["motors"] = {name: dict(motor) for name, motor in motors.items()}
+        if "links" in robot.section:
+            for name, motor in motors.items():
+                robot.section.setdefault("joints", {}).setdefault(name, {})["motor"] = dict(motor)
+        else:
+            robot.section["motors"] = {name: dict(motor) for name, motor in motors.items()}
         return
     for joint in robot.joints:
         motor = motors.get(joint.name)

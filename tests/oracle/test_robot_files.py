@@ -1,4 +1,4 @@
-"""Robot files of makers: each loads, corrected if its message says so, agrees with Pinocchio and falls."""
+"""Robot files of makers: each one loads, if necessary after corrections, agrees with Pinocchio and falls."""
 
 from __future__ import annotations
 

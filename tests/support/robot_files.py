@@ -37,7 +37,7 @@ ENERGY = 1e-6
 
 
 def robot_files(folder: Path, made: Path) -> dict[str, Path]:
-    """Return the URDF files of the packages and of their xacro files, which are expanded into ``made``, by name."""
+    """Return a mapping from names to URDF files of the packages; xacro files are expanded into ``made``."""
     files = {
         str(path.relative_to(folder)): path for path in sorted(folder.rglob("*.urdf")) if OMITTED not in path.parts
     }
@@ -105,9 +105,9 @@ class CorrectedFile:
         lines = self.text.splitlines()
         for line in message.splitlines():
             for pattern, apply in FIXES.items():
-                if found := re.search(pattern, line):
+                if match := re.search(pattern, line):
                     at = re.search(r"\.urdf:(\d+):", line)
-                    apply(self, lines, int(at[1]) - 1 if at else 0, found)
+                    apply(self, lines, int(at[1]) - 1 if at else 0, match)
         self.text = "\n".join(lines)
         return (self.text, json.dumps(self.plant)) != before
 
@@ -122,13 +122,13 @@ Fix = Callable[[CorrectedFile, list[str], int, re.Match[str]], None]
 
 
 def _edit(replace: Callable[[str, re.Match[str]], str]) -> Fix:
-    def apply(_: CorrectedFile, lines: list[str], at: int, found: re.Match[str]) -> None:
-        lines[at] = replace(lines[at], found)
+    def apply(_: CorrectedFile, lines: list[str], at: int, match: re.Match[str]) -> None:
+        lines[at] = replace(lines[at], match)
 
     return apply
 
 
-def _end(_: CorrectedFile, lines: list[str], at: int, found: re.Match[str]) -> None:
+def _end(_: CorrectedFile, lines: list[str], at: int, match: re.Match[str]) -> None:
     lines[at] = "".join(itertools.takewhile(str.isprintable, lines[at]))
 
 
@@ -136,29 +136,29 @@ def _end(_: CorrectedFile, lines: list[str], at: int, found: re.Match[str]) -> N
 FIXES: dict[str, Fix] = {
     r"plant\.inertia: nearest": lambda robot, *_: robot.set("inertia", value="nearest"),
     r"plant\.base: floating": lambda robot, *_: robot.set("base", value="floating"),
-    r"plant\.links\.(\S+)\.inertia_kg_m2 or density": lambda robot, _, __, found: robot.set(
-        "links", found[1], "inertia_kg_m2", value=SPHERE
+    r"plant\.links\.(\S+)\.inertia_kg_m2 or density": lambda robot, _, __, match: robot.set(
+        "links", match[1], "inertia_kg_m2", value=SPHERE
     ),
-    r"plant\.links\.(\S+)\.mass_kg": lambda robot, _, __, found: robot.set("links", found[1], "mass_kg", value=0.1),
-    r"plant\.joints\.(\S+)\.limit_(m|deg)": lambda robot, _, __, found: robot.set(
-        "joints", found[1], f"limit_{found[2]}", value=[-1.0, 1.0]
+    r"plant\.links\.(\S+)\.mass_kg": lambda robot, _, __, match: robot.set("links", match[1], "mass_kg", value=0.1),
+    r"plant\.joints\.(\S+)\.limit_(m|deg)": lambda robot, _, __, match: robot.set(
+        "joints", match[1], f"limit_{match[2]}", value=[-1.0, 1.0]
     ),
-    r"the mass behind it \(([^)]*)\).*set mass_kg": lambda robot, _, __, found: robot.set(
-        "links", found[1], value={"mass_kg": 0.1, "inertia_kg_m2": SPHERE}
+    r"the mass behind it \(([^)]*)\).*set mass_kg": lambda robot, _, __, match: robot.set(
+        "links", match[1], value={"mass_kg": 0.1, "inertia_kg_m2": SPHERE}
     ),
     r"='([^']*)'> is not a finite number; separate numbers by spaces only, e\.g\. \"([^\"]*)\"": _edit(
-        lambda line, found: line.replace(found[1], found[2])
+        lambda line, match: line.replace(match[1], match[2])
     ),
     r"='([^']*)'> has 4 entries, 3 are needed": _edit(
-        lambda line, found: line.replace(found[1], " ".join(found[1].split()[:3]))
+        lambda line, match: line.replace(match[1], " ".join(match[1].split()[:3]))
     ),
-    r"link '([^']*)' is not in the file; add it": lambda _, lines, __, found: (
-        lines.insert(next(k for k, line in enumerate(lines) if "</robot>" in line), f'<link name="{found[1]}"/>')
-        if not any(f'<link name="{found[1]}"/>' in line for line in lines)
+    r"link '([^']*)' is not in the file; add it": lambda _, lines, __, match: (
+        lines.insert(next(k for k, line in enumerate(lines) if "</robot>" in line), f'<link name="{match[1]}"/>')
+        if not any(f'<link name="{match[1]}"/>' in line for line in lines)
         else None
     ),
     r"<limit> has no (velocity|effort); add it": _edit(
-        lambda line, found: line.replace("<limit", f'<limit {found[1]}="0"')
+        lambda line, match: line.replace("<limit", f'<limit {match[1]}="0"')
     ),
     r"is 'spherical'; known: revolute": _edit(lambda line, _: line.replace("spherical", "continuous")),
     r"remove the text after </robot>": _end,

@@ -297,7 +297,7 @@ def test_a_glb_file_is_named_as_glb(tmp_path: Path):
         read_mesh(tmp_path / "cube.glb")
 
 
-def test_packages_are_found_by_name_and_files_by_the_end_of_their_path(tmp_path: Path):
+def test_mesh_search_uses_package_names_and_path_ends(tmp_path: Path):
     folder = tmp_path / "checkout" / "urdf"
     for path in ("checkout/meshes/cube.stl", "checkout/meshes/visual/cube.stl", "checkout/urdf/own.stl"):
         (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
@@ -344,7 +344,7 @@ def test_density_gives_mass_and_moments_of_shapes(tmp_path: Path, shape: Shape, 
     assert inertia.com == pytest.approx([0.05, 0.1, -0.15] if shape.kind == "mesh" else [0, 0, 0])
 
 
-def test_density_of_a_capsule_is_that_of_its_parts(tmp_path: Path):
+def test_density_of_a_capsule_agrees_with_its_parts(tmp_path: Path):
     """A capsule without length is a sphere; a turned one has turned moments."""
     ball = solid_inertia([Shape("capsule", (0.1, 0.0))], 1000.0, tmp_path, "a")
     sphere = solid_inertia([Shape("sphere", (0.1,))], 1000.0, tmp_path, "a")

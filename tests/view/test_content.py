@@ -330,7 +330,7 @@ def test_meshes_are_merged_without_the_extra(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setitem(sys.modules, "fast_simplification", None)
     (few,) = simplified([welded(ball())], 3000)
     assert 500 < len(few.triangles) < 4500
-    # All corners are those of the ball.
+    # All corners remain on the ball.
     assert np.linalg.norm(few.corners, axis=1) == pytest.approx(1.0, rel=1e-9)
 
 

@@ -140,6 +140,12 @@ TABLES = [
             ("hand on a fixed body", {"plant.hand": {"body": "base"}}),
             ("hand of two coordinates", {"plant.hand": {"body": "flange", "point_m": [0, 0]}}),
             ("pose of a joint that is a hinge", {"plant.initial_pose": {"elbow_pitch": {"position_m": [0, 0, 0]}}}),
+            ("correction of a link that does not exist", {"plant.links": {"wrst": {"mass_kg": 1}}}),
+            ("correction of a joint that does not exist", {"plant.joints": {"elbow": {"damping": 1}}}),
+            ("limit in metres of a hinge", {"plant.joints": {"elbow_pitch": {"limit_m": [0, 1]}}}),
+            ("density and mass of a link", {"plant.links": {"forearm": {"mass_kg": 1, "density_kg_m3": 1000}}}),
+            ("impossible moments of a link", {"plant.links": {"forearm": {"inertia_kg_m2": [1, 0, 0, 1, 0, 3]}}}),
+            ("base that moves otherwise", {"plant.base": "mobile"}),
             ("motor without inductance of an arm from URDF", {"plant.motor.inductance_H": 0}),
             (
                 "start beyond the limits of the file",
