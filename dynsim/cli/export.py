@@ -163,8 +163,9 @@ def _export_mjcf(scenario: Scenario, target: Path, touching: bool, check: bool) 
 
 def _stl_files(scenario: Scenario, shapes: Iterable[Shape], folder: str) -> tuple[dict[str, str], dict[str, bytes]]:
     """Return paths by mesh, and contents by path, of STL files that MuJoCo can read; a warning lists other meshes."""
-    from dynsim.draw.geometry.meshes import Meshes, simplified, stl_bytes
+    from dynsim.draw.geometry.meshes import Meshes, simplified
     from dynsim.engine.recording import pictured_parts
+    from dynsim.record.meshes import stl_bytes
     from dynsim.record.scene import Scene
 
     meshes = Meshes()

@@ -97,6 +97,13 @@ def _stl(content: bytes) -> Mesh:
     return Mesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3))
 
 
+def stl_bytes(mesh: Mesh) -> bytes:
+    """Return a mesh as a binary STL file, without colours."""
+    rows = np.zeros(len(mesh.triangles), _RECORD)
+    rows["corners"] = mesh.corners[mesh.triangles]
+    return bytes(80) + len(rows).to_bytes(4, "little") + rows.tobytes()
+
+
 def _obj(content: bytes) -> Mesh:
     corners: list[list[float]] = []
     triangles: list[tuple[int, int, int]] = []

@@ -70,13 +70,6 @@ class Meshes:
         return len(self.unique) - 1
 
 
-def stl_bytes(mesh: Mesh) -> bytes:
-    """Return a mesh as a binary STL file, without colours."""
-    rows = np.zeros(len(mesh.triangles), _RECORD)
-    rows["corners"] = mesh.corners[mesh.triangles]
-    return bytes(80) + len(rows).to_bytes(4, "little") + rows.tobytes()
-
-
 def mesh_paths(scene: Scene, files: Iterable[str]) -> dict[str, Path]:
     """Return the paths of the mesh files that are found in the folders of a scene, by their name in the robot file."""
     meshes = Meshes()
