@@ -77,7 +77,7 @@ def exported(
 
 def worst(prepared: Prepared, record: Record, path: Path) -> list[dict[str, float]]:
     """Largest differences by quantity, with steps of 1 ms and of 0.1 ms."""
-    return [{d.quantity: d.value for d in found} for found in compare(prepared, record, path).values()]
+    return [{d.quantity: d.value for d in differences} for differences in compare(prepared, record, path).values()]
 
 
 @pytest.mark.parametrize("motor", MOTORS)
