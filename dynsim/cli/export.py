@@ -118,9 +118,9 @@ def _export_urdf(scenario: Scenario, target: Path) -> None:
     from dynsim.system.files import write_text
 
     robot = build_model(scenario).robot
-    files = addresses(pictured_parts(Scene(), scenario), _shapes(robot), target.parent)
-    links = tuple(replace(link, shapes=renamed(link.shapes, files)) for link in robot.links)
-    write_text(target, Model(replace(robot, links=links, fixed_shapes=renamed(robot.fixed_shapes, files))).to_urdf())
+    files = _addresses(pictured_parts(Scene(), scenario), _shapes(robot), target.parent)
+    links = tuple(replace(link, shapes=_renamed(link.shapes, files)) for link in robot.links)
+    write_text(target, Model(replace(robot, links=links, fixed_shapes=_renamed(robot.fixed_shapes, files))).to_urdf())
 
 
 def _export_mjcf(scenario: Scenario, target: Path, touching: bool, check: bool) -> None:
@@ -145,8 +145,7 @@ def _export_mjcf(scenario: Scenario, target: Path, touching: bool, check: bool) 
         gains = dict(zip(joints, zip(control.k_p.tolist(), control.k_d.tolist(), strict=True), strict=True))
         for text in mujoco_check.omissions(scenario, prepared, touching):
             _warn(text)
-    folder = target.parent / f"{target.name.split('.')[0]}_meshes"
-    files, contents = _stl_files(scenario, _shapes(model.robot), folder.name)
+    files, contents = _stl_files(scenario, _shapes(model.robot), f"{target.name.split('.')[0]}_meshes")
     text = model.to_mjcf(contacts, build.surfaces(scenario), gains=gains, meshes=files, touching=touching)
     for name, content in contents.items():
         with replacing(target.parent / name) as stream:
@@ -158,26 +157,38 @@ def _export_mjcf(scenario: Scenario, target: Path, touching: bool, check: bool) 
         for step, differences in mujoco_check.compare(prepared, simulate(scenario), target).items():
             print_line(f"largest differences from MuJoCo with steps of {1e3 * step:g} ms:")
             for d in differences:
-                print_line(f"  {d.quantity} {d.value:.2e} {d.unit} ({d.label}, t = {d.time:.4g} s)")
+                print_line(f"  {d.quantity} {d.value:.2e} {d.unit} ({escaped(d.label)}, t = {d.time:.4g} s)")
 
 
 def _stl_files(scenario: Scenario, shapes: Iterable[Shape], folder: str) -> tuple[dict[str, str], dict[str, bytes]]:
     """Return paths by mesh, and contents by path, of STL files that MuJoCo can read; a warning lists other meshes."""
-    from dynsim.draw.geometry.meshes import Meshes, simplified
+    from dynsim.draw.geometry.meshes import simplified, welded
     from dynsim.engine.recording import pictured_parts
-    from dynsim.record.meshes import stl_bytes
+    from dynsim.record.meshes import read_mesh, stl_bytes
     from dynsim.record.scene import Scene
 
-    meshes = Meshes()
-    meshes.of_robot(pictured_parts(Scene(), scenario))
+    paths: dict[str, str] = {}
+    contents: dict[str, bytes] = {}
+    for name, path in _mesh_paths(pictured_parts(Scene(), scenario), shapes, "they are omitted").items():
+        try:
+            (mesh,) = simplified([welded(read_mesh(path))], MUJOCO_TRIANGLES)
+        except (RecordError, ValueError) as error:
+            _warn(f"{error}; this mesh is omitted")
+            continue
+        paths[name] = f"{folder}/mesh_{len(paths) + 1}.stl"
+        contents[paths[name]] = stl_bytes(mesh)
+    return paths, contents
+
+
+def _mesh_paths(scene: Scene, shapes: Iterable[Shape], otherwise: str) -> dict[str, Path]:
+    """Return the mesh files that are found, by their name in the robot file; a warning lists the others."""
+    from dynsim.draw.geometry.meshes import mesh_paths
+
     names = dict.fromkeys(shape.file for shape in shapes if shape.kind == "mesh")
-    numbers = {name: number for name in names if (number := meshes.index(name)) is not None}
-    paths = {name: f"{folder}/mesh_{number + 1}.stl" for name, number in numbers.items()}
-    for note in meshes.notes():
-        _warn(note)
-    return paths, {
-        path: stl_bytes(*simplified([meshes.unique[numbers[name]]], MUJOCO_TRIANGLES)) for name, path in paths.items()
-    }
+    paths = mesh_paths(scene, names)
+    if missing := [name for name in names if name not in paths]:
+        _warn(f"meshes not found: {first_few(missing)}; {otherwise}")
+    return paths
 
 
 def _warn(text: str) -> None:
@@ -188,22 +199,19 @@ def _shapes(robot: Robot) -> list[Shape]:
     return [*robot.fixed_shapes, *(shape for link in robot.links for shape in link.shapes)]
 
 
-def addresses(scene: Scene, shapes: Iterable[Shape], folder: Path | None = None) -> dict[str, str]:
+def _addresses(scene: Scene, shapes: Iterable[Shape], folder: Path | None = None) -> dict[str, str]:
     """Return the address ``file://PATH`` of each mesh file that is found, by its name in the robot file.
 
     Names that lead to the same file from a robot file in ``folder`` are omitted. A warning lists missing files.
     """
     from dynsim.draw.geometry.meshes import mesh_paths
 
-    names = dict.fromkeys(shape.file for shape in shapes if shape.kind == "mesh")
-    paths = mesh_paths(scene, names)
-    if missing := [name for name in names if name not in paths]:
-        _warn(f"meshes not found: {first_few(missing)}; their names are written unchanged")
-    near = {} if folder is None else mesh_paths(replace(scene, mesh_folders=(str(folder.absolute()),)), names)
+    paths = _mesh_paths(scene, shapes, "their names are written unchanged")
+    near = {} if folder is None else mesh_paths(replace(scene, mesh_folders=(str(folder.absolute()),)), paths)
     return {name: f"file://{path}" for name, path in paths.items() if name not in near or not path.samefile(near[name])}
 
 
-def renamed(shapes: Iterable[Shape], files: Mapping[str, str]) -> tuple[Shape, ...]:
+def _renamed(shapes: Iterable[Shape], files: Mapping[str, str]) -> tuple[Shape, ...]:
     """Return the shapes with other names of mesh files."""
     return tuple(replace(shape, file=files.get(shape.file, shape.file)) for shape in shapes)
 
@@ -227,7 +235,7 @@ def _export_record(
             "record.rate_hz"
         )
     if (scene := record.scene) is not None:
-        files = addresses(scene, (*scene.fixed, *(shape for body in scene.bodies for shape in body.shapes)))
-        bodies = tuple(replace(body, shapes=renamed(body.shapes, files)) for body in scene.bodies)
-        record.scene = replace(scene, bodies=bodies, fixed=renamed(scene.fixed, files))
+        files = _addresses(scene, (*scene.fixed, *(shape for body in scene.bodies for shape in body.shapes)))
+        bodies = tuple(replace(body, shapes=_renamed(body.shapes, files)) for body in scene.bodies)
+        record.scene = replace(scene, bodies=bodies, fixed=_renamed(scene.fixed, files))
     return write_mcap(record, out or path.with_suffix(".mcap"))

@@ -58,10 +58,11 @@ def omissions(scenario: Scenario, prepared: Prepared, touching: bool) -> list[st
         "smoothed gear friction becomes dry friction": [
             m.joint for m in servos if m.coulomb_friction and (m.coulomb_speed is not None or law == "bilateral")
         ],
-        "dry friction has no effect under the bilateral law": [
-            link.joint for link in robot.links if link.friction and law == "bilateral"
+        "dry friction has no effect in dynsim under the bilateral law": [
+            *(link.joint for link in robot.links if link.friction and law == "bilateral"),
+            *(m.joint for m in dc if m.dry_friction and law == "bilateral"),
         ],
-        "joint limits are enforced": [
+        "joint limits have no effect in dynsim under the bilateral law": [
             link.joint for link in robot.links if law == "bilateral" and np.isfinite([link.lower, link.upper]).all()
         ],
         "commands are continuous, not sampled": ["controller.sample_time_s"] if prepared.control.sample_time else [],
