@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,7 +12,7 @@ import numpy as np
 from dynsim.engine.prepare import Prepared
 from dynsim.engine.recording import drawn_scene
 from dynsim.errors import ModelError, first_few
-from dynsim.model.description import Array, Robot
+from dynsim.model.description import Array, Load, Robot
 from dynsim.model.drives import Motor, Servo
 from dynsim.model.mjcf import control_scale
 from dynsim.record import Record
@@ -53,7 +53,7 @@ def omissions(scenario: Scenario, prepared: Prepared, touching: bool) -> list[st
             if c.friction_at_rest != c.friction or c.stribeck or c.viscous_friction or c.grip != 1.0
         ],
         "contact stiffness and damping are omitted": [c.name for c in kept if c.stiffness > 0.0],
-        "loads are omitted": [load.name for load in prepared.loads],
+        "loads are omitted, but --check applies them": [load.name for load in prepared.loads],
         "the current limit bounds the torque, not the voltage": [m.joint for m in dc if np.isfinite(m.current_limit)],
         "smoothed gear friction becomes dry friction": [
             m.joint for m in servos if m.coulomb_friction and (m.coulomb_speed is not None or law == "bilateral")
@@ -133,8 +133,11 @@ def _differences(mujoco: Any, model: Any, prepared: Prepared, record: Record, st
         if k:
             count = int(np.ceil((t - time[k - 1]) / step * (1.0 - 1e-9)))
             model.opt.timestep = (t - time[k - 1]) / count
-            for control in controls(prepared, time[k - 1] + model.opt.timestep * np.arange(count)):
+            starts = time[k - 1] + model.opt.timestep * np.arange(count)
+            wrenches = [load.components(starts) for load in prepared.loads]
+            for i, control in enumerate(controls(prepared, starts)):
                 data.ctrl[:] = control
+                _apply_loads(mujoco, model, data, prepared.loads, [wrench[i] for wrench in wrenches])
                 mujoco.mj_step(model, data)
         mujoco.mj_forward(model, data)
         peer_q[k], peer_v[k] = data.qpos[at_q], data.qvel[at_v]
@@ -153,6 +156,20 @@ def _differences(mujoco: Any, model: Any, prepared: Prepared, record: Record, st
         k, column = np.unravel_index(np.abs(error).argmax(), error.shape) if error.size else (0, 0)
         label = labels[column]
         yield Difference(quantity, float(np.abs(error[k, column])), unit[label], label, float(time[k]))
+
+
+def _apply_loads(mujoco: Any, model: Any, data: Any, loads: Sequence[Load], wrenches: Sequence[Array]) -> None:
+    """Apply the wrenches of loads, (6,) each [N, N m], at the present posture."""
+    if not loads:
+        return
+    data.qfrc_applied[:] = 0.0
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    for load, wrench in zip(loads, wrenches, strict=True):
+        body = data.body(load.body)
+        R = body.xmat.reshape(3, 3)
+        force, torque = ((R if load.in_body else np.eye(3)) @ part for part in (wrench[:3], wrench[3:]))
+        mujoco.mj_applyFT(model, data, force, torque, body.xpos + R @ load.point, body.id, data.qfrc_applied)
 
 
 def _coordinates(model: Any, robot: Robot) -> tuple[Array, Array]:

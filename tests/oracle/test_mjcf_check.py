@@ -116,6 +116,19 @@ def test_joint_stops_and_dry_friction_are_stiff_in_mujoco(tmp_path: Path) -> Non
     assert fine["position"] < 5e-3
 
 
+@pytest.mark.parametrize("axes", ["world", "body"])
+def test_loads_act_in_both_programs(axes: str, tmp_path: Path) -> None:
+    file = arm(tmp_path, "servo")
+    wrench = "point_m: [0.1, 0, 0.2], force_N: [0, 4, 2], torque_N_m: [1, 0, 1]"
+    file.write_text(f"{file.read_text()}loads: {{push: {{type: constant, body: link_2, frame: {axes}, {wrench}}}}}\n")
+    prepared, record, path = exported(file, tmp_path)
+    coarse, fine = worst(prepared, record, path)
+    assert fine["position"] < 5e-4
+    assert 5.0 < coarse["position"] / fine["position"] < 20.0
+    prepared.loads.clear()
+    assert worst(prepared, record, path)[1]["position"] > 1e-2
+
+
 def test_torque_source_follows_its_torque(tmp_path: Path) -> None:
     file = tmp_path / "arm.yaml"
     file.write_text(
