@@ -117,7 +117,12 @@ def compare(prepared: Prepared, record: Record, path: Path) -> dict[float, list[
         model = mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:
         raise ModelError(f"{path}: MuJoCo cannot read this file: {' '.join(str(error).split())}") from error
-    return {step: list(_differences(mujoco, model, prepared, record, step)) for step in STEPS}
+    # Otherwise MuJoCo prints its warnings, and writes them to a file in the working directory.
+    mujoco.set_mju_user_warning(lambda text: None)
+    try:
+        return {step: list(_differences(mujoco, model, prepared, record, step)) for step in STEPS}
+    finally:
+        mujoco.set_mju_user_warning(None)
 
 
 def _differences(mujoco: Any, model: Any, prepared: Prepared, record: Record, step: float) -> Iterator[Difference]:

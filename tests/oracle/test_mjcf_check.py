@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import re
 import struct
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from support.messages import check_message
+from support.messages import check_message, raises
 from typer.testing import CliRunner
 
 import dynsim
 from dynsim.cli.commands import app
 from dynsim.engine.mujoco_check import compare, omissions
 from dynsim.engine.prepare import Prepared, prepare
+from dynsim.errors import ModelError
 from dynsim.record import Record
 from dynsim.scenario import build, load_scenario
 
@@ -106,6 +108,22 @@ def test_wrong_gain_is_detected(tmp_path: Path) -> None:
     prepared, record, path = exported(arm(tmp_path, "servo"), tmp_path)
     path.write_text(re.sub(r'kp="([\d.]+)"', lambda match: f'kp="{1.01 * float(match[1])}"', path.read_text()))
     assert worst(prepared, record, path)[1]["position"] > 1e-3
+
+
+def test_divergence_and_missing_mujoco_are_errors(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    prepared, record, path = exported(arm(tmp_path, "servo"), tmp_path)
+    text = re.sub(r'forcerange="[^"]*"', "", re.sub(r'kp="[\d.]+"', 'kp="1e14"', path.read_text()))
+    path.write_text(text.replace("implicitfast", "Euler"))
+    with raises(ModelError, "MuJoCo", "1 ms"):
+        compare(prepared, record, path)
+    assert capfd.readouterr().err == ""
+    assert not (tmp_path / "MUJOCO_LOG.TXT").exists()
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    with raises(ModelError, "--check", "mujoco>=4.0"):
+        compare(prepared, record, path)
 
 
 def test_joint_stops_and_dry_friction_are_stiff_in_mujoco(tmp_path: Path) -> None:
