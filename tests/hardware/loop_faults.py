@@ -136,7 +136,7 @@ class Schedule:
     Attributes
     ----------
     driven : a drive; otherwise a replay
-    faults : of the virtual servos, as in a fault script
+    faults : entries of a fault script
     presses : clock times of Ctrl-C [s]
     late : (clock time, duration) of pauses of the program [s]
     limp_at_first : False if the robot is holding when the run begins
@@ -186,7 +186,7 @@ def drawn(number: int) -> Schedule:
 
 
 class LateClock(VirtualClock):
-    """Virtual time in which the program pauses, and in which somebody presses Ctrl-C."""
+    """Virtual time in which the program pauses, and Ctrl-C."""
 
     def __init__(self, schedule: Schedule) -> None:
         super().__init__()
@@ -389,8 +389,8 @@ def _report(ended: Ended) -> Iterator[str]:
     if result.fault is not None and not ended.code:
         yield "exit code 0 after a fault"
     log = (ended.folder / "out" / ("servos" if schedule.driven else "") / "replay.log").read_text(encoding="utf-8")
-    told = log if "unexpected error" in ended.stderr or not ended.stderr else ended.stderr
-    if result.fault_state is not None and result.fault_state not in UNARMED and result.end_state not in told:
+    message = log if "unexpected error" in ended.stderr or not ended.stderr else ended.stderr
+    if result.fault_state is not None and result.fault_state not in UNARMED and result.end_state not in message:
         yield f"end state {result.end_state!r} not in the message"
     if not result.servos and moved:
         yield "torque not read"
@@ -457,7 +457,7 @@ def _files(ended: Ended) -> Iterator[str]:
     try:
         if (folder / "measured.h5").exists():
             record = Record.load(folder / "measured.h5")
-        elif "hw recover" in ended.stderr:
+        elif "hw recover" in ended.stderr or ended.code == 130:
             record = recover(folder)
         else:
             yield f"no record: {ended.stderr!r}"
@@ -468,7 +468,7 @@ def _files(ended: Ended) -> Iterator[str]:
     result = ended.replay.result
     if record.complete != (result.fault is None) and "measured record failed" not in ended.stderr:
         yield f"the record is marked {'complete' if record.complete else 'incomplete'}"
-    if "unexpected error" in ended.stderr:
+    if "unexpected error" in ended.stderr or not ended.stderr:
         return
     summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
     if summary.get("end_state") != result.end_state or len(summary["servos"]) != len(result.servos):

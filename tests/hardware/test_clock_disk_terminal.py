@@ -1,4 +1,4 @@
-"""Clocks that jump or stall, slow or full disks and streams that nobody reads, during replays and drives."""
+"""Clocks that jump or stall, slow or full disks and blocked pipes, during replays and drives."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_a_replay_keeps_its_cycle(servos: Servos, world: str) -> None:
         assert (ended.returncode, lost) == (0, {}), ended.stderr
 
 
-def test_a_replay_whose_output_nobody_reads_ends_at_ctrl_c(tmp_path: Path) -> None:
+def test_a_replay_with_blocked_output_ends_at_ctrl_c(tmp_path: Path) -> None:
     swing().save(tmp_path / "rig.h5")
     (tmp_path / "rig.yaml").write_text(MAP, encoding="utf-8")
     reader, writer = os.pipe()
@@ -120,9 +120,9 @@ def test_a_disk_that_becomes_full_leaves_the_end_state(tmp_path: Path) -> None:
 
 
 class Stalling(Clock):
-    """Clock of a program: from ``at`` on, it stands still while the world goes on for ``seconds``.
+    """Clock of a program that stalls at ``at`` for ``seconds`` of the world's time.
 
-    With ``suspended``, the program stands still as well.
+    With ``suspended``, the program is stopped for this time, too.
     """
 
     def __init__(self, world: VirtualClock, at: float, seconds: float, *, suspended: bool) -> None:

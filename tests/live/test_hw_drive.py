@@ -497,7 +497,7 @@ def test_a_drive_keeps_its_cycle(
     assert summary["outputs_failed"].keys() == ({"streamed record"} if world == "dead disk" else set())
 
 
-def test_a_drive_whose_output_nobody_reads_ends_at_ctrl_c(drives: Callable[..., Drive]) -> None:
+def test_a_drive_with_blocked_output_ends_at_ctrl_c(drives: Callable[..., Drive]) -> None:
     drive = drives()
     assert drive.process.stdout is not None
     fill(drive.process.stdout.fileno())

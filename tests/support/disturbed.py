@@ -1,4 +1,4 @@
-"""Clocks that are set, and slow or dead disks, of processes that tests start; pipes that nobody reads."""
+"""Clocks that are set, and slow or dead disks, of processes that tests start; blocked pipes."""
 
 from __future__ import annotations
 

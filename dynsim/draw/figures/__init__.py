@@ -140,6 +140,7 @@ def figure(records: Record | Mapping[str, Record], name: str, *, title: bool = T
         drawn: Figure | None = makers[name](records)
     if drawn is None:
         raise RecordError(f"the record has no data for the figure {name!r}")
+    style.literal(drawn)
     if not title:
         drawn.suptitle("")
     return drawn

@@ -12,10 +12,11 @@ import matplotlib
 import numpy as np
 from cycler import cycler
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Text
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
+from matplotlib.ticker import FuncFormatter, LogFormatter, LogLocator, NullFormatter, NullLocator
 from numpy.typing import NDArray
 
 from dynsim.record import Record
@@ -93,6 +94,19 @@ def new_figure(height: float, title: str, *, width: float = WIDTH) -> Figure:
     return figure
 
 
+def literal(figure: Figure) -> None:
+    """Draw all texts literally: names from files may contain formulas, and control characters that have no glyphs."""
+    powers = {label for axes in figure.axes for axis in (axes.xaxis, axes.yaxis) for label in _powers(axis)}
+    for text in figure.findobj(Text):
+        text.set_text(plain(text.get_text()))
+        text.set_parse_math(text in powers)
+
+
+def _powers(axis: Axis) -> list[Text]:
+    """Return the tick labels that matplotlib writes as powers of ten."""
+    return axis.get_ticklabels(which="both") if isinstance(axis.get_major_formatter(), LogFormatter) else []
+
+
 def save(figure: Figure, path: Path) -> Path:
     """Write a figure as PNG, PDF or SVG, depending on the suffix; equal figures give equal bytes.
 
@@ -101,9 +115,7 @@ def save(figure: Figure, path: Path) -> Path:
     RecordError
         If the file cannot be written; an existing file is then unchanged.
     """
-    # Names from files may contain control characters, for which fonts have no glyphs.
-    for text in figure.findobj(Text):
-        text.set_text(plain(text.get_text()))
+    literal(figure)
     figure.set_dpi(DPI)
     kind = path.suffix.removeprefix(".")
     with replacing(path) as stream, matplotlib.rc_context({"svg.hashsalt": path.stem}):

@@ -126,6 +126,7 @@ class Strip:
             self.legend = tuple(labels[:most])
             look: dict[str, Any] = {"bbox_to_anchor": (1.0, 1.0), "fontsize": 6.5, "borderaxespad": 0.2}
             axes.legend(handles[:most], labels[:most], loc="upper left", **look)
+        style.literal(figure)
         canvas.draw()
         self._image = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
         self._axes = axes

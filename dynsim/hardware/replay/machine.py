@@ -368,23 +368,23 @@ class Ending:
         self._at_rest = self._at_rest or struck == ReplayState.SETTLE
         interrupted = self.result.faults[0].cause == Cause.INTERRUPTED
         if self.loop.stop.for_release:
-            self._try(self._release)
+            self._insist(self._release)
         elif struck in UNARMED:
             return
         elif struck == ReplayState.DISARM:
-            self._try(self.regular)
+            self._insist(self.regular)
         elif struck == ReplayState.ARM:
             # Nothing has moved yet: restore the initial torque state, unless another program has since switched it off.
             taken = any(fault.cause == Cause.TORQUE_LOST for fault in self.result.faults)
-            self._try(self._leave_holding if found_holding and not taken else self._release)
+            self._insist(self._leave_holding if found_holding and not taken else self._release)
         elif self.policy == "off" and not interrupted:
-            self._try(self._release)
+            self._insist(self._release)
         else:
             # If the port is dead, this has no effect, but the attempt shows whether the port is really dead.
             if not self._try(self._freeze if self.policy == "hold" and not interrupted else self._decelerate):
-                self._try(self._freeze)
+                self._insist(self._freeze)
             self._try(self._come_to_rest)
-            self._try(self._release if self.policy == "off" else self._leave_holding)
+            self._insist(self._release if self.policy == "off" else self._leave_holding)
 
     def release_at_last(self) -> bool:
         """Switch the torque off if the user has requested it since the policy was applied."""
@@ -420,6 +420,10 @@ class Ending:
         else:
             return True
         return False
+
+    def _insist(self, step: Callable[[], None]) -> None:
+        """Execute a step, and once more if it failed."""
+        _ = self._try(step) or self._try(step)
 
     def _port_died(self, error: PortError) -> None:
         if all(fault.cause != Cause.PORT for fault in self.result.faults):
