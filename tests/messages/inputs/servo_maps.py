@@ -43,6 +43,7 @@ TABLES = [
             ("velocity that the servo does not reach", "velocity: 3.0", "velocity: 30.0"),
             ("torque that the servo does not have", "torque: 6.0", "torque: 60.0"),
             ("unknown model", "MX-106", "MX-105"),
+            ("model with Protocol 1", "MX-106", "AX-12A"),
             ("unknown mode of a servo", "mode: velocity", "mode: current"),
             ("unknown policy", "policy: decelerate", "policy: panic"),
             ("misspelt limit", "torque: 6.0}", "torque: 6.0, torqe: 1}"),
