@@ -105,11 +105,11 @@ class JointSheet:
     source: str
 
 
-_PANDA = "https://frankarobotics.github.io/docs/control_parameters.html, limits for Panda"
+_PANDA = "https://frankaemika.github.io/docs/control_parameters.html, limits for Panda"
 _UR5E = "https://www.universal-robots.com/articles/ur-articles/max-joint-torques; speed: user manual of the UR5e"
 _IIWA = (
     "https://www.kuka.com/-/media/kuka-downloads/imported/48ec812b1b2947898ac2598aff70abc0/spez_lbr_iiwa_en.pdf, "
-    "axis data; torques: KUKA brochure LBR iiwa, technical data"
+    "axis data; torques: KUKA brochure LBR iiwa, technical data (as in iiwa_description of Drake)"
 )
 _DEG = math.pi / 180
 # The gains are the gains of the position actuators in mujoco_menagerie (franka_emika_panda, universal_robots_ur5e and

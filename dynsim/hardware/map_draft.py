@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -15,9 +16,9 @@ from dynsim.errors import CheckRefused
 from dynsim.hardware.bus.control_table import MODELS, SINGLE_TURN, TICKS_PER_TURN
 from dynsim.hardware.errors import ServoMapError
 from dynsim.hardware.replay.check import plan_cycle
-from dynsim.hardware.servo_map import Supply, load_servo_map
-from dynsim.model.description import Link, Robot
-from dynsim.model.drives import Servo
+from dynsim.hardware.servo_map import Supply, load_servo_map, rounded_up
+from dynsim.model.description import Link
+from dynsim.model.drives import Drive, Servo
 from dynsim.scenario import Scenario, build
 from dynsim.system.files import file_name
 
@@ -26,6 +27,8 @@ RATES = (200, 100, 50, 20)
 """Cycle rates [Hz]; the draft has the highest rate that the bus allows."""
 TORQUE, FOLLOWING_ERROR = 0.7, 0.3
 """Assumed abort limits: fraction of the stall torque, and following error [rad]; servos lag by up to 0.2 rad."""
+APPROACH = 0.3
+"""Assumed speed of the move to the start [rad/s]."""
 HOTTEST, COOLER = 65, 5
 """Assumed limit of the temperature [°C], and its minimum distance from the temperature at which a servo shuts down."""
 TURN, UNLIMITED = 359.8, 36_000.0
@@ -37,6 +40,7 @@ Servo map drafted by `dynsim hw map` from {scenario}.
 Before the first motion: set every id, measure every zero_tick with `dynsim hw calibrate`, and check every sign with
 `dynsim hw calibrate --nudge`. The values of following_error, limits.torque and safety are assumed: adapt them.
 """
+LEFT_OUT = "Joints with a motor that have no servo here, because they are not revolute joints of the arm: {joints}.\n"
 
 
 def draft_map(scenario: Scenario, model: str | None = None) -> str:
@@ -52,16 +56,18 @@ def draft_map(scenario: Scenario, model: str | None = None) -> str:
     Raises
     ------
     ServoMapError
-        If the robot has no joint with a motor or a joint cannot be moved by a servo, or if the model of a servo is
-        unknown.
+        If the robot is a snake, the arm has no revolute joint with a motor, or the model of a servo is unknown.
     """
     if model is not None and model not in MODELS:
         raise ServoMapError(f"--model must be one of {', '.join(MODELS)}, got {model}")
+    if scenario.plant.type == "snake":
+        raise ServoMapError("plant.type: snake requires lifts for its wheels; copy and change the map snake.yaml")
     robot = build.robot(scenario)
-    models = _models(robot, model)
-    links = {link.joint: link for link in robot.links}
-    if others := [joint for joint in models if links[joint].kind != "revolute"]:
-        raise ServoMapError(f"servos require revolute joints, but {', '.join(others)} is {links[others[0]].kind}")
+    objects = tuple(f"{name}." for name in scenario.config.objects)
+    links = {link.joint: link for link in robot.links if link.kind == "revolute" and not link.joint.startswith(objects)}
+    driven = [motor for motor in robot.motors if not motor.joint.startswith(objects)]
+    models = _models([motor for motor in driven if motor.joint in links], model)
+    left_out = [motor.joint for motor in driven if motor.joint not in links]
     kinds: dict[str, Any] = {}
     servos: dict[str, Any] = {}
     for number, (joint, (name, wheel)) in enumerate(models.items(), start=1):
@@ -81,15 +87,17 @@ def draft_map(scenario: Scenario, model: str | None = None) -> str:
         "safety": {
             "policy": "decelerate",
             "at_end": "hold",
+            "approach_velocity": min(APPROACH, *(kind["limits"]["velocity"] for kind in kinds.values())),
             "temperature_max": min(HOTTEST, limp - COOLER),
             "supply": _flow(Supply(lowest=low, highest=high).model_dump()),
         },
         "kinds": kinds,
         "servos": servos,
     }
+    comment = HEADER.format(scenario=scenario.name) + (LEFT_OUT.format(joints=", ".join(left_out)) if left_out else "")
     for rate in RATES:
         content["bus"]["rate"] = rate
-        text = _text(content, scenario.name)
+        text = _text(content, comment)
         try:
             with TemporaryDirectory() as folder:
                 path = Path(folder, "map.yaml")
@@ -101,26 +109,28 @@ def draft_map(scenario: Scenario, model: str | None = None) -> str:
     raise ServoMapError(f"{len(servos)} servos are too many for a bus at {BAUD} bit/s")
 
 
-def _models(robot: Robot, model: str | None) -> dict[str, tuple[str, bool]]:
+def _models(motors: Sequence[Drive], model: str | None) -> dict[str, tuple[str, bool]]:
     """Return the model of the servo of each joint with a motor, and whether the servo is in velocity mode."""
-    sheets = {motor.joint: motor.sheet if isinstance(motor, Servo) else "" for motor in robot.motors}
+    sheets = {motor.joint: motor.sheet if isinstance(motor, Servo) else "" for motor in motors}
     if not sheets:
-        raise ServoMapError("the robot has no joint with a motor; add motors, such as motor: {type: xm430_w350}")
+        raise ServoMapError("the arm has no revolute joint with a motor; add motors, such as motor: {type: xm430_w350}")
     if missing := [joint for joint, sheet in sheets.items() if sheet not in MODELS and model is None]:
         raise ServoMapError(
             f"the motors of {', '.join(missing)} are not Dynamixel servos; use motor: {{type: xm430_w350}} or another "
             "servo of the catalogue (`dynsim list`), or --model MODEL"
         )
-    wheels = {motor.joint: isinstance(motor, Servo) and motor.velocity_mode for motor in robot.motors}
+    wheels = {motor.joint: isinstance(motor, Servo) and motor.velocity_mode for motor in motors}
     return {joint: (sheet if sheet in MODELS else str(model), wheels[joint]) for joint, sheet in sheets.items()}
 
 
 def _kind(link: Link, name: str, wheel: bool) -> tuple[dict[str, Any], int]:
     """Return the kind of a servo, and its zero [ticks]: the middle of the turn, or such that the limits fit."""
     sheet = MODELS[name]
+    # Some vendors write 0 for an unknown limit.
+    speed, torque = link.velocity_limit or math.inf, link.effort_limit or math.inf
     limits: dict[str, Any] = {
-        "velocity": math.floor(100 * min(link.velocity_limit, sheet.no_load_speed)) / 100,
-        "torque": float(f"{min(link.effort_limit, TORQUE * sheet.stall_torque):.2g}"),
+        "velocity": max(math.floor(100 * min(speed, sheet.no_load_speed)) / 100, 0.01),
+        "torque": max(float(f"{min(torque, TORQUE * sheet.stall_torque):.2g}"), rounded_up(sheet.torque(1))),
     }
     mode, zero = "velocity", TICKS_PER_TURN // 2
     if not wheel:
@@ -146,11 +156,11 @@ def _flow(content: Any) -> Any:
     return flow
 
 
-def _text(content: dict[str, Any], scenario: str) -> str:
+def _text(content: dict[str, Any], comment: str) -> str:
     yaml = YAML(typ="rt")
     yaml.width = 200
     document = CommentedMap(content)
-    document.yaml_set_start_comment(HEADER.format(scenario=scenario))
+    document.yaml_set_start_comment(comment)
     stream = io.StringIO()
     yaml.dump(document, stream)
     return stream.getvalue()

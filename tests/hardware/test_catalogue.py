@@ -104,7 +104,9 @@ def test_a_draft_names_motors_without_servo_model(arm: Path) -> None:
     assert draft_map(scenario, "XM540-W270").count("XM540-W270") == 1
     with raises(ServoMapError, "XL330-M288", "common supply voltage"):
         draft_map(scenario, "XL330-M288")
-    with raises(ServoMapError, "no joint with a motor"):
+    with raises(ServoMapError, "plant.type: snake", "snake.yaml"):
+        draft_map(load_scenario("snake_operator"))
+    with raises(ServoMapError, "no revolute joint with a motor"):
         draft_map(load_scenario("free_flyer", overrides={"plant.motor": None, "plant.motors": {}}))
 
 
@@ -118,6 +120,17 @@ def test_the_command_writes_a_map_once(arm: Path, monkeypatch: pytest.MonkeyPatc
         codes.append(ended.value.code or 0)
     assert codes == [0, 2]
     assert load_servo_map(tmp_path / "arm_map.yaml").joints == ("joint_1", "joint_2", "joint_3")
+
+
+def test_a_draft_lists_joints_without_servo() -> None:
+    text = draft_map(load_scenario("mobile_elbow_comparison"), "MX-106")
+    assert "no servo here" in text
+    assert "base.left, base.right" in text
+    assert "base.left:" not in text
+    # A joint that turns further than position mode allows.
+    text = draft_map(load_scenario("six_axis_arm"), "XM430-W350")
+    assert "mode: extended_position" in text
+    assert text.count("mode: position") == 4
 
 
 @pytest.mark.long

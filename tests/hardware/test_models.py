@@ -30,7 +30,15 @@ def test_what_the_loop_reads_stands_in_the_same_place_on_all_models(name: str) -
     assert fields["present_temperature"].address + 1 == sum(HEALTH_BLOCK)
 
 
-@pytest.mark.parametrize("name", ["XL430-W250", "XM430-W350", "XM430-W210", "XH540-W150", "XH540-W270"])
+FIVE_VOLTS = (
+    ("model: MX-28", "model: XL330-M288"),
+    ("torque: 1.8", "torque: 0.15"),
+    ("{lowest: 10.5, highest: 14.0}", "{lowest: 4.4, highest: 5.8}"),
+)
+"""Changes of the rig for servos that need a supply of 5 V."""
+
+
+@pytest.mark.parametrize("name", [name for name in MODELS if not name.startswith("MX")])
 def test_a_replay_on_servos_of_another_model(name: str, write_map: Callable[..., Path]) -> None:
     """The joints lag by d/k of their model's law, and the torque told is the torque that moved them."""
     stall = MODELS[name].stall_torque
@@ -38,6 +46,7 @@ def test_a_replay_on_servos_of_another_model(name: str, write_map: Callable[...,
         write_map(
             ("model: MX-106", f"model: {name}"),
             ("velocity: 3.0, torque: 6.0", f"velocity: 3.0, torque: {0.7 * stall}"),
+            *(FIVE_VOLTS if name.startswith("XL330") else ()),
         )
     )
     run = Rig(servo_map).run()
