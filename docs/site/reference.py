@@ -52,9 +52,13 @@ def _page(introduction: str, schema: Schema) -> str:
 
 def _title(name: str) -> str:
     """Return the heading of a definition; for a member, its family and type."""
+    from dynsim.library.motors import catalogue
+
     member = re.fullmatch(r"dynsim__library__(\w+?)__(\w+)__Config", name)
     if member:
         return f"{member[1].replace('_', ' ').rstrip('s').capitalize()} {member[2]}"
+    if name in catalogue.NAMES:
+        return f"Motor {name}"
     return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name).capitalize()
 
 
