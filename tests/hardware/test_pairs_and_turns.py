@@ -201,3 +201,13 @@ def test_calibrate_accepts_names_of_joints(
     with pytest.raises(SystemExit) as ended:
         cli.main()
     assert (ended.value.code or 0) == code
+
+
+def test_a_jump_in_a_recorded_motion_is_refused(robot: Callable[..., Rig]) -> None:
+    """A trajectory whose second point comes 10 ms after the first, half a radian away."""
+    rig = robot(MAP)
+    record = Record([0.0, 0.01, 1.0, 2.0])
+    record.add("q", np.array([[-0.5], [0.0], [0.2], [0.2]]), "rad", labels=("pan",))
+    record.add("v", np.zeros((4, 1)), "rad/s", labels=("pan",))
+    with raises(CheckRefused, "pan: velocity", "75.0000 rad/s", "nothing was sent"):
+        check_motion(record, rig.map)
