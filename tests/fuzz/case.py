@@ -9,12 +9,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from random import Random
 
-KINDS = ("scenario", "override", "servo_map", "urdf", "csv_path", "record", "terrain", "sweep", "faults")
+KINDS = ("scenario", "override", "servo_map", "urdf", "csv_path", "record", "terrain", "sweep", "faults", "recording")
 # The damaged file, by kind.
 MAIN = {
     "scenario": "scenario.yaml", "override": "scenario.yaml", "servo_map": "map.yaml", "urdf": "robot.urdf",
     "csv_path": "path.csv", "record": "record.h5", "terrain": "heights.csv", "sweep": "out/runs.jsonl",
-    "faults": "faults.yaml",
+    "faults": "faults.yaml", "recording": "recording.csv",
 }  # fmt: skip
 # Substitutes for that file, and the fraction of cases with one: no input may block or never end.
 NO_FILES = ("pipe", "folder", "nothing", "link to /dev/zero", "link to /dev/null", "link to itself", "unreadable")
