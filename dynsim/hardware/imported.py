@@ -14,7 +14,7 @@ import csv
 import importlib
 import math
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -227,9 +227,8 @@ def _read(path: Path, servo_map: ServoMap, topic: str | None, trust: bool) -> Re
 
 
 def _read_csv(path: Path) -> Recording:
-    lines = (
-        read_text(path, RecordError, SIZE_LIMIT).lstrip("\ufeff").replace("\r\n", "\n").replace("\r", "\n").split("\n")
-    )
+    text = read_text(path, RecordError, SIZE_LIMIT).lstrip("\ufeff")
+    lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
     header = [cell.strip() for cell in _cells(lines[0])]
     clock, joints = _columns(path, header)
     column, scale = clock
@@ -414,7 +413,8 @@ def _smoothed(recording: Recording, servo: MappedServo, unit: str | None, bandwi
         for k in np.flatnonzero(spikes)
     ]
     number, time, value = number[~spikes], time[~spikes], value[~spikes]
-    bridged = _gaps(recording, label, number, time, step, 1.0 / cutoff)
+    longest = min(1.0 / cutoff, max(1.0 / BANDWIDTH, BANDWIDTH_SHARE * step))
+    bridged = _gaps(recording, label, number, time, step, longest)
     weight = 1.0 / (step * (2.0 * np.pi * cutoff) ** 4)
     spline = make_smoothing_spline(time, value, lam=weight)
     error = spline(time) - value
@@ -425,7 +425,7 @@ def _smoothed(recording: Recording, servo: MappedServo, unit: str | None, bandwi
         raise RecordError(
             f"{recording.location(number[worst])}: the smooth motion of {label} would deviate by "
             f"{abs(error[worst]):.3g} rad (limit {DEVIATION:g} rad) from the sample, which is {jump:.3g} rad from its "
-            "neighbour; use a higher --bandwidth, or cut the recording if the position jumps there"
+            "neighbour; use a higher --bandwidth, or cut or unwrap the recording if the position jumps there"
         )
     rms = float(np.sqrt(np.mean(error**2)))
     ends = float(time[0]), float(time[-1])
@@ -490,16 +490,10 @@ def _gaps(
     recording: Recording, label: str, number: NDArray[np.int64], time: Array, step: float, longest: float
 ) -> list[str]:
     """Return the gaps that the spline bridges; raise RecordError for a gap longer than ``longest`` [s]."""
-
-    def described() -> Iterator[str]:
-        steps = np.diff(time)
-        for k in np.flatnonzero(steps > LONG_STEP * step):
-            text = f"{recording.location(number[k + 1])}: no sample for {steps[k]:.3g} s after {number[k]}"
-            if steps[k] > longest:
-                raise RecordError(
-                    f"{text}, so the motion of {label} is unknown (limit {longest:.3g} s, the period at the "
-                    "bandwidth); cut the recording"
-                )
-            yield text
-
-    return list(described())
+    steps, texts = np.diff(time), []
+    for k in np.flatnonzero(steps > LONG_STEP * step):
+        texts.append(f"{recording.location(number[k + 1])}: no sample for {steps[k]:.3g} s after {number[k]}")
+        if steps[k] > longest:
+            problem = f"the motion of {label} is unknown (limit {longest:.3g} s); cut the recording"
+            raise RecordError(f"{texts[-1]}, so {problem}")
+    return texts

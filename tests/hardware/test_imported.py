@@ -206,6 +206,12 @@ def test_recordings_without_a_known_motion_are_refused(
         import_motion(path, servo_map)
 
 
+def test_a_low_bandwidth_does_not_hide_a_gap(servo_map: ServoMap, write: Callable[..., Path]) -> None:
+    rows = [[row[0], 0.0, 0.0] for row in demonstration()]
+    with pytest.raises(RecordError, match=r":101: no sample for 0\.733 s after 100.* \(limit 0\.2 s\)"):
+        import_motion(write([*rows[:99], *rows[120:]]), servo_map, bandwidth=0.5)
+
+
 def test_a_record_without_velocities_names_the_import(servo_map: ServoMap, tmp_path: Path) -> None:
     time = np.arange(0.0, 5.0, 1 / RATE)
     record = Record(time)
