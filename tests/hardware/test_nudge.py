@@ -150,12 +150,13 @@ def test_the_command_asks_about_each_joint_and_writes_on_request(answering, writ
     command = ("hw", "calibrate", "--map", path, "--port", "virtual", "--nudge")
     code, out, _ = answering("", *command, "--yes")
     assert code == 0
-    assert re.findall(r"^(\w+) \(ID \d\): ([+-]\d)", out, re.MULTILINE) == [
-        ("shoulder", "+3"), ("elbow", "+3"), ("wheel", "+3"),
-    ]  # fmt: skip
+    moved = re.findall(r"^(\w+) \(ID \d\): ([+-]\d\.\d)", out, re.MULTILINE)
+    assert [joint for joint, _ in moved] == ["shoulder", "elbow", "wheel"]
+    # The friction of the gear costs up to 0.24°.
+    assert all(2.7 <= float(angle) <= 3.1 for _, angle in moved)
     code, out, _ = answering("y\nagain\nperhaps\nn\ny\nn\n", *command)
     assert code == 0
-    assert out.count("elbow (ID 2): +3") == 2
+    assert len(re.findall(r"elbow \(ID 2\): \+[23]", out)) == 2
     assert lines_with(out, "elbow", re.compile(r"\b1$"))
     assert load_servo_map(path).servos[1].sign == -1, "not without a yes"
     code, out, _ = answering("n\n", *command, "--joint", "elbow", "--write")
