@@ -14,7 +14,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from dynsim.errors import ModelError
 from dynsim.model.drives import Drive, Motor
@@ -26,6 +26,8 @@ from dynsim.record.scene import Shape
 
 Array = NDArray[np.float64]
 WORLD = "world"
+# Sum of the area vectors of a mesh, relative to its area, above which the mesh is open.
+_OPEN = 1e-2
 
 
 def vector(x: float, y: float, z: float) -> Array:
@@ -61,6 +63,46 @@ class Inertia:
         """Return a solid cylinder along +z from the frame's origin: I_x = I_y = m (3 r² + l²)/12, I_z = m r²/2."""
         side = mass * (3.0 * radius**2 + length**2) / 12.0
         return cls(mass, vector(0.0, 0.0, 0.5 * length), np.diag([side, side, 0.5 * mass * radius**2]))
+
+    @classmethod
+    def solid_box(cls, mass: float, edges: ArrayLike) -> Inertia:
+        """Return a solid box about the frame's origin: I_x = m (b² + c²)/12."""
+        squares = np.square(edges)
+        return cls(mass, tensor=np.diag(mass / 12.0 * (squares.sum() - squares)))
+
+    @classmethod
+    def solid_capsule(cls, density: float, radius: float, length: float) -> Inertia:
+        """Return a solid capsule along z about the frame's origin; ``length`` is the distance between its centres."""
+        cylinder = cls.solid_cylinder(density * np.pi * radius**2 * length, radius, length)
+        # The centre of mass of a half ball is 3 r/8 above its flat side.
+        half = density * 2.0 / 3.0 * np.pi * radius**3
+        moments = np.diag(half * radius**2 * np.array([83.0 / 320.0, 83.0 / 320.0, 0.4]))
+        ends = (vector(0.0, 0.0, side * (0.5 * length + 0.375 * radius)) for side in (-1.0, 1.0))
+        centred = cylinder.placed(np.eye(3), vector(0.0, 0.0, -0.5 * length))
+        return cls.merged([centred, *(cls(half, end, moments) for end in ends)])
+
+    @classmethod
+    def solid_mesh(cls, density: float, corners: Array) -> Inertia:
+        """Return the volume within triangles (n, 3, 3) [m], from the tetrahedra between the triangles and their centre.
+
+        Raises
+        ------
+        ValueError
+            If the surface is not closed: its area vectors do not sum to zero.
+        """
+        centre = corners.mean(axis=(0, 1))
+        a, b, c = np.moveaxis(corners - centre, 1, 0)
+        areas, volumes = np.cross(b - a, c - a), np.einsum("ti,ti->t", a, np.cross(b, c)) / 6.0
+        volume = float(volumes.sum())
+        if np.linalg.norm(areas.sum(axis=0)) > _OPEN * np.linalg.norm(areas, axis=1).sum() or volume == 0.0:
+            raise ValueError("the mesh is not closed and has no volume")
+        sums = a + b + c
+        com = volumes @ sums / (4.0 * volume)
+        # Second moments of a tetrahedron with one corner at the origin: V/20 (Σ c cᵀ + s sᵀ).
+        second = sum(np.einsum("t,ti,tj->ij", volumes, x, x) for x in (a, b, c, sums)) / (20.0 * volume)
+        second = second - np.outer(com, com)
+        mass = density * abs(volume)
+        return cls(mass, centre + com, mass * (np.trace(second) * np.eye(3) - second))
 
     def placed(self, R: Array, p: Array) -> Inertia:
         """Return the same inertia in a frame in which B has rotation R and origin p [m]."""

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pinocchio
 import pytest
 from support.messages import check_message, lines_with, mentions, raises, warns
 
@@ -16,8 +17,7 @@ from dynsim.draw.geometry.meshes import mesh_notes
 from dynsim.engine import check, simulate
 from dynsim.errors import DynsimError, ModelError, RecordError, ScenarioError
 from dynsim.model.description import Inertia
-from dynsim.model.urdf.reader import read_urdf
-from dynsim.model.urdf.solid import solid_inertia
+from dynsim.model.urdf.reader import read_urdf, solid_inertia
 from dynsim.record.meshes import mesh_path, read_mesh
 from dynsim.record.scene import Shape
 from dynsim.scenario import build_model, load_scenario
@@ -130,6 +130,13 @@ def test_corrections_of_links_and_joints_replace_the_file(case: Path):
 def test_wrong_corrections_are_refused(case: Path, key: str, value: Any, names: list[str]):
     with raises(ScenarioError, *names):
         load_scenario(case, overrides={f"plant.{key}": value})
+
+
+def test_corrections_can_be_swept(case: Path):
+    for key, value in (("links.left.mass_kg", 3.0), ("joints.knee.damping", 0.4), ("inertia", "nearest")):
+        masses = model(case, {f"plant.{key}": value}).robot.links
+        assert masses[1].inertia.mass == (3.0 if key.startswith("links") else 1.0)
+        assert masses[0].damping == (0.4 if key.startswith("joints") else 0.0)
 
 
 def test_two_motors_of_a_joint_conflict(case: Path):
@@ -264,6 +271,60 @@ def test_point_mass_on_axes_that_meet_is_named(case: Path):
     edited(case, ("</robot>", f'{wrists}<link name="yoke"/>{joints}</robot>'))
     with raises(ModelError, "pitch", "head", "inertia_kg_m2"):
         check(load_scenario(case))
+
+
+def test_nearest_moments_of_a_rounded_and_of_a_misprinted_body():
+    """Rounding by an exporter changes little; a lost decimal point changes much, and the warning says so."""
+    for moments, near, share in (
+        ([0.00305, 0.0236, 0.0269], [0.0031333, 0.0236833, 0.0268167], 0.004),
+        ([0.0026, 0.0023, 1.67], [0.5576333, 0.5573333, 1.1149667], 0.58),
+    ):
+        stated = Inertia(1.0, np.zeros(3), np.diag(moments))
+        assert np.diag(stated.nearest().tensor) == pytest.approx(near, rel=1e-4)
+        assert np.linalg.norm(np.subtract(near, moments)) / np.linalg.norm(moments) == pytest.approx(share, rel=0.02)
+
+
+KNUCKLES = f"""<robot name="knuckles"><link name="base"/>
+{
+    JOINT.format(
+        "left", "continuous", "base", "l", '<origin xyz="0 0 0.1" rpy="0 0.4 0"/><mimic joint="right" multiplier="-1"/>'
+    )
+}
+<link name="l">{BODY.format(MOMENTS)}</link><link name="r">{BODY.format(MOMENTS)}</link>
+{JOINT.format("right", "continuous", "base", "r", "")}
+<link name="t">{BODY.format(MOMENTS)}</link>
+{
+    JOINT.format(
+        "tip",
+        "revolute",
+        "r",
+        "t",
+        '<limit lower="-3" upper="3" effort="5" velocity="5"/>'
+        '<origin xyz="0 0 0.1" rpy="0.2 0 0.3"/><mimic joint="right" multiplier="-1.5" offset="0.3"/>',
+    ).replace("0 1 0", "0.2 -0.9 0.1")
+}
+</robot>"""
+
+
+def test_followers_with_negative_multipliers_accelerate_as_in_pinocchio(case: Path):
+    """The first acceleration is −Gᵀh/GᵀMG with Pinocchio's M and h of the tree without couplings."""
+    (case.parent / "robot.urdf").write_text(KNUCKLES)
+    record = simulate(load_scenario(case, overrides={"plant.initial_deg": {"right": 23}}))
+    ratio = {"left": -1.0, "right": 1.0, "tip": -1.5}
+    start = np.deg2rad(23) * np.array(list(ratio.values())) + [0.0, 0.0, 0.3]
+    theirs = pinocchio.buildModelFromUrdf(str(case.parent / "robot.urdf"))
+    rows = [theirs.joints[theirs.getJointId(name)].idx_v for name in ratio]
+    turn, G = np.zeros(3), np.zeros(3)
+    turn[rows], G[rows] = start, list(ratio.values())
+    q, data = pinocchio.integrate(theirs, pinocchio.neutral(theirs), turn), theirs.createData()
+    M = pinocchio.crba(theirs, data, q)
+    h = pinocchio.nle(theirs, data, q, np.zeros(3))
+    expected = -(G @ h) / (G @ (np.triu(M) + np.triu(M, 1).T) @ G)
+    labels = list(record.labels["vdot"])
+    assert {name: record["q"][0, labels.index(name)] for name in ratio} == pytest.approx(
+        dict(zip(ratio, start, strict=True))
+    )
+    assert record["vdot"][0, labels.index("right")] == pytest.approx(expected, rel=1e-9)
 
 
 # Meshes: a cube of 1 m, as binary STL.

@@ -12,7 +12,7 @@ import heapq
 import math
 import re
 import warnings
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from graphlib import CycleError, TopologicalSorter
@@ -23,13 +23,14 @@ from xml.parsers import expat
 import numpy as np
 
 from dynsim.config.problems import suggest
-from dynsim.errors import ModelError, first_few
+from dynsim.errors import ModelError, RecordError, first_few
 from dynsim.model.description import WORLD, Array, Coupling, Frame, Inertia, Link, Robot
 from dynsim.model.joints.ball import floating
 from dynsim.model.joints.planar import planar
-from dynsim.model.urdf.solid import solid_inertia
+from dynsim.record.meshes import mesh_path, read_mesh
 from dynsim.record.quaternion import of_turn, product
 from dynsim.record.scene import Shape, ShapeKind, quaternion
+from dynsim.record.urdf_text import rotation as rotation_of
 from dynsim.system.inputs import read_bytes
 
 # XML of a URDF file: elements with line numbers, and attributes as numbers; unknown attributes are reported.
@@ -454,6 +455,49 @@ def _colour(material: Element, named_colours: Mapping[str, Colour | None]) -> Co
         if all(0.0 <= number <= 1.0 for number in (red, green, blue, opacity)):
             return red, green, blue, opacity
     return named_colours.get(material.attributes.get("name", ""))
+
+
+def solid_inertia(shapes: Sequence[Shape], density: float, folder: Path, key: str) -> Inertia:
+    """Return the mass properties of solid shapes with a density [kg/m³]; overlaps count twice.
+
+    Raises
+    ------
+    ModelError
+        If there are no shapes, or a mesh is not found, cannot be read, or is not closed.
+    """
+    if not shapes:
+        raise ModelError(f"{key}.density_kg_m3: the link has no shapes; set mass_kg, com_m and inertia_kg_m2")
+    parts = []
+    for shape in shapes:
+        try:
+            solid = _solid(shape, density, folder)
+        except (RecordError, ValueError) as error:
+            raise ModelError(f"{key}.density_kg_m3: {error}; set mass_kg, com_m and inertia_kg_m2 instead") from error
+        parts.append(solid.placed(rotation_of(shape.orientation), np.array(shape.position)))
+    return Inertia.merged(parts)
+
+
+def _solid(shape: Shape, density: float, folder: Path) -> Inertia:
+    """Return the mass properties of a shape in its own frame."""
+    match shape.kind:
+        case "box":
+            return Inertia.solid_box(density * math.prod(shape.size), shape.size)
+        case "sphere":
+            return Inertia.solid_capsule(density, shape.size[0], 0.0)
+        case "capsule":
+            return Inertia.solid_capsule(density, *shape.size)
+        case "cylinder":
+            radius, length = shape.size
+            upright = Inertia.solid_cylinder(density * math.pi * radius**2 * length, radius, length)
+            return upright.placed(np.eye(3), np.array([0.0, 0.0, -0.5 * length]))
+    path = mesh_path(shape.file, [folder])
+    if path is None:
+        raise ValueError(f"mesh {shape.file} not found")
+    mesh = read_mesh(path)
+    try:
+        return Inertia.solid_mesh(density, (np.array(shape.size) * mesh.corners)[mesh.triangles])
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
 
 
 # Maximum number of links; the largest robots in use have some 100 links.
