@@ -75,7 +75,7 @@ def validation() -> Any:
 
 def robot_files(read: str = "") -> str:
     """Return the number of robot files whose reading begins with ``read``."""
-    return str(sum(row["read"].startswith(read) for row in data("reference/robot_files.json").values()))
+    return str(sum(row["read"].startswith(read) for row in data("reference/robot_files.json")["files"].values()))
 
 
 def contact() -> Any:

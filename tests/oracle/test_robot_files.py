@@ -18,7 +18,7 @@ def test_files_of_makers_load_agree_and_fall(tmp_path: Path) -> None:
     folder = os.environ.get(FOLDER)
     if not folder:
         pytest.skip(f"{FOLDER} must name the folder in which the packages of {PACKAGES.name} are installed")
-    kept = json.loads(KEPT.read_text(encoding="utf-8"))
+    kept = json.loads(KEPT.read_text(encoding="utf-8"))["files"]
     outcome = dict(outcomes(Path(folder), tmp_path))
     assert outcome.keys() == kept.keys()
     for name, result in outcome.items():
@@ -34,7 +34,7 @@ def test_files_of_makers_load_agree_and_fall(tmp_path: Path) -> None:
 
 
 def test_record_of_files_has_no_failure() -> None:
-    kept = json.loads(KEPT.read_text(encoding="utf-8"))
+    kept = json.loads(KEPT.read_text(encoding="utf-8"))["files"]
     counts = Counter(result["read"] for result in kept.values())
     assert counts["refused"] == len(NOT_ROBOTS)
     assert max(abs(result.get("ledger", 0.0)) for result in kept.values()) <= ENERGY

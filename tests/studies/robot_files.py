@@ -10,6 +10,8 @@ from pathlib import Path
 
 from support.robot_files import outcomes
 
+import dynsim
+
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
@@ -19,7 +21,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as made:
         results = dict(outcomes(options.folder, Path(made)))
     lines = [f"{json.dumps(name)}: {json.dumps(result)}" for name, result in results.items()]
-    options.json.write_text("{\n" + ",\n".join(lines) + "\n}\n", encoding="utf-8")
+    head = f'{{"version": {json.dumps(dynsim.__version__)}, "files": {{\n'
+    options.json.write_text(head + ",\n".join(lines) + "\n}}\n", encoding="utf-8")
     for (read, motion), count in Counter((r["read"], r.get("motion", "")) for r in results.values()).most_common():
         print(f"{count:4} {read}; {motion}")
 
