@@ -26,6 +26,8 @@ Indices = NDArray[np.int64]
 # Limits of one mesh file: its bytes, and the triangles, nested elements and nodes that it contains, copies of instances
 # included.
 BYTES_MAX, TRIANGLES_MAX, DEPTH_MAX, NODES_MAX = 100_000_000, 2_000_000, 100, 100_000
+# Endings of mesh files, also of those that are named but not read.
+_KINDS = (".stl", ".obj", ".dae", ".glb", ".gltf")
 _UNKNOWN = np.full(3, np.nan)
 _RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("more", "<u2")])
 
@@ -273,7 +275,7 @@ def mesh_path(file: str, folders: Iterable[Path]) -> Path | None:
     """Return the path of a mesh as named in a robot file, or None if it is not found.
 
     Packages are searched for as in ROS, in the folders above the robot file, and by the name in their ``package.xml``.
-    Otherwise the file with the longest common end of its path is used, in the folder of the robot file or above it.
+    Otherwise the only file in the robot's package whose path has the longest common end is used.
 
     Parameters
     ----------
@@ -293,8 +295,7 @@ def _places(file: str, folders: list[Path]) -> Iterator[Path]:
     """Yield possible paths of a mesh, the best first."""
     scheme, _, inside = file.rpartition("://")
     if scheme not in ("package", "model"):
-        yield from (folder / inside for folder in folders)
-        package = ""
+        yield from (up / inside for folder in folders for up in _upward(folder))
     else:
         package, _, inside = inside.partition("/")
         roots = [above for folder in folders for above in (folder, *folder.parents)]
@@ -305,15 +306,42 @@ def _places(file: str, folders: list[Path]) -> Iterator[Path]:
             yield root / package / inside
             if root.name == package or _package_name(root) == package:
                 yield root / inside
-    parts = [part for part in Path(inside).parts if part not in ("/", "..")]
     for folder in folders:
-        above = list(itertools.takewhile(lambda up: up != up.parent, (folder, *folder.parents)))[:_ABOVE]
-        for k in range(len(parts)):
-            yield from (up.joinpath(*parts[k:]) for up in above)
+        # Of files with equal ends, the one nearest to the robot file; none if two are equally near.
+        ends = {path: _equal_names(reversed(path.parts), reversed(Path(inside).parts)) for path in _mesh_files(folder)}
+        ranked = [((end, _equal_names(path.parts, folder.parts)), path) for path, end in ends.items() if end]
+        best = max((rank for rank, _ in ranked), default=None)
+        nearest = [path for rank, path in ranked if rank == best]
+        if len(nearest) == 1:
+            yield nearest[0]
 
 
-# Number of folders above the robot file in which the end of a path is looked for, with the folder of the file.
-_ABOVE = 4
+# Number of folders above a robot file that may be its package, and number of files that are looked at in a package.
+_ABOVE, _FILES = 4, 50_000
+
+
+def _upward(folder: Path) -> tuple[Path, ...]:
+    return folder, *itertools.islice(folder.parents, _ABOVE)
+
+
+@cache
+def _mesh_files(folder: Path) -> list[Path]:
+    """Return the meshes in the nearest folder above with ``package.xml`` or ``meshes``; without one, in the folder."""
+    for up in _upward(folder):
+        if (up / "package.xml").is_file() or (up / "meshes").is_dir():
+            files = up.rglob("*")
+            break
+    else:
+        files = folder.glob("*")
+    return [path for path in itertools.islice(files, _FILES) if path.suffix.lower() in _KINDS]
+
+
+def _equal_names(names: Iterable[str], others: Iterable[str]) -> int:
+    """Return the number of equal names with which two sequences begin; upper and lower case are the same."""
+    pairs = zip(names, others, strict=False)
+    return sum(1 for _ in itertools.takewhile(lambda pair: pair[0].casefold() == pair[1].casefold(), pairs))
+
+
 _NAME = re.compile(rb"<name>\s*([^<\s]+)\s*</name>")
 
 

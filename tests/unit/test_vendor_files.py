@@ -372,9 +372,15 @@ def test_mesh_search_uses_package_names_and_path_ends(tmp_path: Path):
         ("/home/somebody/work/meshes/visual/cube.stl", "meshes/visual/cube.stl"),
         ("file:///home/somebody/own.stl", "urdf/own.stl"),
         ("own.stl", "urdf/own.stl"),
+        ("package://arm_description/other/OWN.STL", "urdf/own.stl"),
     ):
         assert mesh_path(file, [folder]) == tmp_path / "checkout" / path, file
     assert mesh_path("package://arm_description/meshes/other.stl", [folder]) is None
+    # Two files match equally well: the nearer one is used, and none if both are equally near.
+    assert mesh_path("other/cube.stl", [folder]) is None
+    assert (
+        mesh_path("other/cube.stl", [folder.parent / "meshes" / "visual"]) == folder.parent / "meshes/visual/cube.stl"
+    )
 
 
 def test_check_names_meshes_that_are_missing_or_cannot_be_read(case: Path):
