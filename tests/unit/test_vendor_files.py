@@ -274,7 +274,7 @@ def test_point_mass_on_axes_that_meet_is_named(case: Path):
 
 
 def test_nearest_moments_of_a_rounded_and_of_a_misprinted_body():
-    """Rounding by an exporter changes little; a lost decimal point changes much, and the warning says so."""
+    """Rounding by an exporter changes little; a lost decimal point changes much."""
     for moments, near, share in (
         ([0.00305, 0.0236, 0.0269], [0.0031333, 0.0236833, 0.0268167], 0.004),
         ([0.0026, 0.0023, 1.67], [0.5576333, 0.5573333, 1.1149667], 0.58),

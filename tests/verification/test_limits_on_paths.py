@@ -10,7 +10,7 @@ from support.messages import raises
 
 from dynsim import load_scenario
 from dynsim.engine.prepare import prepare
-from dynsim.errors import UnreachableReference
+from dynsim.errors import ModelError, UnreachableReference
 
 ARM = """
 duration_s: 2
@@ -77,7 +77,7 @@ def test_a_path_that_needs_more_is_refused_with_joint_time_and_amount(arm):
 
 
 def test_a_joint_that_starts_beyond_its_limit_is_refused(arm):
-    with raises(UnreachableReference, "joint_2", "40°", "35°"):
+    with raises(ModelError, "joint_2", "40°", "35°"):
         prepare_named(arm(35))
 
 

@@ -90,14 +90,12 @@ def follow(
         that would exceed its limit, the time and the amount.
     """
     if orientation is not None:
-        _check_start(model, joints, q)
         args = model, times, targets, joints, q, tolerance, orientation, braces
         return recall("turned hand", lambda: _turned(*args), model.geometry, *args[1:])
     path, wanted = path_arrays(model, joints, braces, limited=True), reals(targets)
     carried = np.zeros((len(times), 0)) if base is None else reals(base)
     first = 0 if base is None else base_row(model.robot)[0]
     geometry = model.geometry
-    _check_start(model, joints, q)
 
     def solved() -> Array:
         ws, result = workspace(model.n, 0, 0), np.zeros((len(times), len(joints)))
@@ -158,21 +156,6 @@ def _turned(
             ) from None
         postures[k] = q[columns]
     return postures
-
-
-def _check_start(model: Model, joints: Sequence[str], q: Array) -> None:
-    """Raise UnreachableReference for joints that start beyond their limits, since the path would start with a jump."""
-    for name in joints:
-        i = model.joint_names.index(name)
-        link, at = model.robot.links[i], float(q[model.robot.position_index[i]])
-        for which, limit, beyond in (("lower", link.lower, link.lower - at), ("upper", link.upper, at - link.upper)):
-            if beyond > LIMIT_SLACK:
-                raise UnreachableReference(
-                    "controller.hand.path: "
-                    f"{name} follows the path, but starts at {format_quantity(at, link.units[0])}, beyond "
-                    f"its {which} limit of {format_quantity(limit, link.units[0])}; change its initial "
-                    "position or its limit"
-                )
 
 
 def _passed_limits(model: Model, joints: Sequence[str], times: Array, positions: Array) -> str:

@@ -220,12 +220,7 @@ class Element:
                 continue
             twin = f"i{key[2:]}{key[1:2]}"
             if (self.tag, key) == ("axis", "rpy") or (self.tag == "inertia" and twin in known):
-                value = self.attributes.get(twin)
-                if (
-                    value is not None
-                    and _words(value) != _words(self.attributes[key])
-                    and self.number(twin) != self.number(key)
-                ):
+                if twin in self.attributes and self.number(twin) != self.number(key):
                     raise self.fault(f"{key} and {twin} of <inertia> differ; remove {key}")
                 self.ignore(f"{key} of <{self.tag}> of {self.owner}")
                 continue
