@@ -58,7 +58,7 @@ _TIME_COLUMN = re.compile(rf"({'|'.join(TIME_NAMES)})(?:_(s|ms|us|ns))?", re.IGN
 
 
 @dataclass
-class Samples:
+class RecordedSamples:
     """Recorded positions of one joint.
 
     Attributes
@@ -83,7 +83,7 @@ class Recording:
 
     path: Path
     at: str
-    joints: dict[str, Samples]
+    joints: dict[str, RecordedSamples]
 
     def location(self, number: int) -> str:
         return f"{self.path}{self.at}{number}"
@@ -277,10 +277,10 @@ def _joint_name(name: str) -> str:
     return re.sub(r"[./](pos|position)$", "", name).rsplit("/", 1)[-1]
 
 
-def _columns(path: Path, header: list[str]) -> tuple[tuple[int, float], dict[int, Samples]]:
+def _columns(path: Path, header: list[str]) -> tuple[tuple[int, float], dict[int, RecordedSamples]]:
     """Return the time column with the factor to seconds, and the columns with positions."""
     clock: tuple[int, float] | None = None
-    joints: dict[int, Samples] = {}
+    joints: dict[int, RecordedSamples] = {}
     names: dict[str, str] = {}
     twice = ""
     for k, heading in enumerate(header):
@@ -293,7 +293,7 @@ def _columns(path: Path, header: list[str]) -> tuple[tuple[int, float], dict[int
         elif (not unit or unit in UNITS) and name:
             joint = _joint_name(name)
             twice = twice or (f"columns {names[joint]!r} and {heading!r}" if joint in names else "")
-            joints[k], names[joint] = Samples(UNITS.get(unit, "")), heading
+            joints[k], names[joint] = RecordedSamples(UNITS.get(unit, "")), heading
     if clock is None:
         shown = brief(",".join(header))
         raise RecordError(
@@ -327,7 +327,7 @@ def _read_mcap(path: Path, topic: str | None) -> Recording:
         raise RecordError(f"{path}: joint states in {', '.join(topics)}; choose one with --topic")
     if topic is not None and topic not in topics:
         raise RecordError(f"{path}: no joint states in {topic}; topics: {', '.join(topics)}")
-    joints: dict[str, Samples] = {}
+    joints: dict[str, RecordedSamples] = {}
     origin: int | None = None
     for number, message in enumerate(topics[topic or next(iter(topics))], 1):
         try:
@@ -342,7 +342,7 @@ def _read_mcap(path: Path, topic: str | None) -> Recording:
             )
         for name, value in zip(state.name, state.position, strict=False):
             if math.isfinite(value):
-                samples = joints.setdefault(name, Samples("rad"))
+                samples = joints.setdefault(name, RecordedSamples("rad"))
                 samples.time.append((stamp - origin) * 1e-9)
                 samples.value.append(float(value))
                 samples.number.append(number)
@@ -351,7 +351,7 @@ def _read_mcap(path: Path, topic: str | None) -> Recording:
 
 def _read_record(path: Path, servo_map: ServoMap, trust: bool) -> Recording:
     record = Record.load(path, trust=trust)
-    joints: dict[str, Samples] = {}
+    joints: dict[str, RecordedSamples] = {}
     for name in dict.fromkeys(servo.kind.follows.position for servo in servo_map.servos):
         if name not in record or record[name].ndim != 2 or record.signals[name].axis != TIME:
             continue
@@ -359,7 +359,7 @@ def _read_record(path: Path, servo_map: ServoMap, trust: bool) -> Recording:
             raise RecordError(f"{path}: signal {name!r} has unit {record.units[name]!r}; an import requires 'rad'")
         for label, column in zip(record.labels[name], record[name].T, strict=True):
             known = np.flatnonzero(np.isfinite(column))
-            joints[label] = Samples("rad", record.time[known].tolist(), column[known].tolist(), known.tolist())
+            joints[label] = RecordedSamples("rad", record.time[known].tolist(), column[known].tolist(), known.tolist())
     return Recording(path, ": sample ", joints)
 
 

@@ -335,7 +335,7 @@ def test_check_says_where_it_starts_before_it_refuses(tmp_path: Path):
     posed += ["--set", "contacts.law=bilateral", "--set", "controller.hand=null"]
     solved = dynsim("check", "elbow_comparison", *posed, folder=tmp_path)
     assert solved.returncode == 0, solved.stderr
-    moved = [" ".join(line.split()) for line in lines_with(solved.stdout, "on_surface")]
+    moved = [" ".join(line.split()) for line in lines_with(solved.stdout, "set by `initial`")]
     assert len(moved) % 4 == 0
     assert len(set(moved)) == len(moved) // 4 > 0
 

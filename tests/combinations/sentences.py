@@ -83,11 +83,11 @@ SENTENCES: dict[str, str] = {
     "overloaded": r"^(.+): the rms (\S+) of the run exceeds the nominal",
     "tips at the start": (
         r"^a jolt at the start drives the tip margin below zero.*? "
-        rf"(?:between two samples|in {NUMBER}(?: % of the samples)?)[,;]"
+        rf"(?:between two samples|(?:in )?{NUMBER}(?: % of the samples)?)[,;]"
     ),
     "tips": (
         r"^the base (?:tips over|is tipped over|1) at t = .*below zero "
-        rf"(?:between two samples|in {NUMBER}(?: % of the samples)?)[,;]"
+        rf"(?:between two samples|(?:in )?{NUMBER}(?: % of the samples)?)[,;]"
     ),
     "lifted": rf"^the base is lifted: its wheels and caster carry no load in {NUMBER}(?: %)? of the samples",
     "would slip": rf"^the (\S+) wheel would slip: it requires up to {NUMBER} times the traction",

@@ -13,7 +13,7 @@ from dynsim import cli
 from dynsim.hardware.bus.control_table import MX_106, RAW_BLOCK, STATE_BLOCK
 from dynsim.hardware.replay.check import plan_cycle
 from dynsim.hardware.replay.compare import compare_records
-from dynsim.hardware.servo_map import RATED_SUPPLY, load_servo_map
+from dynsim.hardware.servo_map import load_servo_map
 from dynsim.hardware.virtual.servos import CURRENT_NOISE
 from dynsim.hardware.virtual.simulated_plant import Drive, InertialLoad
 from dynsim.record import Record
@@ -31,8 +31,8 @@ def test_current_and_pwm_of_every_servo_are_recorded(clean_run: Run) -> None:
     assert np.isfinite(record["load"]).any(axis=0).tolist() == (~measures).tolist()
     torque = record["torque_estimate"][:, 0]
     assert np.allclose(record["current"][:, 0] * MX_106.torque_constant, torque, atol=1e-12)
-    # The voltage drives the torque and the back-EMF: u/12 V = τ/τ_stall + ω/ω_0.
-    voltage = record["pwm"] * record["supply_voltage"] / RATED_SUPPLY
+    # The voltage drives the torque and the back-EMF: u/u_rated = τ/τ_stall + ω/ω_0.
+    voltage = record["pwm"] * record["supply_voltage"] / MX_106.rated_voltage
     motion = record["state"] == 5
     for column, servo in enumerate(clean_run.map.servos[:2]):
         rate = record["v"][:, column] / servo.model.no_load_speed
