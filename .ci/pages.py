@@ -1100,6 +1100,9 @@ for _name, _runs in {
 NUMBERS |= {
     "robot_files": robot_files,
     "robot_files_loaded": lambda: robot_files("loads"),
+    "robot_files_agree": lambda: str(
+        sum(row.get("agrees", False) for row in data("reference/robot_files.json")["files"].values())
+    ),
     "robot_files_corrected": lambda: robot_files("loads after"),
     "slope_slip_s": lambda: fixed(run("block_on_slope pulled")["first_at_s"]["slip_start"], 4),
     "bounces_half": lambda: str(run("bouncing_link half")["events"].get("bounce", 0)),

@@ -241,6 +241,10 @@ def test_a_floating_base_falls_and_can_be_placed(case: Path):
     robot = build_model(load_scenario(case, overrides=overrides)).robot
     assert robot.bodies[0] == "base"
     assert sum(link.inertia.mass for link in robot.links) == pytest.approx(5.0)
+    (case.parent / "again.urdf").write_text(Model(robot).to_urdf())
+    again = read_urdf(case.parent / "again.urdf")
+    assert again.position_names == robot.position_names
+    assert [link.inertia.mass for link in again.links] == [link.inertia.mass for link in robot.links]
     height = record["q"][:, 2]
     assert height[-1] == pytest.approx(3.0 - 0.5 * 9.81 * 0.02**2, abs=1e-12)
 
