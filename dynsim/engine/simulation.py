@@ -1636,6 +1636,7 @@ def start_of(scenario: Scenario) -> Start:
     hand = model.point_position(*robot.hand, q)
     key = build.on_surface_key(scenario, aloft) if aloft else ""
     warnings = [
+        *robot.notes,
         *without_effect(scenario, bool(robot.motors)),
         *_below(scenario, robot),
         *build.left_out_warnings(scenario, contacts),

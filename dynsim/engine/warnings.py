@@ -116,7 +116,7 @@ def warnings_of(
     warnings += _slipping_start(record, prepared) or _moving_start(record, prepared)
     warnings += _sunk(record, sunk)
     warnings += _beyond_stops(robot, prepared.stops, prepared.control)
-    warnings += without_effect(scenario, bool(robot.motors))
+    warnings += [*robot.notes, *without_effect(scenario, bool(robot.motors))]
     warnings += _overloaded(motors)
     return warnings if prepared.balance is None else [*warnings, *prepared.balance.warnings]
 

@@ -503,6 +503,8 @@ class Robot:
         Axes of the hand's frame, whose orientation is controlled, in the axes of the body that carries the hand.
     nearest : tuple of str
         Joints without a set position whose limits exclude zero; they start at the legal position nearest to zero.
+    notes : tuple of str
+        Warnings for every run, such as repairs of the robot file.
     """
 
     name: str
@@ -520,6 +522,7 @@ class Robot:
     feet: tuple[Foot, ...] = ()
     hand_frame: Array = field(default_factory=lambda: np.eye(3))
     nearest: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
     def holding(self, name: str) -> list[Tie]:
         """Return the ties by which a gripper of the robot can hold the named object; empty without a gripper."""

@@ -176,8 +176,12 @@ def test_all_problems_are_in_one_message_and_its_corrections_are_enough(case: Pa
         "plant.joints.knee.limit_deg": [-90, 90],
         "plant.inertia": "nearest",
     }
-    with warns(UserWarning, "'left'", "%", "robot.urdf:3"):
-        robot = model(case, plant).robot
+    robot = model(case, plant).robot
+    for warnings in (
+        check(load_scenario(case, overrides=plant)).warnings,
+        simulate(load_scenario(case, overrides=plant)).summary["warnings"],
+    ):
+        check_message(lines_with(warnings, "'left'")[0], "robot.urdf:3", "%")
     assert robot.links[0].inertia.mass == pytest.approx(6.0)
     assert robot.links[0].inertia.tensor.diagonal() == pytest.approx(0.5 * np.array([0.13, 0.10, 0.05]))
 

@@ -86,10 +86,11 @@ class _Reported(ModelError):
 
 @dataclass
 class Findings:
-    """Problems of a file, each with its line, and harmless extras, which are ignored."""
+    """Problems of a file, each with its line, harmless extras, which are ignored, and repairs."""
 
     problems: list[ModelError] = field(default_factory=list)
     extras: list[str] = field(default_factory=list)
+    repairs: list[str] = field(default_factory=list)  # moments of inertia that were replaced
     unread: set[str] = field(default_factory=set)  # links with an invalid name
 
     @contextmanager
@@ -961,6 +962,7 @@ def read_urdf(path: Path, lock: Mapping[str, float] | None = None, corrections: 
         couplings=tuple(coupling for joint, coupling in followers if joint.kind in MOVING),
         fixed_shapes=_shapes(locked, places).get(None, ()),
         fixed_inertia=_inertias(locked, places).get(None, Inertia(0.0)),
+        notes=tuple(tree.findings.repairs),
     )
 
 
@@ -1111,16 +1113,18 @@ def _possible(tree: UrdfTree, places: Mapping[str, _Place], links: Iterable[Link
     """Return bodies whose moments of inertia are possible: report the others, or replace them by the nearest ones."""
     possible = []
     for link in links:
-        name = f"{tree.path}:{tree.links[link.name].line}: link {link.name!r}, with everything fixed to it"
+        line = tree.links[link.name].line
         try:
-            link.inertia.check(name)
+            link.inertia.check(f"{tree.path}:{line}: link {link.name!r}, with everything fixed to it")
         except ModelError as error:
             if nearest:
                 made = link.inertia.nearest()
                 change = float(np.linalg.norm(made.tensor - link.inertia.tensor) / np.linalg.norm(link.inertia.tensor))
                 before, after = (np.linalg.eigvalsh(inertia.tensor) for inertia in (link.inertia, made))
-                text = f"principal moments {before} kg m² are impossible; {after} are used instead"
-                warnings.warn(f"{name}: {text} (a change of {100.0 * change:.3g} % of the norm)", stacklevel=3)
+                tree.findings.repairs.append(
+                    f"{tree.path.name}:{line}: link {link.name!r}: principal moments {before} kg m² are impossible; "
+                    f"{after} are used instead (a change of {100.0 * change:.3g} % of the norm)"
+                )
                 link = replace(link, inertia=made)
             else:
                 odd = [part for part in _odd(tree, places) if places[part].body == link.name] or [link.name]
