@@ -11,6 +11,8 @@ from dataclasses import dataclass
 
 RPM = 2 * math.pi / 60
 """One revolution per minute [rad/s]."""
+GEAR_FRICTION = 0.02
+"""Dry friction of the gear of a Dynamixel servo as a fraction of its stall torque (assumed)."""
 
 
 @dataclass(frozen=True)

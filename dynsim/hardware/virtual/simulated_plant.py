@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from dynsim.config.data_sheets import GEAR_FRICTION
 from dynsim.hardware.bus.control_table import MX_106, RAD_PER_TICK, ServoModel
 from dynsim.hardware.errors import ServoMapError
 from dynsim.hardware.servo_map import ServoMap
@@ -38,9 +39,6 @@ VELOCITY_TIME_CONSTANT = 0.02
 """Time constant of a servo's closed velocity loop without load [s] (unverified)."""
 FREE_DAMPING = 0.1
 """Damping of an unpowered gear train as a fraction of the back-EMF damping (unverified)."""
-
-GEAR_FRICTION = 0.02
-"""Dry friction of the gear train as a fraction of the stall torque (unverified)."""
 
 
 @dataclass

@@ -16,7 +16,7 @@ from pydantic import create_model
 
 from dynsim.compile.protocols import BuildContext
 from dynsim.config.base import NonNegative, Positive, default
-from dynsim.config.data_sheets import JOINT_SHEETS, SERVO_SHEETS, JointSheet, ServoSheet
+from dynsim.config.data_sheets import GEAR_FRICTION, JOINT_SHEETS, SERVO_SHEETS, JointSheet, ServoSheet
 from dynsim.model.drives import Servo, ServoParameters
 
 STIFFNESS_VOLTS = 58.6 / 12.0
@@ -40,6 +40,7 @@ _SNAKE: dict[str, dict[str, Any]] = {
     },
     "MX-28": {
         "mode": (Literal["position", "velocity"], "velocity", "quantity that the servo controls"),
+        "coulomb_friction_N_m": (NonNegative, 0.0, "gear friction; none, because the velocity loop compensates for it"),
         "rotor_inertia_kg_m2": (NonNegative, 2e-4, "rotor inertia at the output shaft (assumed)"),
     },
 }
@@ -64,6 +65,7 @@ def _servo(sheet: ServoSheet) -> dict[str, Any]:
             "gain in position mode (assumed)",
         ),
         "k_v_V_s_per_rad": (NonNegative, 20.0, "gain in velocity mode (assumed)"),
+        "coulomb_friction_N_m": (NonNegative, round(GEAR_FRICTION * stall, 4), "gear friction (assumed)"),
         "rotor_inertia_kg_m2": (NonNegative, inertia, "rotor inertia at the output shaft (assumed)"),
     } | _SNAKE.get(sheet.name, {})
 
