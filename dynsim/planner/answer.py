@@ -485,7 +485,8 @@ def plan_braces(
     tolerances = tolerances or Tolerances()
     positive = {"radius_m": radius_m, "peak_W_per_N_m": peak_W_per_N_m, "clearance_m": clearance_m, "min_N": min_N}
     for key, value in (positive | {"shift_m": max(map(abs, tolerances.shift_m), default=0.0)}).items():
-        if value is not None and not 0.0 <= value <= (largest := largest_magnitude(key)):
+        largest = largest_magnitude(key)
+        if value is not None and not 0.0 <= value <= largest:
             raise ScenarioError(f"{key} = {value}: must be between 0 and {largest:g}")
     if any(not 0.0 < share <= 1.0 for share in along):
         raise ScenarioError(f"along = {list(along)}: must be fractions of the link length, above 0 and at most 1")
