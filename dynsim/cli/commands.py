@@ -252,14 +252,14 @@ def plot(
     """Draw the figures of one record, or of several records and their overlay."""
     files = record_files(records)
     named = labelled(files, trust=trust)
+    if len(named) > 1:  # before the single figures, because it rejects records that do not fit together
+        draw(Figures(named, out or Path("figures"), format_, together=True), quiet=False)
     for path, (label, record) in zip(files, named.items(), strict=True):
         folder = path.parent / "figures" if out is None else out if len(files) == 1 else out / label
         try:
             draw(Figures({label: record}, folder, format_), quiet=False)
         except RecordError as error:
             raise RecordError(f"{path}: {error}") from error
-    if len(named) > 1:
-        draw(Figures(named, out or Path("figures"), format_, together=True), quiet=False)
 
 
 app.command(epilog=PLAN_EXAMPLE)(plan)

@@ -1,6 +1,6 @@
 """Fuzzing of all inputs: commands on damaged files must succeed or end with one clear error.
 
-    inputs/      one module per kind of input; each draws a case from a seed and an index
+    inputs/      modules that draw cases of one or several kinds from a seed and an index
     mutations    random damage of trees, texts and bytes
     readings     content of an input, read independently, and its comparison with dynsim's objects
     worker       a child process that runs cases and judges them

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import signal
 import sys
 import tempfile
+from dataclasses import asdict
 from pathlib import Path
 
 from fuzz import campaign
@@ -23,6 +25,9 @@ def main() -> int:
     parser.add_argument("--limit", type=float, default=campaign.LIMIT, help="of one command [s]")
     parser.add_argument("--repeat", nargs=2, metavar=("KIND", "INDEX"), help="one case again")
     parser.add_argument("--keep", type=Path, help="with --repeat: write the files of the case to this folder")
+    parser.add_argument(
+        "--journal", type=Path, help="file of results: they are added to it, and cases in it are skipped"
+    )
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="fuzz-records-") as folder:
         records = Path(folder)
@@ -38,7 +43,9 @@ def main() -> int:
             cases = [(options.kind, index) for index in range(options.count)]
         else:
             cases = campaign.spread(options.count)
-        done: list[campaign.Result] = []
+        done = campaign.read(options.journal) if options.journal and options.journal.exists() else []
+        known = {(result.seed, result.kind, result.index) for result in done}
+        cases = [case for case in cases if (options.seed, *case) not in known]
 
         def end(*_: object) -> None:
             print(campaign.table(done) if done else "nothing was done", flush=True)
@@ -48,24 +55,27 @@ def main() -> int:
 
         def report(result: campaign.Result) -> None:
             done.append(result)
+            if options.journal:
+                with options.journal.open("a", encoding="utf-8") as stream:
+                    stream.write(f"{json.dumps(asdict(result))}\n")
             if result.failed:
                 print(result, file=sys.stderr, flush=True)
             if sys.stderr.isatty() and len(done) % 20 == 0:
                 print(f"\r{len(done)} of {len(cases)}", end="", file=sys.stderr, flush=True)
 
-        results = campaign.run(
+        campaign.run(
             cases,
             records=records,
             seed=options.seed,
-            jobs=min(options.jobs, len(cases)),
+            jobs=max(1, min(options.jobs, len(cases))),
             limit=options.limit,
             report=report,
         )
-    print(campaign.failures(results))
-    print(campaign.table(results))
-    if options.repeat and not results[0].failed:
-        print(results[0].ended.detail)
-    return 1 if any(result.failed for result in results) else 0
+    print(campaign.failures(done))
+    print(campaign.table(done))
+    if options.repeat and not done[0].failed:
+        print(done[0].ended.detail)
+    return 1 if any(result.failed for result in done) else 0
 
 
 if __name__ == "__main__":

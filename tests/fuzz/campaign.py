@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import queue
@@ -53,6 +54,13 @@ class Result:
             f"  repeat: PYTHONPATH=.:tests python -m fuzz --seed {self.seed} --repeat {self.kind} {self.index}\n"
             + "".join(f"  | {line}\n" for line in ended.detail.strip().splitlines()[-8:])
         )
+
+
+def read(journal: Path) -> list[Result]:
+    """Return the results in a journal, one in each line; the last result of a case counts."""
+    rows = map(json.loads, journal.read_text(encoding="utf-8").splitlines())
+    results = [Result(**{**row, "ended": Outcome(**row["ended"])}) for row in rows]
+    return list({(result.seed, result.kind, result.index): result for result in results}.values())
 
 
 class Worker:
@@ -170,27 +178,45 @@ def run(
 
     with tempfile.TemporaryDirectory(prefix="fuzz-") as base, ThreadPoolExecutor(jobs) as pool:
         results = [result for batch in pool.map(work, [Path(base, str(k)) for k in range(jobs)]) for result in batch]
-    return sorted(results, key=lambda result: (KINDS.index(result.kind), result.index))
+    order = list(KINDS)
+    return sorted(results, key=lambda result: (order.index(result.kind), result.index))
 
 
 def spread(count: int) -> list[tuple[str, int]]:
-    """Return ``count`` cases that alternate between all kinds."""
-    return [(KINDS[k % len(KINDS)], k // len(KINDS)) for k in range(count)]
+    """Return ``count`` cases, of every kind in proportion to its weight."""
+    cases = (
+        (name, turn * kind.weight + k)
+        for turn in itertools.count()
+        for name, kind in KINDS.items()
+        for k in range(kind.weight)
+    )
+    return list(itertools.islice(cases, count))
 
 
 def table(results: list[Result]) -> str:
-    """Return a table of kinds and outcomes, with the number of inputs compared with the second reading."""
+    """Return a table of kinds: outcomes, second readings, accepted inputs that ran, processor time and memory."""
     columns = (OK, REFUSED, INTERRUPTED, *FAILURES)
-    counts = Counter((result.kind, result.ended.outcome) for result in results)
-    compared = Counter(result.kind for result in results if result.ended.compared or result.ended.outcome == LOSS)
-    lines = [f"{'kind':<10}{'inputs':>8}{'compared':>10}" + "".join(f"{name:>15}" for name in columns)]
-    for kind in KINDS:
-        row = [counts[kind, name] for name in columns]
-        lines.append(f"{kind:<10}{sum(row):>8}{compared[kind]:>10}" + "".join(f"{number:>15}" for number in row))
-    total = [sum(counts[kind, name] for kind in KINDS) for name in columns]
-    slowest = max(results, key=lambda result: result.seconds)
-    lines.append(f"{'all':<10}{sum(total):>8}{compared.total():>10}" + "".join(f"{number:>15}" for number in total))
-    lines.append(f"slowest: {slowest.kind} {slowest.index}, {slowest.seconds:.1f} s")
+    heads = ("inputs", "compared", "run", *columns, "mean s", "most s", "most MB")
+    lines = [f"{'kind':<14}" + "".join(f"{head.replace(' ', '_'):>14}" for head in heads)]
+    for kind in (*dict.fromkeys(result.kind for result in results), "all"):
+        own = [result for result in results if kind in ("all", result.kind)]
+        counts = Counter(result.ended.outcome for result in own)
+        row = [len(own), sum(result.ended.compared or result.ended.outcome == LOSS for result in own)]
+        row += [sum(result.ended.ran and result.ended.outcome == OK for result in own)]
+        row += [counts[name] for name in columns]
+        times = [result.ended.cpu_s for result in own]
+        numbers = [
+            f"{sum(times) / len(own):.2f}",
+            f"{max(times):.1f}",
+            f"{max(result.ended.memory_MB for result in own):.0f}",
+        ]
+        lines.append(f"{kind:<14}" + "".join(f"{text:>14}" for text in (*row, *numbers)))
+    slowest = max(results, key=lambda result: result.ended.cpu_s)
+    biggest = max(results, key=lambda result: result.ended.memory_MB)
+    lines.append(
+        f"slowest: {slowest.kind} {slowest.index}, {slowest.ended.cpu_s:.1f} s of processor time; "
+        f"largest: {biggest.kind} {biggest.index}, {biggest.ended.memory_MB:.0f} MB"
+    )
     return "\n".join(lines)
 
 
@@ -200,5 +226,6 @@ def failures(results: list[Result]) -> str:
     for result in results:
         if result.failed:
             causes.setdefault(result.cause, []).append(result)
-    ordered = sorted(causes.values(), key=lambda same: (KINDS.index(same[0].kind), -len(same)))
+    order = list(KINDS)
+    ordered = sorted(causes.values(), key=lambda same: (order.index(same[0].kind), -len(same)))
     return "\n".join(f"{len(same)} × {same[0]}" for same in ordered)

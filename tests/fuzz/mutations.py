@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import copy
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Collection
+from functools import cache
 from random import Random
 from typing import Any
 
@@ -277,3 +278,80 @@ def mutate_text(rng: Random, text: str) -> tuple[bytes, str]:
 def _numbers_in(line: str) -> list[str]:
     words = "".join(sign if sign.isalnum() or sign in "+-._" else " " for sign in line).split()
     return [word for word in words if any(sign.isdigit() for sign in word)]
+
+
+@cache
+def options() -> dict[str, tuple[Any, ...]]:
+    """Return the choices of every scenario key that is an enumeration, by the name of the key."""
+    from dynsim.scenario.reading import json_schema
+
+    known: dict[str, tuple[Any, ...]] = {}
+
+    def walk(node: Any) -> None:
+        for name, item in node.get("properties", {}).items() if isinstance(node, dict) else ():
+            for choice in (item, *item.get("anyOf", ()), item.get("items", {})) if isinstance(item, dict) else ():
+                if "enum" in choice and name != "type":
+                    known[name] = tuple(dict.fromkeys((*known.get(name, ()), *choice["enum"])))
+        for item in node.values() if isinstance(node, dict) else node if isinstance(node, list) else ():
+            walk(item)
+
+    walk(json_schema())
+    return known
+
+
+def scaled(rng: Random, number: float) -> float:
+    """Return a number of similar size: usually times 0.5 to 2, sometimes by powers of ten or with the other sign."""
+    if isinstance(number, int) and rng.random() < 0.5:
+        return max(0, number + rng.choice((-1, 1, 2)))
+    factor = rng.uniform(0.5, 2.0) if rng.random() < 0.75 else rng.choice((0.1, 0.01, 10.0, 100.0, -1.0, 0.0))
+    return float(f"{factor * number:.6g}") if number else rng.choice((0.0, 0.01, 0.1))
+
+
+def vary(rng: Random, tree: Any, fixed: Collection[str] = ("duration_s", "rate_hz", "count", "joints")) -> str:
+    """Change one value of a tree to one that is probably valid; return its dotted key, or "" without such a value.
+
+    ``fixed`` are keys whose values do not change.
+    """
+    chosen = []
+    for path in places(tree):
+        old, name = at(tree, path), next((key for key in reversed(path) if isinstance(key, str)), "")
+        if not set(path) & set(fixed) and (
+            isinstance(old, bool) or is_number(old) or (isinstance(old, str) and name in options())
+        ):
+            chosen.append((path, old, name))
+    # A list of numbers counts as often as a single number.
+    weights = [1.0 / (len(at(tree, path[:-1])) if isinstance(path[-1], int) else 1) for path, _, _ in chosen]
+    if not chosen:
+        return ""
+    path, old, name = rng.choices(chosen, weights)[0]
+    if isinstance(old, bool):
+        new: Any = not old
+    elif is_number(old):
+        new = scaled(rng, old)
+    else:
+        new = rng.choice(options()[name])
+    at(tree, path[:-1])[path[-1]] = new
+    return ".".join(map(str, path))
+
+
+def mutate_blocks(rng: Random, data: bytes) -> tuple[bytes, str]:
+    """Damage large parts of a file: blocks overwritten, moved, doubled or removed."""
+    out, done = bytearray(data), []
+    for _ in range(rng.choice((1, 2, 5))):
+        size = max(1, int(len(out) * rng.choice((0.0002, 0.001, 0.01, 0.1, 0.3))))
+        start, other = (rng.randrange(max(1, len(out) - size)) for _ in range(2))
+        block = bytes(out[start : start + size])
+        kind = rng.choice(("random", "zeros", "ones", "copied", "removed", "doubled", "shuffled", "truncated"))
+        if kind in ("random", "zeros", "ones"):
+            byte = {"zeros": b"\0", "ones": b"\xff"}.get(kind)
+            out[start : start + size] = rng.randbytes(len(block)) if byte is None else byte * len(block)
+        elif kind == "copied":
+            out[other : other + size] = block
+        elif kind == "doubled":
+            out[start:start] = block
+        elif kind == "shuffled":
+            out[start : start + size] = bytes(rng.sample(block, len(block)))
+        else:
+            del out[start : start + size if kind == "removed" else None]
+        done.append(f"{size} bytes {kind} at {start}")
+    return bytes(out), "; ".join(done)

@@ -11,6 +11,8 @@ import math
 import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
+from functools import lru_cache
+from pathlib import Path
 from typing import Any
 from xml.parsers import expat
 
@@ -27,6 +29,18 @@ ROUNDING = 1e-9
 
 class Unreadable(Exception):
     """Raised if the second reading gives no answer."""
+
+
+@lru_cache(1)
+def _loaded(path: Path, written: int) -> Any:
+    from dynsim.record import Record
+
+    return Record.load(path)
+
+
+def loaded(path: Path) -> Any:
+    """Return a record; the last one is kept, because several checks read it."""
+    return _loaded(path.absolute(), path.stat().st_mtime_ns)
 
 
 def yaml_tree(text: str) -> Any:
@@ -123,13 +137,21 @@ def scenario_losses(said: Mapping[str, Any], scenario: Any) -> list[str]:
     said = {key: item for key, item in said.items() if key not in ("variants", *_REWRITTEN)}
     taken = scenario.resolved
     plant = dict(said["plant"]) if isinstance(said.get("plant"), Mapping) else {}
-    chain = plant.get("chain")
-    if plant.get("type") == "serial_arm" and isinstance(chain, list):
-        # The resolved scenario has no shared link: every entry of the chain has its keys.
-        shared = plant.pop("link", None) or {}
-        plant["chain"] = [_with_shared(shared, entry) for entry in chain]
+    if isinstance(plant.get("arm"), Mapping):
+        plant["arm"] = _unshared(plant["arm"])
+    plant = _unshared(plant)
+    if plant:
         said["plant"] = plant
     return missing(said, taken) + _model_losses(said, plant, scenario)
+
+
+def _unshared(plant: Mapping[str, Any]) -> dict[str, Any]:
+    """Return an arm as in the resolved scenario: without a shared link, whose keys every entry of the chain has."""
+    plant = dict(plant)
+    if plant.get("type") == "serial_arm" and isinstance(plant.get("chain"), list):
+        shared = plant.pop("link", None) or {}
+        plant["chain"] = [_with_shared(shared, entry) for entry in plant["chain"]]
+    return plant
 
 
 def _with_shared(shared: Mapping[str, Any], entry: Any) -> Any:
@@ -147,7 +169,7 @@ def _model_losses(said: Mapping[str, Any], plant: Mapping[str, Any], scenario: A
         return lost
     from dynsim.scenario import build
 
-    if plant.get("type") == "serial_arm":
+    if plant.get("type") == "serial_arm" and not said.get("loads") and not said.get("objects"):
         masses = [
             float(entry.get("mass_kg", 0.1)) for entry in plant["chain"] for _ in range(int(entry.get("count", 1)))
         ]
@@ -156,12 +178,17 @@ def _model_losses(said: Mapping[str, Any], plant: Mapping[str, Any], scenario: A
             lost.append(f"masses {masses[:5]}… became {built[:5]}…")
     contacts = said.get("contacts") or {}
     points = contacts.get("points") or {}
+    factor = float((said.get("surface_error") or {}).get("friction_factor", 1.0))
     friction = {
-        str(name): float(point["friction"] if point.get("friction") is not None else contacts.get("friction", 0.1))
+        str(name): factor
+        * float(point["friction"] if point.get("friction") is not None else contacts.get("friction", 0.1))
         for name, point in points.items()
         if point is not None and point.get("enabled", True)
     }
     held = {contact.name: contact.friction for contact in build.contacts(scenario)}
+    # Candidates, objects and wheels are points that the file does not list.
+    if contacts.get("candidates", "points") != "points" or said.get("objects") or plant.get("type") == "snake":
+        held = {name: held[name] for name in friction if name in held}
     if friction != held:
         lost.append(f"friction {friction} became {held}")
     return lost

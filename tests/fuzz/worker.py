@@ -6,8 +6,9 @@ child, through the entry point of the console script.
 
 A command must succeed, or refuse with one line that begins with ``error:`` (and indented continuation lines), exit code
 2 or 3 and all files unchanged. Exceptions: ``hw replay`` may end with 1 to 4 and may write files in any case; a command
-may save a partial result that it marks incomplete; a run beyond its time limit must stop on Ctrl-C. ``check`` and other
-``hw`` commands must not change files even if they succeed. No temporary file remains; no signal of a run is infinite.
+may save a partial result that it marks incomplete; a simulation beyond its limit of processor time must stop on Ctrl-C,
+or by itself if it makes no progress. ``check`` and ``hw check`` must
+not change files even if they succeed. No temporary file remains; no signal of a run is infinite.
 """
 
 from __future__ import annotations
@@ -18,41 +19,42 @@ import faulthandler
 import io
 import json
 import os
+import re
 import resource
 import shutil
 import signal
 import sys
 import tempfile
+import time
 import traceback
 import warnings
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
+import typer
 from support.messages import says
 
 from fuzz import broken
 from fuzz.case import SHIPPED, Draft, draw, put
 from fuzz.inputs.sweep import forget_commit
-from fuzz.readings import Unreadable
+from fuzz.readings import Unreadable, loaded
 
 OK, REFUSED, INTERRUPTED = "ok", "refused", "interrupted"
-TRACEBACK, HANG, CRASH, LOSS, MESSAGE, FILES, NUMBERS = (
-    "traceback",
-    "hang",
-    "crash",
-    "silent loss",
-    "unclear error",
-    "files changed",
-    "not finite",
-)
-FAILURES = (TRACEBACK, HANG, CRASH, LOSS, MESSAGE, FILES, NUMBERS)
+FAILURES = TRACEBACK, HANG, CRASH, LOSS, MESSAGE, FILES, NUMBERS, LARGE = (
+    "traceback", "hang", "crash", "silent loss", "unclear error", "files changed", "not finite", "memory",
+)  # fmt: skip
 READY = "ready"
 # Memory of a worker in addition to its memory after all imports [bytes].
 MEMORY = 4 << 30
-# A simulation may take long because of its input (stiff motors, for example). It must then stop on Ctrl-C [s].
-SIMULATION_LIMIT = 20.0
+# Maximum resident memory of a case [MB].
+RESIDENT = 2000.0
+# Maximum processor time of a command [s]. A simulation may take longer because of its input (stiff motors, for
+# example); then it must stop on Ctrl-C. Without progress of the simulated time it must end by itself.
+CPU_LIMIT, SIMULATION_LIMIT, STALLED_LIMIT = 10.0, 20.0, 70.0
+SIMULATING = ("run", "compare", "sweep", "plan")
 # Original stderr: file descriptor 2 is redirected while a case runs.
 LOG = os.dup(2)
 
@@ -67,24 +69,45 @@ class Outcome:
     detail: str = ""
     # The content of the input was compared with dynsim's objects.
     compared: bool = False
+    # A simulation, a plan or a replay succeeded.
+    ran: bool = False
+    cpu_s: float = 0.0
+    memory_MB: float = 0.0
 
 
 def run_case(case: Draft, folder: Path, limit: float) -> Outcome:
     """Run all commands of a case in ``folder``; the first failure counts."""
+    used, children = sum(os.times()[:4]), resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
+    Path("/proc/self/clear_refs").write_text("5", encoding="ascii")  # resets the largest resident memory
+    ended = _run_case(case, folder, limit)
+    ended.cpu_s = sum(os.times()[:4]) - used
+    largest = int(re.findall(r"VmHWM:\s+(\d+)", Path("/proc/self/status").read_text(encoding="ascii"))[0])
+    grown = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
+    ended.memory_MB = 1.024e-3 * max(largest, grown if grown > children else 0)
+    if ended.memory_MB > RESIDENT and ended.outcome not in FAILURES:
+        ended.outcome, ended.what = LARGE, f"more than {RESIDENT:g} MB"
+    return ended
+
+
+def _run_case(case: Draft, folder: Path, limit: float) -> Outcome:
     for name, data in case.files.items():
         put(folder / name, data)
-    # Some scenarios refer to it.
-    shutil.copytree(SHIPPED / "robots", folder / "robots")
-    ended = Outcome(OK)
+    # Some scenarios refer to them.
+    for name in ("robots", "data"):
+        shutil.copytree(SHIPPED / name, folder / name)
+    ended, ran = Outcome(OK), False
     for command in case.commands:
         before = _snapshot(folder)
-        ended = _run_command(command, folder, SIMULATION_LIMIT if command[0] == "run" else limit)
+        ended = _run_command(command, folder, limit)
+        ran = ran or (ended.outcome == OK and (command[0] in SIMULATING or command[1] in ("replay", "compare")))
         if ended.outcome in FAILURES:
             return ended
         after = _snapshot(folder)
-        replays = command[:2] == ["hw", "replay"]
+        replays = command[:2] in (["hw", "replay"], ["hw", "compare"], ["hw", "recover"])
         reads_only = (
-            (ended.outcome != OK and not replays) or command[0] == "check" or (command[0] == "hw" and not replays)
+            (ended.outcome == REFUSED and not replays and not says(ended.detail, "sweep table"))
+            or command[0] == "check"
+            or (command[0] == "hw" and not replays)
         )
         if reads_only and not says(ended.detail, "incomplete") and before != after:
             changed = sorted(name for name in {*before, *after} if before.get(name) != after.get(name))
@@ -97,11 +120,15 @@ def run_case(case: Draft, folder: Path, limit: float) -> Outcome:
             break
         if command[0] == "run" and (wrong := _not_finite(folder / "out" / "record.h5")):
             return Outcome(NUMBERS, f"{wrong} is not finite", command[0], ended.detail)
+    ended.ran = ran
     if case.losses is not None:
         lost = _losses(case, folder, limit)
         if lost.outcome in FAILURES:
             return lost
         ended.compared = lost.compared
+        ended.ran = ran or (lost.compared and case.simulates)
+        if not case.commands and not lost.compared:
+            ended.outcome = REFUSED
     return ended
 
 
@@ -109,9 +136,7 @@ def _not_finite(path: Path) -> str:
     """Return the first signal of a successful run with a value that is not finite, except signals that may have one."""
     import numpy as np
 
-    from dynsim.record import Record
-
-    record = Record.load(path)
+    record = loaded(path)
     return next((name for name in record if np.isinf(record[name]).any()), "")
 
 
@@ -120,7 +145,8 @@ def _run_command(command: list[str], folder: Path, limit: float) -> Outcome:
 
     argv, sys.argv = sys.argv, ["dynsim", *command]
     code: Any = 0
-    with _quiet(folder, limit) as said:
+    used, simulating = sum(os.times()[:4]), command[0] in SIMULATING
+    with _quiet(folder, limit, SIMULATION_LIMIT if simulating else CPU_LIMIT, simulating) as said:
         warnings.simplefilter("default")
         try:
             main()
@@ -133,16 +159,30 @@ def _run_command(command: list[str], folder: Path, limit: float) -> Outcome:
         finally:
             sys.argv = argv
     if said.rang_at:
-        if command[0] == "run" and code == 130 and says(said.errors, "interrupted"):
+        if (
+            simulating
+            and not said.stalled
+            and code == 130
+            and (command[0] != "run" or says(said.errors, "interrupted"))
+        ):
             return Outcome(INTERRUPTED, detail=said.errors)
-        return Outcome(HANG, f"{command[0]} takes more than {limit:g} s", _place(said.rang_at), said.errors[-500:])
+        return Outcome(HANG, f"{command[0]} takes more than {said.rang}", _place(said.rang_at), said.errors[-500:])
+    if (spent := sum(os.times()[:4]) - used) > CPU_LIMIT and not simulating:
+        return Outcome(HANG, f"{command[0]} takes more than {CPU_LIMIT:g} s of processor time", detail=f"{spent:.1f} s")
     return _judge(command, 0 if code is None else code, said.output, said.errors)
+
+
+# Exit codes of commands that differ from 2 and 3.
+CODES = {"hw replay": (1, 2, 3, 4), "hw compare": (2, 3, 5)}
 
 
 def _judge(command: list[str], code: Any, out: str, err: str) -> Outcome:
     """Check exit code and output of a command against the rules."""
     lines = err.splitlines()
     errors = [line for line in lines if line.startswith("error:")]
+    if code == 2 and lines[:1] and lines[0].startswith("Usage: ") and "Error" in err:
+        # The command line itself is wrong: the message of its parser is in a frame.
+        return Outcome(REFUSED, detail=err[-2000:])
     verdict = Outcome(OK if code == 0 else REFUSED, detail=err[-2000:])
     wrong = ""
     if "Traceback (most recent call last)" in out + err:
@@ -151,7 +191,7 @@ def _judge(command: list[str], code: Any, out: str, err: str) -> Outcome:
         wrong = f"control characters {strange!r} reach the terminal"
     elif code == 0 and errors:
         wrong = "an error with exit code 0"
-    elif code != 0 and code not in ((1, 2, 3, 4) if command[:2] == ["hw", "replay"] else (2, 3)):
+    elif code != 0 and code not in CODES.get(" ".join(command[:2]), (2, 3)):
         wrong = f"exit code {code!r}"
     elif code != 0 and len(errors) != 1:
         wrong = f"{len(errors)} lines of error:"
@@ -174,12 +214,18 @@ def _is_control(sign: str) -> bool:
     return (ord(sign) < 32 and sign not in "\n\t") or 127 <= ord(sign) < 160
 
 
+# Lines of a sweep about runs that failed.
+FAILED_RUN = re.compile(r"run \d+ failed: |… and \d+ more")
+
+
 def _loose(lines: list[str], after: str) -> list[str]:
     """Return lines other than the error, its continuation, warnings and the note about a saved part."""
     loose = []
     warned = False
     for line in lines:
-        if line == after or line.startswith(" ") or says(line, "saved part") or not line.strip():
+        if line == after or line.startswith(" ") or not line.strip():
+            continue
+        if says(line, "saved part") or FAILED_RUN.match(line):
             continue
         warned = warned or "Warning: " in line or line.startswith("warning: ")
         if not warned:
@@ -191,22 +237,22 @@ def _losses(case: Draft, folder: Path, limit: float) -> Outcome:
     from dynsim.errors import DynsimError
 
     assert case.losses is not None
-    with _quiet(folder, limit) as said:
+    with _quiet(folder, limit, SIMULATION_LIMIT) as said:
         warnings.simplefilter("ignore")
         try:
             lost = case.losses()
         except (DynsimError, MemoryError, KeyboardInterrupt, Unreadable):
-            return Outcome(OK) if not said.rang_at else _late(said, limit)
+            return Outcome(OK) if not said.rang_at else _late(said)
         except BaseException as error:
             return _traceback(error)
     if said.rang_at:
-        return _late(said, limit)
+        return _late(said)
     return Outcome(LOSS, _class_of(lost[0]), "", "; ".join(lost)[:500]) if lost else Outcome(OK, compared=True)
 
 
-def _late(said: _Said, limit: float) -> Outcome:
+def _late(said: _Said) -> Outcome:
     assert said.rang_at is not None
-    return Outcome(HANG, f"reading takes more than {limit:g} s", _place(said.rang_at))
+    return Outcome(HANG, f"reading takes more than {said.rang}", _place(said.rang_at))
 
 
 def _class_of(loss: str) -> str:
@@ -255,11 +301,13 @@ class _Said:
     output: str = ""
     errors: str = ""
     rang_at: traceback.StackSummary | None = None
+    rang: str = ""
+    stalled: bool = False
 
 
 @contextlib.contextmanager
-def _quiet(folder: Path, limit: float) -> Iterator[_Said]:
-    """Work in ``folder``, capture all output, and raise Ctrl-C after ``limit`` [s]."""
+def _quiet(folder: Path, limit: float, cpu_limit: float, simulating: bool = False) -> Iterator[_Said]:
+    """Work in ``folder``, capture all output, and raise Ctrl-C after ``limit`` [s] or ``cpu_limit`` [s]."""
     said, out, err = _Said(), io.StringIO(), io.StringIO()
     before = Path.cwd()
     os.chdir(folder)
@@ -272,7 +320,7 @@ def _quiet(folder: Path, limit: float) -> Iterator[_Said]:
             warnings.catch_warnings(),
         ):
             try:
-                with _alarm(limit, said):
+                with _alarm(limit, cpu_limit, simulating, said):
                     yield said
             finally:
                 native.seek(0)
@@ -296,22 +344,64 @@ def _into(target: int) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _alarm(limit: float, said: _Said) -> Iterator[None]:
-    """Raise Ctrl-C after ``limit`` [s]; if even that is not handled, log the stack and end the process."""
+def _alarm(limit: float, cpu_limit: float, simulating: bool, said: _Said) -> Iterator[None]:
+    """Raise Ctrl-C after ``limit`` [s] or ``cpu_limit`` [s of processor time]; a stalled simulation gets more of both.
+
+    If even that is not handled, log the stack and end the process.
+    """
+    begun = time.process_time()
 
     def ring(number: int, frame: Any) -> None:
+        spent = time.process_time() - begun
+        said.stalled = simulating and time.process_time() - max(begun, PROGRESS[1]) > 0.5 * cpu_limit
+        if said.stalled and spent < STALLED_LIMIT:
+            return
         said.rang_at = said.rang_at or traceback.extract_stack(frame)
+        said.rang = said.rang or (f"{limit:g} s" if number == signal.SIGALRM else f"{cpu_limit:g} s of processor time")
         raise KeyboardInterrupt
 
-    signal.signal(signal.SIGALRM, ring)
-    # Repeat every two seconds, in case the first signal was swallowed.
-    signal.setitimer(signal.ITIMER_REAL, limit, 2.0)
-    faulthandler.dump_traceback_later(1.5 * limit + 1.0, exit=True, file=LOG)
+    for number, timer, after in (
+        (signal.SIGALRM, signal.ITIMER_REAL, limit),
+        (signal.SIGPROF, signal.ITIMER_PROF, cpu_limit),
+    ):
+        signal.signal(number, ring)
+        # Repeat every two seconds, in case the first signal was swallowed.
+        signal.setitimer(timer, after, 2.0)
+    last = 1.5 * limit + 1.0
+    faulthandler.dump_traceback_later(last + (10.0 * STALLED_LIMIT if simulating else 0.0), exit=True, file=LOG)
     try:
         yield
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        for timer in (signal.ITIMER_REAL, signal.ITIMER_PROF):
+            signal.setitimer(timer, 0.0)
         faulthandler.cancel_dump_traceback_later()
+
+
+# Simulated time of the present run [s], and processor time at which it advanced last [s].
+PROGRESS = [0.0, 0.0]
+
+
+def _watch_progress() -> None:
+    """Follow the simulated time of runs, independently of dynsim's own limit."""
+    from dynsim.engine.stopping import WallWatch
+    from dynsim.integrators.run import TIME
+
+    spend = WallWatch.spend
+
+    def watched(self: Any, run: Any) -> None:
+        if run.clock[TIME] != PROGRESS[0]:
+            PROGRESS[:] = run.clock[TIME], time.process_time()
+        spend(self, run)
+
+    WallWatch.spend = watched  # type: ignore[method-assign]
+
+
+def _know_records(folder: Path) -> None:
+    """Make this process read the valid records like its own, without a child process for each."""
+    from dynsim.record import reader
+
+    for path in folder.rglob("*.h5"):
+        reader._written.add(path.read_bytes()[-65:-1].decode("ascii"))
 
 
 def _load_everything(records: Path) -> None:
@@ -322,6 +412,10 @@ def _load_everything(records: Path) -> None:
     from dynsim.scenario import load_scenario
 
     forget_commit()
+    # Made from the signatures of all commands at every call, which takes as long as a short run.
+    typer.main.get_command = cache(typer.main.get_command)
+    _watch_progress()
+    _know_records(records)
     for name in ("single_pendulum", "elbow_comparison", "snake_positioning"):
         simulate(load_scenario(name, None, {"duration_s": 0.01, "metrics.settle_s": 0}))
 

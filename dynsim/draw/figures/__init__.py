@@ -83,7 +83,8 @@ def draw_comparison(records: Mapping[str, Record], folder: Path, kind: str = "pn
     drawn = {name: record for name, record in records.items() if len(record)}
     # In a comparison, measured runs are drawn in the same way as simulated runs, which have the same signals.
     arm = importlib.import_module(SIMULATED)
-    modules = {arm if module.__name__ == MEASURED else module for module in map(_module, drawn.values())}
+    own = [_module(record, name) for name, record in drawn.items()]
+    modules = {arm if module.__name__ == MEASURED else module for module in own}
     if not modules:
         return []
     if len(modules) > 1:
@@ -158,8 +159,9 @@ def _drawable() -> Iterator[None]:
         raise RecordError(f"the record cannot be drawn: {type(error).__name__}: {text}") from error
 
 
-def _module(record: Record) -> ModuleType:
-    for name, needed in MODULES.items():
+def _module(record: Record, name: str = "") -> ModuleType:
+    for module, needed in MODULES.items():
         if any(signals <= set(record) for signals in needed):
-            return importlib.import_module(name)
-    raise RecordError(f"no figures for a record with these signals: {', '.join(record) or 'none'}")
+            return importlib.import_module(module)
+    which = f"{name}: " if name else ""
+    raise RecordError(f"{which}no figures for a record with these signals: {', '.join(record) or 'none'}")

@@ -305,7 +305,7 @@ def _read(part: Path) -> Record:
     except (ValueError, TypeError, KeyError) as error:
         raise RecordError(f"{part}: is not a partial record of a replay ({error})") from error
     # The last row may be cut off.
-    rows = _rows_in_order(np.frombuffer(data[: len(data) // kind.itemsize * kind.itemsize], dtype=kind))
+    rows = _valid_rows(np.frombuffer(data[: len(data) // kind.itemsize * kind.itemsize], dtype=kind))
     origins = rows["origin"][np.isfinite(rows["origin"])]
     origin = origins[0] if len(origins) else rows["time"][0] if len(rows) else 0.0
     record = describe(measured_record(rows, layout, float(origin)), scene)
@@ -313,8 +313,11 @@ def _read(part: Path) -> Record:
     return record
 
 
-def _rows_in_order(rows: Rows) -> Rows:
-    """Return the rows before the first row whose time does not increase; a power failure may leave zeros at the end."""
+def _valid_rows(rows: Rows) -> Rows:
+    """Return the rows before the first whose time does not increase or whose state is unknown.
+
+    A power failure may leave zeros at the end.
+    """
     forward = np.diff(rows["time"], prepend=-np.inf) > 0
-    broken = np.flatnonzero(~(forward & np.isfinite(rows["time"])))
+    broken = np.flatnonzero(~(forward & np.isfinite(rows["time"]) & np.isin(rows["state"], [*ReplayState])))
     return rows[: broken[0]] if len(broken) else rows

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+from contextlib import nullcontext
 from pathlib import Path
 from random import Random
 
@@ -25,11 +27,32 @@ faults:
 
 
 def make_motion(folder: Path) -> None:
-    """Make a short record of the small robot of ``studies.fault_table``, and its map."""
-    from studies.fault_table import MAP, swing
+    """Make a short record of the small robot of ``studies.fault_table``, its map, and the measured record of a replay.
+
+    ``measured.part`` is the file that a replay leaves if its process dies.
+    """
+    from studies.fault_table import MAP, Rig, swing
+
+    from dynsim.hardware.replay import session
+    from dynsim.hardware.replay.output import PART
+    from dynsim.hardware.servo_map import load_servo_map
 
     swing(0.1).save(folder / "rig.h5")
     (folder / "rig.yaml").write_text(MAP.replace("run_up: 20", "run_up: 20, approach_velocity: 1.0"), encoding="utf-8")
+    rig = Rig(load_servo_map(folder / "rig.yaml"), swing(0.1))
+    run, save = rig.prepare(), session._save
+    session._save = lambda *_: None  # type: ignore[assignment]
+    try:
+        connection = nullcontext((run.replay.bus, run.clock))
+        result = session.run_replay(rig.motion(), rig.map, connection, folder / "replay", live=True)
+    finally:
+        session._save = save
+    result.record.provenance = {
+        key: item for key, item in result.record.provenance.items() if "time" not in key and "date" not in key
+    }
+    result.record.save(folder / "measured.h5")
+    (folder / "replay" / PART).rename(folder / PART)
+    shutil.rmtree(folder / "replay")
 
 
 def draw(rng: Random, records: Path) -> Draft:

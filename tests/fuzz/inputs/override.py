@@ -26,13 +26,13 @@ KEYS = (
 
 
 @cache
-def _real_keys(name: str) -> tuple[str, ...]:
+def real_keys(name: str) -> tuple[str, ...]:
     tree = yaml_tree((SHIPPED / f"{name}.yaml").read_text(encoding="utf-8"))
     tree.pop("variants", None)
     return tuple(".".join(map(str, path)) for path in places(tree))
 
 
-def _path(key: str) -> tuple[str | int, ...]:
+def path_of(key: str) -> tuple[str | int, ...]:
     return tuple(int(part) if part.isdecimal() else part for part in key.split("."))
 
 
@@ -46,13 +46,13 @@ def draw(rng: Random, records: Path) -> Draft:
     overrides = []
     if rng.random() < 0.3:
         # A key that dynsim probably accepts, so that losses can be detected.
-        key = rng.choice([key for key in _real_keys(name) if is_number(at(tree, _path(key)))])
-        overrides.append(f"{key}={near(rng, at(tree, _path(key)))}")
+        key = rng.choice([key for key in real_keys(name) if is_number(at(tree, path_of(key)))])
+        overrides.append(f"{key}={near(rng, at(tree, path_of(key)))}")
     for _ in range(rng.choice((1, 1, 1, 2, 3)) if not overrides else 0):
-        real = rng.choice(_real_keys(name))
+        real = rng.choice(real_keys(name))
         key = rng.choice((real, real, real, rng.choice(KEYS), f"{real}.x", real[:-1], real.replace(".", "..")))
         try:
-            old = at(tree, _path(key))
+            old = at(tree, path_of(key))
         except (LookupError, TypeError, ValueError):
             old = None
         item = value(rng, old)

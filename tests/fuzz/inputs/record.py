@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
 import re
@@ -17,10 +18,12 @@ import numpy as np
 from fuzz.case import Draft
 from fuzz.inputs.faults import make_motion
 from fuzz.inputs.sweep import make_sweep
-from fuzz.mutations import TEXTS, mutate_bytes
+from fuzz.mutations import TEXTS, mutate_blocks, mutate_bytes
 from fuzz.readings import Unreadable, record_losses
 
 FORMATS = ("csv", "joint-trajectory", "urdf-log")
+# Size of the last line, with the digest [bytes].
+SIGNATURE = 80
 
 
 def make_records(folder: Path) -> None:
@@ -43,7 +46,9 @@ def make_records(folder: Path) -> None:
     make_motion(folder)
 
 
-def draw(rng: Random, records: Path) -> Draft:
+def draw(rng: Random, records: Path, kind: str) -> Draft:
+    if kind == "hdf5":
+        return _damaged(rng, records)
     name = rng.choice(("arm", "arm", "snake"))
     sound = (records / f"{name}.h5").read_bytes()
     structural = rng.random() < 0.55
@@ -84,6 +89,23 @@ def draw(rng: Random, records: Path) -> Draft:
         # Accidental damage: an accepted record must equal the saved one.
         files["sound.h5"] = sound
     return Draft(f"{name}: {mutation}", files, [command], losses)
+
+
+def _damaged(rng: Random, records: Path) -> Draft:
+    """Return a record with large damage and a correct digest, or none, so that HDF5 reads it."""
+    name = rng.choice(("arm.h5", "snake.h5", "measured.h5"))
+    data, mutation = mutate_blocks(rng, (records / name).read_bytes()[:-SIGNATURE])
+    if signed := rng.random() < 0.7:
+        data += b"\ndynsim-sha256:%s\n" % hashlib.sha256(data).hexdigest().encode()
+    command = rng.choice(
+        (
+            ["view", "record.h5", "--no-open", "--out", "page.html"],
+            ["export", "record.h5", "--out", "out.txt", "--format", rng.choice((*FORMATS, "mcap"))],
+            ["hw", "check", "record.h5", "--map", "arm"],
+        )
+    )
+    command += [] if signed else ["--trust"]
+    return Draft(f"{name}: {mutation}{' signed' * signed}", {"record.h5": data}, [command])
 
 
 def losses() -> list[str]:
