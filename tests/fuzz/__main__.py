@@ -26,7 +26,7 @@ def main() -> int:
     parser.add_argument("--repeat", nargs=2, metavar=("KIND", "INDEX"), help="one case again")
     parser.add_argument("--keep", type=Path, help="with --repeat: write the files of the case to this folder")
     parser.add_argument(
-        "--journal", type=Path, help="file of results: they are added to it, and cases in it are skipped"
+        "--journal", type=Path, help="file of results: results are added, and cases in it that did not fail are skipped"
     )
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="fuzz-records-") as folder:
@@ -44,7 +44,7 @@ def main() -> int:
         else:
             cases = campaign.spread(options.count)
         done = campaign.read(options.journal) if options.journal and options.journal.exists() else []
-        known = {(result.seed, result.kind, result.index) for result in done}
+        known = {(result.seed, result.kind, result.index) for result in done if not result.failed}
         cases = [case for case in cases if (options.seed, *case) not in known]
 
         def end(*_: object) -> None:

@@ -22,14 +22,17 @@ def install() -> None:
 
     def load(cls: type[Record], path: Any, *, trust: bool = False) -> Record:
         # A case runs in a folder with its name and number.
-        number = int(Path.cwd().name.rpartition("-")[2])
-        list(WAYS.values())[number % len(WAYS)]()
+        number = Path.cwd().name.rpartition("-")[2]
+        if not number.isdecimal():
+            return sound_load(cls, path, trust=trust)
+        list(WAYS.values())[int(number) % len(WAYS)]()
         return sound_load(cls, path, trust=trust)
 
     def inertia(self: Any) -> Any:
         body = sound_inertia(self)
         return type(body)(1.01 * body.mass, body.com, body.tensor)
 
+    sys.modules["__main__"].RESIDENT = 600.0  # type: ignore[attr-defined]
     Record.load = classmethod(load)  # type: ignore[assignment,method-assign]
     LinkConfig.inertia = inertia  # type: ignore[method-assign]
 
@@ -62,6 +65,7 @@ WAYS = {
     "raises": lambda: int("no number"),
     "hangs": lambda: time.sleep(3600),
     "takes all memory": lambda: bytearray(64 << 30),
+    "takes 0.6 GB": lambda: len(b"x" * 600_000_000) and _refuse(),
     "babbles": _babble,
     "overwrites": lambda: _overwrite("map.yaml"),
     "litters": lambda: _overwrite("map.yaml.tmp"),

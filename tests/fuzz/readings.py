@@ -77,14 +77,18 @@ def set_dotted(tree: Any, dotted: str, item: Any) -> None:
             if isinstance(node, list):
                 node = node[int(key)]
             else:
-                node = (
-                    node[key]
-                    if node.get(key) is not None
-                    else node.setdefault(key, {}) or node.__setitem__(key, {}) or node[key]
-                )
-        node[int(last) if isinstance(node, list) else last] = item
+                key = _key(node, key)
+                if node.get(key) is None:
+                    node[key] = {}
+                node = node[key]
+        node[int(last) if isinstance(node, list) else _key(node, last)] = item
     except (LookupError, ValueError, AttributeError, TypeError) as error:
         raise Unreadable(dotted) from error
+
+
+def _key(node: Mapping[Any, Any], text: str) -> Any:
+    """Return the key that is written like ``text``, which this reader may have converted to a number."""
+    return next((key for key in node if str(key) == text), text)
 
 
 def missing(said: Any, taken: Any, where: str = "") -> list[str]:

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 from support.messages import mentions
 
+from dynsim.draw.geometry import meshes
 from dynsim.model.description import Inertia, Link, Robot
 from dynsim.model.urdf.reader import read_urdf
 from fuzz import campaign
 from fuzz.broken import WAYS
-from fuzz.case import SHIPPED
+from fuzz.case import SHIPPED, draw, put
 from fuzz.readings import missing, record_losses, urdf_losses
-from fuzz.worker import CRASH, FILES, HANG, LOSS, MESSAGE, REFUSED, TRACEBACK
+from fuzz.worker import CRASH, FILES, HANG, LARGE, LOSS, MESSAGE, REFUSED, TRACEBACK
 
 pytestmark = pytest.mark.long
 
@@ -24,6 +25,7 @@ FOUND = {
     "raises": (TRACEBACK, "ValueError", LOADING),
     "hangs": (HANG, "hw takes more than 2 s", LOADING),
     "takes all memory": (REFUSED, "", ""),
+    "takes 0.6 GB": (LARGE, "more than 600 MB", ""),
     "babbles": (MESSAGE, "control characters", "hw"),
     "overwrites": (FILES, "hw check changed map.yaml", "hw"),
     "litters": (FILES, "hw check changed map.yaml.tmp", "hw"),
@@ -133,6 +135,18 @@ def test_masses_behind_fixed_joints_are_composed_as_they_are_merged(tmp_path: Pa
         "r", (Link("a", "j", None, "revolute", np.array([0.0, 0.0, 1.0]), Inertia(2.0)),), (), ("a", np.zeros(3))
     )
     assert urdf_losses(text.encode(), light)
+
+
+@pytest.mark.parametrize("kind", ["obj", "stl", "dae"])
+def test_a_lost_triangle_is_a_loss(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    cases = (draw(kind, 3, index, tmp_path) for index in range(100))
+    case = next(case for case in cases if case.losses.args == (kind, True) and f"mesh.{kind}" in case.files)
+    put(tmp_path / f"mesh.{kind}", case.files[f"mesh.{kind}"])
+    assert case.losses() == []
+    read = meshes.read_mesh
+    monkeypatch.setattr(meshes, "read_mesh", lambda path: read(path)._replace(triangles=read(path).triangles[1:]))
+    assert "triangles became" in case.losses()[0]
 
 
 def test_a_record_with_another_number_is_a_loss(records: Path) -> None:

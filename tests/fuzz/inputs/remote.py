@@ -76,7 +76,7 @@ def message_losses(texts: list[str | bytes]) -> list[str]:
     """Return messages that were read as something else, and speeds beyond the limits of the dead-man switch."""
     from dynsim.teleop.web.pilot import Deadman, PilotCommand, Refused, parse
 
-    now, lost = [0.0], []
+    now, lost, newest = [0.0], [], PilotCommand(-1, (), False)
     deadman = Deadman(_axes(), lambda: now[0])
     for text in texts:
         now[0] += 0.1
@@ -92,12 +92,14 @@ def message_losses(texts: list[str | bytes]) -> list[str]:
             if [*parsed.axes] != speeds or (parsed.count, parsed.held) != (message["n"], message.get("held", False)):
                 lost.append(f"{str(text)[:80]} was read as {parsed}")
             deadman.receive(parsed)
+            # Messages that were overtaken have no effect.
+            newest = parsed if parsed.count > newest.count else newest
         elif parsed != message["do"]:
             lost.append(f"{str(text)[:80]} was read as {parsed}")
         command, state, _ = deadman.command()
         if any(abs(speed) > axis.limit for speed, axis in zip(command.velocity, _axes(), strict=True)):
             lost.append(f"speeds {command.velocity} are beyond the limits")
-        if any(command.velocity) and not (isinstance(parsed, PilotCommand) and parsed.held):
+        if any(command.velocity) and not newest.held:
             lost.append(f"a motion without the switch, in the state {state}")
     return lost
 
