@@ -182,6 +182,18 @@ def test_plot_keeps_apart_records_of_the_same_variant(tmp_path: Path):
     assert (tmp_path / "figures" / "compare_hand_path.png").is_file()
 
 
+def test_plot_rejects_records_without_a_common_overlay_before_it_draws(tmp_path: Path):
+    arm, other = Record([0.0, 1.0]), Record([0.0, 1.0])
+    arm.add("hand_position", [[0.0, 0.0, 1.0]] * 2, "m", labels=("x", "y", "z"))
+    other.add("pressure", [0.0, 1.0], "Pa")
+    arm.save(tmp_path / "arm.h5")
+    other.save(tmp_path / "other.h5")
+    result = dynsim("plot", "arm.h5", "other.h5", "--out", "figures", folder=tmp_path)
+    assert result.returncode == 2
+    check_message(result.stderr, "other", "pressure")
+    assert not (tmp_path / "figures").exists()
+
+
 @pytest.mark.long
 def test_figures_in_another_format_replace_those_of_the_run_before(tmp_path: Path):
     arguments = ["run", "single_pendulum", "--set", "duration_s=0.2", "--set", "metrics.settle_s=0.05", "--out", "out"]

@@ -102,6 +102,15 @@ def test_zeros_after_a_power_cut_are_no_cycles(streamed, rig: Rig, tmp_path: Pat
     same(record, recover(tmp_path), len(record))
 
 
+def test_rows_from_an_unknown_state_on_are_dropped(streamed, rig: Rig, tmp_path: Path) -> None:
+    record, stream = streamed
+    start = stream.index(b"\n") + 1
+    rows = np.frombuffer(stream, row_type(len(rig.map.servos)), offset=start).copy()
+    rows["state"][-5] = 99
+    (tmp_path / PART).write_bytes(stream[:start] + rows.tobytes())
+    same(record, recover(tmp_path), len(rows) - 5)
+
+
 def test_a_record_that_is_whole_stays(streamed, tmp_path: Path) -> None:
     record, stream = streamed
     record.save(tmp_path / "measured.h5")
