@@ -99,7 +99,7 @@ def _run_case(case: Draft, folder: Path, limit: float) -> Outcome:
     for command in case.commands:
         before = _snapshot(folder)
         ended = _run_command(command, folder, limit)
-        ran = ran or (ended.outcome == OK and (command[0] in SIMULATING or command[1] in ("replay", "compare")))
+        ran = ran or (ended.outcome == OK and (command[0] in SIMULATING or command[:2] == ["hw", "replay"]))
         if ended.outcome in FAILURES:
             return ended
         after = _snapshot(folder)

@@ -145,7 +145,7 @@ def losses(kind: str, sound: bool) -> list[str]:
     try:
         mesh = read_mesh(path)
     except RecordError as error:
-        if sound and path.is_file() and not path.is_symlink():
+        if sound and path.is_file() and not path.is_symlink() and path.stat().st_size:
             return [f"a valid mesh is refused: {error}"]
         raise
     taken = mesh.corners[mesh.triangles]

@@ -24,6 +24,9 @@ EXPORTED = (
     "wall_push",
 )  # fmt: skip
 NUMBER_TEXTS = ("0", "-1", "nan", "inf", "1e9", "1e-9", "1e300", "", "x", "0x10", "1_0", "１", "2.5")
+# Settings of short sweeps, and options that many sweeps do not have.
+SHORT = ["--jobs", "1", "--out", "out", "--set", "duration_s=0.01", "--set", "metrics.settle_s=0"]
+ODD = ("--keep-records all", "--seed -1", "--count 0", "--variants x", "--seed 12", "--resume")
 # Options of each command with values, most of them valid. An option with * is always set; a flag has the value "".
 OPTIONS = {
     "compare": {"--jobs": "1", "--format": "png pdf svg gif", "--set": "integrator.rtol=1e-7 a=1"},
@@ -69,11 +72,8 @@ def draw(rng: Random, records: Path, kind: str) -> Draft:
             command.append("--no-verify")
         files: dict[str, bytes | str] = {"scenario.yaml": yaml_text(tree).encode()}
         return Draft(f"{mutation}: {' '.join(command)}", files, [command], losses)
-    names = tuple(
-        rng.sample(
-            RECORDS if rng.random() < 0.1 or kind == "export" else DRAWN, 1 + (kind != "export" and rng.random() < 0.2)
-        )
-    )
+    several, any_record = kind != "export" and rng.random() < 0.2, kind == "export" or rng.random() < 0.1
+    names = rng.sample(RECORDS if any_record else DRAWN, 2 if several else 1)
     command = [kind, *names, *_options(rng, kind)]
     return Draft(" ".join(command), {name: (records / name).read_bytes() for name in names}, [command], output_losses)
 
@@ -110,35 +110,13 @@ def _sweep(rng: Random) -> tuple[list[str], int | None]:
             text, rows = mutate_text(rng, text)[0].decode("utf-8", "replace").replace("\x00", "").strip("\n")[:3000], 0
         expressions += ["--sample" if law in ("uniform", "normal") else "--grid", text]
     count = rng.choice((1, 2, 3)) if sampled else 1
-    command = [
-        "sweep",
-        name,
-        *expressions,
-        *QUIET,
-        "--jobs",
-        "1",
-        "--out",
-        "out",
-        "--set",
-        "duration_s=0.01",
-        "--set",
-        "metrics.settle_s=0",
-    ]
+    command = ["sweep", name, *expressions, *QUIET, *SHORT]
     command += ["--count", str(count)] if count > 1 else []
     if variants and rng.random() < 0.3:
         command += ["--variants", ",".join(variants[:2])]
         rows *= len(variants[:2])
     if rng.random() < 0.15:
-        command += rng.choice(
-            (
-                ["--keep-records", "all"],
-                ["--seed", "-1"],
-                ["--count", "0"],
-                ["--variants", "x"],
-                ["--seed", "12"],
-                ["--resume"],
-            )
-        )
+        command += rng.choice(ODD).split()
         rows = 0
     return command, rows * count or None
 
