@@ -153,7 +153,7 @@ def test_damaged_machine_code_is_compiled_anew(kernel_files: Path, damage: str) 
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="files have no numeric owners")
-def test_machine_code_of_another_user_is_compiled_anew(kernel_files: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_machine_code_of_another_user_is_recompiled(kernel_files: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     _double()
     (file,) = kernel_files.iterdir()
     if os.getuid() == 0:

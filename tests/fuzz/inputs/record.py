@@ -140,7 +140,7 @@ def read(record: Any) -> None:
         if record[name].shape[:1] != record.times(name).shape:
             raise AssertionError(f"signal {name!r} has {record[name].shape} samples, not {record.times(name).shape}")
         if signal.labels and [name for name in signal.labels if not isinstance(name, str)]:
-            raise AssertionError(f"signal {name!r} has labels that are no texts: {signal.labels}")
+            raise AssertionError(f"signal {name!r} has labels that are not texts: {signal.labels}")
         for column, _ in enumerate(signal.labels):
             signal.data[:, column].sum()
 
