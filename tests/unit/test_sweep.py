@@ -655,7 +655,7 @@ def test_a_sweep_of_5000_runs_outlives_a_killed_worker_every_two_seconds(tmp_pat
     runs = [
         "single_pendulum",
         "--set",
-        "duration_s=15",
+        "duration_s=60",
         "--grid",
         f"{LENGTH}=0.5:1:5000",
         "--no-figures",
