@@ -59,7 +59,7 @@ from dynsim.cli.tables import (
 from dynsim.cli.teleop import teleop
 from dynsim.config import completion
 from dynsim.errors import DynsimError, RecordError, SimulationInterrupted, SimulationStopped
-from dynsim.system.terminal import escaped
+from dynsim.system.terminal import escaped, escaped_problem
 
 if TYPE_CHECKING:
     from dynsim.engine import Start
@@ -224,7 +224,7 @@ def check(
             failed = True
             # Print the start positions, because they help the user to find the error.
             print_starts(console, starts)
-            errors.print(f"[red]error:[/] {escaped(str(error))}")
+            errors.print(f"[red]error:[/] {escaped_problem(error)}")
         else:
             count = f"{len(variants)} variants" if len(variants) > 1 else "1 variant"
             print_line(f"{escaped(name)}: ok ({count})")

@@ -17,7 +17,7 @@ from dynsim.cli.commands import app
 from dynsim.cli.tables import errors
 from dynsim.errors import DynsimError, SimulationInterrupted
 from dynsim.system import interruption
-from dynsim.system.terminal import escaped, lenient_streams, shortened
+from dynsim.system.terminal import escaped_problem, lenient_streams
 
 
 def main(received: Sequence[int]) -> None:
@@ -58,7 +58,7 @@ def _exit_code() -> int:
         return SimulationInterrupted.exit_code
     else:
         return 0
-    errors.print(f"[red]error:[/] {escaped(shortened(problem))}")
+    errors.print(f"[red]error:[/] {escaped_problem(problem)}")
     return code
 
 
@@ -99,7 +99,7 @@ def _plain_warnings() -> Iterator[None]:
 
     def show(message: Warning | str, category: type[Warning], *location: Any, **options: Any) -> None:
         if issubclass(category, UserWarning):
-            errors.print(f"[yellow]warning:[/] {escaped(shortened(message))}")
+            errors.print(f"[yellow]warning:[/] {escaped_problem(message)}")
         elif not issubclass(category, RuntimeWarning):  # of numpy; results that are not finite have errors of their own
             shown(message, category, *location, **options)
 

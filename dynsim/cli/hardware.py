@@ -33,7 +33,7 @@ from dynsim.errors import DynsimError, RecordError
 from dynsim.hardware.errors import ReplayInterrupted, ServoMapError, VerificationFailed
 from dynsim.system import interruption
 from dynsim.system.files import file_name, json_text, write_json
-from dynsim.system.terminal import Terminal, escaped, plain
+from dynsim.system.terminal import Terminal, escaped_problem, plain
 
 if TYPE_CHECKING:
     from dynsim.hardware.bus.protocol import Bus, Clock
@@ -627,7 +627,7 @@ def hw_drive(
         if isinstance(done, DynsimError):
             if error is None:
                 raise done
-            errors.print(f"[red]error:[/] {escaped(str(done))}")
+            errors.print(f"[red]error:[/] {escaped_problem(done)}")
             raise error
     if result is not None and not quiet:
         print_timing(result)
@@ -641,7 +641,7 @@ def hw_drive(
     if error is None and not quiet:
         print_replay(result, "driven", folder / SERVOS, folder / "record.h5")
     if error is not None and done.failure is not None:
-        errors.print(f"[red]error:[/] simulation: {escaped(str(done.failure))}")
+        errors.print(f"[red]error:[/] simulation: {escaped_problem(done.failure)}")
     if failure := error or done.failure:
         raise failure
 

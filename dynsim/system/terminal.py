@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import codecs
 import os
+import re
 import sys
 import unicodedata
 from collections.abc import Iterator
@@ -55,6 +56,14 @@ def escaped(text: object) -> str:
 def escaped_line(text: object) -> str:
     r"""Return a name or a sentence escaped as by :func:`escaped`, with line breaks written as ``\n``."""
     return escape(plain(text).replace("\n", "\\n"))
+
+
+def escaped_problem(text: object) -> str:
+    r"""Return an error escaped as by :func:`escaped` and :func:`shortened`; line breaks in it are written as ``\n``.
+
+    The lines of an error after the first are indented; other line breaks are part of a name or an option.
+    """
+    return escape(shortened(re.sub(r"\n(?!  )", r"\\n", plain(text))))
 
 
 class Terminal(Console):

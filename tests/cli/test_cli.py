@@ -182,6 +182,13 @@ def test_plot_keeps_apart_records_of_the_same_variant(tmp_path: Path):
     assert (tmp_path / "figures" / "compare_hand_path.png").is_file()
 
 
+@pytest.mark.parametrize("arguments", [["run", "a\nb"], ["sweep", "single_pendulum", "--grid", "a\nb"]])
+def test_error_with_a_line_break_in_an_option_is_one_line(arguments: list[str], tmp_path: Path):
+    result = dynsim(*arguments, folder=tmp_path)
+    assert result.returncode == 2
+    check_message(result.stderr, r"a\nb")
+
+
 def test_plot_rejects_records_without_a_common_overlay_before_it_draws(tmp_path: Path):
     arm, other = Record([0.0, 1.0]), Record([0.0, 1.0])
     arm.add("hand_position", [[0.0, 0.0, 1.0]] * 2, "m", labels=("x", "y", "z"))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 import struct
 import xml.etree.ElementTree as ElementTree
 from functools import partial
@@ -170,7 +171,7 @@ def _number(text: str) -> float:
 
 def _read_obj(data: bytes) -> np.ndarray:
     corners, triangles = [], []
-    for line in data.decode("ascii").replace("\r\n", "\n").split("\n"):
+    for line in re.split("\r\n?|\n", data.decode("ascii")):
         words = line.split()
         if words[:1] == ["v"]:
             corners.append([_number(word) for word in words[1:4]])
