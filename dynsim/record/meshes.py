@@ -111,7 +111,9 @@ def _obj(content: bytes) -> Mesh:
     triangles: list[tuple[int, int, int]] = []
     for line in content.decode("utf-8", errors="replace").splitlines():
         words = line.split()
-        if len(words) >= 4 and words[0] == "v":
+        if words[:1] == ["v"]:
+            if len(words) < 4:  # without it, the indices of faces would refer to other corners
+                raise ValueError(f"corner {len(corners) + 1} has fewer than three coordinates")
             corners.append([float(word) for word in words[1:4]])
         elif len(words) >= 4 and words[0] == "f":
             indices = [int(word.split("/")[0]) for word in words[1:]]

@@ -137,6 +137,7 @@ def test_mesh_files(name: str, text: bytes | str, tmp_path: Path) -> None:
         ("a.stl", "vertex 1 2 x"),
         ("a.obj", "v 0 0 0\nf 1 2 3"),
         ("a.obj", "f 1 2"),
+        ("a.obj", "v 0 0 0\nv 1\nv 1 0 0\nv 0 1 0\nf 1 2 3"),
         ("a.dae", "<COLLADA"),
         ("a.dae", '<!DOCTYPE a [<!ENTITY b "c">]><COLLADA/>'),
         ("a.dae", "<COLLADA/>"),
