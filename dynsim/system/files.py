@@ -265,6 +265,8 @@ def _draft(path: Path) -> Iterator[_Draft]:
 
 def _existing(path: Path) -> os.stat_result | None:
     """Return the status of the existing file at a path; raise OSError if it is not a regular file."""
+    if "\0" in os.fspath(path):
+        raise OSError(0, "is not a path: it contains a null character")
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
         existing: os.stat_result | None = os.stat(path)

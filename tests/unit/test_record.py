@@ -251,3 +251,9 @@ def test_a_drive_that_has_no_room_leaves_its_script(tmp_path: Path, simulated, m
     monkeypatch.setattr("dynsim.engine.recording.write_text", full)
     with pytest.raises(RecordError, match=r"^record\.h5: No space left on device$"):
         save_drive(record, tmp_path)
+
+
+def test_save_rejects_a_path_with_a_null_character(record: Record, tmp_path: Path):
+    for path in ("a\0", "a\0/b.h5"):
+        with raises(RecordError, "null"):
+            record.save(str(tmp_path / path))
