@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from support.messages import mentions
 
-from dynsim.draw.geometry import meshes
 from dynsim.model.description import Inertia, Link, Robot
 from dynsim.model.urdf.reader import read_urdf
+from dynsim.record import meshes
 from fuzz import campaign
 from fuzz.broken import WAYS
 from fuzz.case import SHIPPED, draw, put

@@ -26,13 +26,13 @@ from support.messages import raises, says
 
 import dynsim
 from dynsim import cli
-from dynsim.draw.geometry import meshes
-from dynsim.draw.geometry.meshes import Mesh, Meshes, read_mesh, simplified, welded
+from dynsim.draw.geometry.meshes import Meshes, simplified, welded
 from dynsim.draw.page import content, page, viewable, write
 from dynsim.draw.page.content import Blocks, three
 from dynsim.draw.page.content import packed_mesh as packed
 from dynsim.errors import RecordError
-from dynsim.record import Record
+from dynsim.record import Record, meshes
+from dynsim.record.meshes import Mesh, read_mesh
 from dynsim.record.poses import ORIENTATION, POSITION, add_body_poses
 from dynsim.scenario import build_model, load_scenario, variant_names
 
@@ -185,8 +185,8 @@ HOSTILE = {
 READ = """
 import resource, sys
 from pathlib import Path
-from dynsim.draw.geometry import meshes
-from dynsim.draw.geometry.meshes import read_mesh
+from dynsim.record import meshes
+from dynsim.record.meshes import read_mesh
 from dynsim.errors import RecordError
 resource.setrlimit(resource.RLIMIT_CPU, (8, 9))
 resource.setrlimit(resource.RLIMIT_AS, (2 << 30, 2 << 30))

@@ -19,7 +19,7 @@ _WELD = 2.0**-20
 # Fractions of the mesh size for merging corners before a mesh is simplified, because thin triangles, which are frequent
 # in CAD meshes, hinder simplification. The next fraction is tried if more than _TOO_MANY times the allowed number of
 # triangles remains.
-_COARSE, _TOO_MANY = (1 / 500, 1 / 250, 1 / 120, 1 / 60, 1 / 30), 1.5
+_COARSE, _TOO_MANY = (1 / 500, 1 / 250, 1 / 120, 1 / 60, 1 / 30, 1 / 20, 1 / 15), 1.5
 # Aggressiveness parameter of fast_simplification; edges are collapsed up to an error of 1 % of the mesh size.
 _AGGRESSIVENESS = 2.5
 # Minimum number of triangles of a solid (a tetrahedron).

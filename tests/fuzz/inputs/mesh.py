@@ -139,8 +139,8 @@ def _fan(face: list[int]) -> list[tuple[int, int, int]]:
 
 def losses(kind: str, sound: bool) -> list[str]:
     """Return triangles in which the mesh differs from a second reading; refuse a sound mesh as a loss."""
-    from dynsim.draw.geometry.meshes import read_mesh
     from dynsim.errors import RecordError
+    from dynsim.record.meshes import read_mesh
 
     path = Path(f"mesh.{kind}")
     try:
