@@ -309,6 +309,9 @@ def _staged(ended: Ended, stages: Stages) -> Iterator[None]:
             still = SimpleNamespace(scene=None, provenance={})
             return follower.Ready("http://127.0.0.1", still, Sample(0.0, *self.feed.posture(0.0)), self.feed.step)  # type: ignore[arg-type]
 
+        def wait_for_pilot(self) -> None:
+            pass
+
         def finish(self, why: str) -> Any:
             return follower.Done(SimpleNamespace(ended=why), 0.0, saved=False, failure=None)  # type: ignore[arg-type]
 

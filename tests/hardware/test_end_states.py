@@ -204,7 +204,7 @@ def test_a_second_fault_on_the_way_is_named_and_shows(rig, onset: float, kind: s
         named_at = (
             next(fault for fault in result.faults if 2 in fault.ids).time if kind == "drop_off" else result.fault_time
         )
-        later = [time for time, id_, _ in result.policy_goals if id_ == 2 and time > named_at]
+        later = [time for time, id_, _ in result.policy_goals if id_ == 2 and time >= named_at]
         wheel = [time for time, id_, _ in result.policy_goals if id_ == 7]
         assert max(later) < max(wheel)
 
