@@ -694,7 +694,9 @@ def import_recording(
     """Import recorded joint positions as a smooth motion with velocities, for `dynsim hw replay`."""
     from dynsim.hardware.imported import import_motion
     from dynsim.hardware.servo_map import load_servo_map
+    from dynsim.system.inputs import check_file
 
+    check_file(file, RecordError)
     target = out or file.with_suffix(".h5")
     if target.exists() and target.samefile(file):
         raise RecordError(f"{file} would be overwritten; choose another file with --out")

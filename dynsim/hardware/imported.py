@@ -14,7 +14,7 @@ import csv
 import importlib
 import math
 import re
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -220,17 +220,17 @@ def _read(path: Path, servo_map: ServoMap, topic: str | None, trust: bool) -> Re
     if kind == ".mcap":
         return _read_mcap(path, topic)
     if kind == ".csv":
-        return _read_csv(path)
+        return _read_csv(path, servo_map.joints)
     if kind in (".h5", ".hdf5"):
         return _read_record(path, servo_map, trust)
     raise RecordError(f"{path}: unknown type {kind or 'without suffix'!r}; import a .csv, .mcap or .h5 file")
 
 
-def _read_csv(path: Path) -> Recording:
+def _read_csv(path: Path, known: Collection[str]) -> Recording:
     text = read_text(path, RecordError, SIZE_LIMIT).lstrip("\ufeff")
     lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
     header = [cell.strip() for cell in _cells(lines[0])]
-    clock, joints = _columns(path, header)
+    clock, joints = _columns(path, header, known)
     column, scale = clock
     for number, line in enumerate(lines[1:], 2):
         location, cells = f"{path}:{number}", _cells(line)
@@ -247,7 +247,7 @@ def _read_csv(path: Path) -> Recording:
                 samples.time.append(time * scale)
                 samples.value.append(value)
                 samples.number.append(number)
-    names = {k: _joint_name(_split(header[k])[0]) for k in joints}
+    names = {k: _joint_name(_split(header[k])[0], known) for k in joints}
     return Recording(path, ":", {names[k]: samples for k, samples in joints.items()})
 
 
@@ -272,12 +272,14 @@ def _split(heading: str) -> tuple[str, str]:
     return (match[1], match[2] or "") if match else (heading, "")
 
 
-def _joint_name(name: str) -> str:
-    """Return the joint in names of other recorders: "elbow.pos", "/joint_states/elbow/position"."""
-    return re.sub(r"[./](pos|position)$", "", name).rsplit("/", 1)[-1]
+def _joint_name(name: str, known: Collection[str]) -> str:
+    """Return a known name unchanged, otherwise the joint in "elbow.pos" or "/joint_states/elbow/position"."""
+    return name if name in known else re.sub(r"[./](pos|position)$", "", name).rsplit("/", 1)[-1]
 
 
-def _columns(path: Path, header: list[str]) -> tuple[tuple[int, float], dict[int, RecordedSamples]]:
+def _columns(
+    path: Path, header: list[str], known: Collection[str]
+) -> tuple[tuple[int, float], dict[int, RecordedSamples]]:
     """Return the time column with the factor to seconds, and the columns with positions."""
     clock: tuple[int, float] | None = None
     joints: dict[int, RecordedSamples] = {}
@@ -291,7 +293,7 @@ def _columns(path: Path, header: list[str]) -> tuple[tuple[int, float], dict[int
                 raise RecordError(f"{path}:1: {heading!r}: unknown unit of time; choices: {', '.join(SECONDS)}")
             clock = (k, factor)
         elif (not unit or unit in UNITS) and name:
-            joint = _joint_name(name)
+            joint = _joint_name(name, known)
             twice = twice or (f"columns {names[joint]!r} and {heading!r}" if joint in names else "")
             joints[k], names[joint] = RecordedSamples(UNITS.get(unit, "")), heading
     if clock is None:

@@ -134,9 +134,9 @@ def _kind(link: Link, name: str, wheel: bool) -> tuple[dict[str, Any], int]:
     }
     mode, zero = "velocity", TICKS_PER_TURN // 2
     if not wheel:
-        # Rounded inward, except for the rounding errors of limits in radians.
-        low = math.ceil(10 * max(math.degrees(link.lower), -UNLIMITED) - 0.01) / 10
-        high = math.floor(10 * min(math.degrees(link.upper), UNLIMITED) + 0.01) / 10
+        # Rounded outward by less than an encoder tick, so that a joint may start at its limit.
+        low = math.floor(100 * max(math.degrees(link.lower), -UNLIMITED) + 0.01) / 100
+        high = math.ceil(100 * min(math.degrees(link.upper), UNLIMITED) - 0.01) / 100
         if not (math.isfinite(link.lower) or math.isfinite(link.upper)):
             low, high = -TURN / 2, TURN / 2
         limits = {"position_deg": _flow([low, high])} | limits

@@ -240,7 +240,11 @@ def _write_joint_trajectory(file: TextIO, joints: list[str], time: Array, q: Arr
 
 def _yaml_text(joint: str) -> str:
     """Return a name unchanged if YAML reads it as text, otherwise as a quoted JSON string, which YAML can read."""
-    return joint if re.fullmatch(r"[A-Za-z_][\w.-]*", joint) and joint.lower() not in _YAML_WORDS else json.dumps(joint)
+    return (
+        joint
+        if re.fullmatch(r"[A-Za-z_][\w.-]*", joint) and joint.lower() not in _YAML_WORDS
+        else json.dumps(joint, ensure_ascii=False)
+    )
 
 
 def _flow(values: Array) -> str:

@@ -234,6 +234,8 @@ def compare_records(simulated: Record, measured: Record) -> Comparison:
     CheckRefused
         If the measured run lifted wheels but the lifting cannot be computed for the simulated record.
     """
+    if "record_time" in simulated and "record_time" not in measured:
+        raise RecordError("the first record was measured on servos, the second was simulated; exchange them")
     for name in ("state", "record_time"):
         if name in measured and measured[name].shape != measured.time.shape:
             raise RecordError(
@@ -339,11 +341,12 @@ def _effort_errors(
         name = sensor if sensor in measured else quantity
         if any(n not in record or record[n].ndim != 2 for n, record in ((quantity, simulated), (name, measured))):
             continue
+        acting: dict[str, Array] = {}
         for column, joint in enumerate(measured.labels[name]):
-            data = np.asarray(measured[name][rows, column], dtype=np.float64)
-            label = labels.get(joint, joint)
-            if label not in simulated.labels[quantity] or not np.isfinite(data).any():
-                continue
+            data, label = np.asarray(measured[name][rows, column], dtype=np.float64), labels.get(joint, joint)
+            if label in simulated.labels[quantity] and np.isfinite(data).any():
+                acting[label] = acting.get(label, 0.0) + data  # both servos of a pair act on one joint
+        for label, data in acting.items():
             ours = simulated[quantity][:, simulated.labels[quantity].index(label)]
             pair = np.stack([np.interp(time - delay, own_time, ours), data])
             largest, when = _largest(pair[1] - pair[0], time)
