@@ -245,3 +245,10 @@ def test_an_imported_recording_is_replayed(
     measured = Record.load(tmp_path / "out" / "measured.h5")
     moved = measured["record_time"] > 0.5
     assert np.nanmax(np.abs(measured["q"] - measured["q_goal"])[moved]) < 0.1
+
+
+def test_a_name_of_the_map_may_contain_a_slash(tmp_path: Path, write: Callable[..., Path]) -> None:
+    (tmp_path / "map.yaml").write_text(MAP.replace("  lift:", "  left/lift:"), encoding="utf-8")
+    path = write(demonstration(), "time [s],pan [rad],left/lift [rad]")
+    record, *_ = import_motion(path, load_servo_map(tmp_path / "map.yaml"))
+    assert record.labels["q"] == ("pan", "left/lift")

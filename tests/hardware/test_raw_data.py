@@ -8,8 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.messages import raises
 
 from dynsim import cli
+from dynsim.errors import RecordError
 from dynsim.hardware.bus.control_table import MX_106, RAW_BLOCK, STATE_BLOCK
 from dynsim.hardware.replay.check import plan_cycle
 from dynsim.hardware.replay.compare import compare_records
@@ -137,3 +139,20 @@ def test_a_joint_with_a_label_is_compared_by_its_label(rig: Rig) -> None:
     assert [(error.joint, error.quantity) for error in compare_records(simulated, measured).efforts] == [
         ("joint_2", "torque")
     ]
+
+
+def test_the_torques_of_a_pair_act_together(rig: Rig) -> None:
+    measured = rig.run().result.record
+    measured.provenance = {**measured.provenance, "labels": {"elbow": "shoulder"}}
+    simulated = Record(np.linspace(0.0, 1.0, 101))
+    simulated.add("q", np.zeros((101, 2)), "rad", labels=("shoulder", "elbow"))
+    simulated.add("torque", np.zeros((101, 1)), "N m", labels=("shoulder",))
+    (error,) = compare_records(simulated, measured).efforts
+    rows = (measured["state"] == 5) & (measured["record_time"] >= 0.0) & (measured["record_time"] <= 1.0)
+    both = measured["torque_estimate"][rows, :2].sum(axis=1)
+    assert error.measured_rms == pytest.approx(np.sqrt(np.nanmean(both**2)), rel=1e-9)
+
+
+def test_exchanged_records_are_refused(rig: Rig) -> None:
+    with raises(RecordError, "first record", "exchange"):
+        compare_records(rig.run().result.record, rig.record)
