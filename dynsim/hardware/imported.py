@@ -168,7 +168,8 @@ def import_motion(
         if value is not None and not low <= value <= high:
             raise RecordError(f"{name} must be from {low:g} to {high:g} Hz, got {value:g}")
     recording = _read(path, servo_map, topic, trust)
-    servos = [servo for servo in servo_map.servos if servo.hold_at is None]
+    # The second servo of a pair follows the same column.
+    servos = [servo for servo in servo_map.servos if servo.hold_at is None and servo.joint == servo.axle]
     _check_columns(recording, servos)
     joints = [_smoothed(recording, servo, unit, bandwidth) for servo in servos]
     start, end = max(joint.start for joint in joints), min(joint.end for joint in joints)

@@ -532,7 +532,7 @@ def test_command(
     drawn: list[tuple[list[str], Path]] = []
     monkeypatch.setattr(commands, "draw", lambda figures, quiet: drawn.append((list(figures.records), figures.folder)))
     assert run(monkeypatch, "plot", tmp_path / "all", "--out", tmp_path / "figures") == 0
-    assert [folder.name for _, folder in drawn] == ["two_elbows", "two_elbows_2", "figures"]
+    assert [folder.name for _, folder in drawn] == ["figures", "two_elbows", "two_elbows_2"]
     assert run(monkeypatch, "plot", tmp_path / "all" / "a") == 0
     assert drawn[-1] == (["two_elbows"], tmp_path / "all" / "a" / "figures")
     # The same folders elsewhere.

@@ -13,6 +13,7 @@ from support.messages import raises
 from dynsim import cli
 from dynsim.errors import CheckRefused
 from dynsim.hardware.errors import ServoMapError
+from dynsim.hardware.imported import import_motion
 from dynsim.hardware.replay.check import check_motion
 from dynsim.hardware.replay.output import ReplayState
 from dynsim.hardware.replay.rules import Cause
@@ -72,6 +73,22 @@ def test_a_pair_moves_in_step(robot: Callable[..., Rig]) -> None:
     assert record.labels["q"] == ("pan",), "one column for the joint"
     assert record.labels["torque_estimate"] == ("pan", "pan.pair")
     assert record["q"].max() == pytest.approx(0.8, abs=0.01)
+
+
+def test_a_recording_has_one_column_for_a_pair(robot: Callable[..., Rig], tmp_path: Path) -> None:
+    rig = robot(MAP)
+    ticks = [f"{time:.3f},{2048 + 500 * np.sin(np.pi * time / 4) ** 2:.0f}" for time in np.arange(0.0, 4.0, 0.02)]
+    (tmp_path / "ticks.csv").write_text("\n".join(["time [s],pan [tick]", *ticks]) + "\n", encoding="utf-8")
+    record, *_ = import_motion(tmp_path / "ticks.csv", rig.map)
+    assert record.labels["q"] == ("pan",)
+    assert record["q"].max() == pytest.approx(500 * 2 * np.pi / 4096, abs=2e-3)
+
+
+def test_the_torque_limit_holds_for_each_servo_of_a_pair(robot: Callable[..., Rig]) -> None:
+    rig = robot(MAP.replace("velocity: v}", "velocity: v, torque: torque}"))
+    rig.record.add("torque", np.full((len(rig.record), 1), 2.0), "N m", labels=("pan",))
+    (margin,) = [margin for margin in check_motion(rig.record, rig.map).margins if margin.quantity == "torque"]
+    assert margin.value == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize("id_", [1, 2])

@@ -30,7 +30,7 @@ PHRASES = {
     "reference": "its reference",
     "saved part": "up to the stop",
     "sent": "was sent",
-    "sweep table": "sweep.csv lists the reasons",
+    "sweep table": "lists the reasons",
     "takes": "seconds to two minutes",
     "unconfirmed": "NOT confirmed",
     "simulation gone": "the process of the simulation has ended",

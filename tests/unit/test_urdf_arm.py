@@ -135,6 +135,17 @@ def bracket(scenario: Path) -> Path:
     return scenario
 
 
+def test_the_mass_of_a_motor_is_in_the_frame_of_the_link_before_its_joint(bracket: Path):
+    """Also if that link is fixed to a body and turned: it acts as a payload there."""
+    motor = {"type": "torque", "mass_kg": 1.5, "mass_point_m": [0.1, 0.2, 0.3]}
+    with_motor = build_model(load_scenario(bracket, overrides={"plant.motors": {"flap_hinge": motor}}))
+    payload = {"type": "payload", "body": "bracket", "mass_kg": 1.5, "point_m": [0.1, 0.2, 0.3]}
+    with_payload = build_model(load_scenario(bracket, overrides={"loads.motor": payload}))
+    q = np.array([0.1, 0.7, 0.7])
+    assert with_motor.mass_matrix(q) == pytest.approx(with_payload.mass_matrix(q), rel=1e-12)
+    assert with_motor.bias_forces(q, q) == pytest.approx(with_payload.bias_forces(q, q), rel=1e-12)
+
+
 def test_coupled_joints_are_locked_by_the_scenario(bracket: Path):
     assert build_model(load_scenario(bracket)).joint_names == ("slide", "hinge", "flap_hinge")
     model = build_model(load_scenario(bracket, overrides={"plant.lock_deg": {"flap_hinge": 30}}))

@@ -77,11 +77,6 @@ def test_joints_start_at_the_legal_position_nearest_to_zero(case: Path, law: str
     assert mentions(line, "knee", "-51.5662 deg", "finger", "0.02 m")
 
 
-def test_a_locked_follower_is_warned_of(case: Path):
-    with warns(UserWarning, "'other' is locked and does not follow 'finger'"):
-        model(case, {"plant.lock_m": {"other": -0.03}})
-
-
 @pytest.mark.parametrize("law", ["bilateral", "unilateral"])
 def test_illegal_start_positions_are_listed_at_once(case: Path, law: str):
     start = {"plant.initial_deg": {"knee": 10}, "plant.initial_m": {"finger": 0.0}, "contacts.law": law}

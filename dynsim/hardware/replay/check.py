@@ -421,7 +421,9 @@ def _torque_margins(record: Record, servo_map: ServoMap) -> Iterator[Margin]:
         signal = servo.kind.follows.torque
         if signal is None or servo.hold_at is not None or servo.joint != servo.axle:
             continue
-        torque = column_of(record, signal, servo, "N m")
+        # The limit holds for each servo of a pair.
+        count = sum(other.axle == servo.axle for other in servo_map.servos)
+        torque = column_of(record, signal, servo, "N m") / count
         highest = int(np.abs(torque).argmax())
         value, limit = float(torque[highest]), servo.kind.limits.torque
         time = float(record.time[highest] - record.time[0])

@@ -951,11 +951,6 @@ def read_urdf(path: Path, lock: Mapping[str, float] | None = None, corrections: 
                 tree.findings.problems.append(tree.error(joint.line, text))
     tree.findings.check()
     _warn(locked, places, links, {link.name for link, old in zip(links, stated, strict=True) if link is not old})
-    for name in lock or {}:
-        coupling = tree.joints[name].coupling
-        if coupling is not None and locked.joints[coupling.leader].kind in MOVING:
-            text = f"{path}: joint {name!r} is locked and does not follow {coupling.leader!r}"
-            warnings.warn(f"{text}; to lock both, lock the leader", stacklevel=2)
     hand = _hand(tree, places)
     return Robot(
         name=tree.name,
