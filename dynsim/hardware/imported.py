@@ -358,9 +358,11 @@ def _read_record(path: Path, servo_map: ServoMap, trust: bool) -> Recording:
     for name in dict.fromkeys(servo.kind.follows.position for servo in servo_map.servos):
         if name not in record or record[name].ndim != 2 or record.signals[name].axis != TIME:
             continue
-        if record.units[name] != "rad":
-            raise RecordError(f"{path}: signal {name!r} has unit {record.units[name]!r}; an import requires 'rad'")
         for label, column in zip(record.labels[name], record[name].T, strict=True):
+            if (own := record.unit_of(name, label)) != "rad":
+                if any(servo.label == label for servo in servo_map.servos):
+                    raise RecordError(f"{path}: {label} has unit {own!r}; an import requires 'rad'")
+                continue
             known = np.flatnonzero(np.isfinite(column))
             joints[label] = RecordedSamples("rad", record.time[known].tolist(), column[known].tolist(), known.tolist())
     return Recording(path, ": sample ", joints)

@@ -13,7 +13,7 @@ from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
 
 from dynsim.errors import CheckRefused
-from dynsim.hardware.bus.control_table import MODELS, SINGLE_TURN, TICKS_PER_TURN
+from dynsim.hardware.bus.control_table import MODELS, RAD_S_PER_UNIT, SINGLE_TURN, TICKS_PER_TURN
 from dynsim.hardware.errors import ServoMapError
 from dynsim.hardware.replay.check import plan_cycle
 from dynsim.hardware.servo_map import Supply, load_servo_map, rounded_up
@@ -128,8 +128,9 @@ def _kind(link: Link, name: str, wheel: bool) -> tuple[dict[str, Any], int]:
     sheet = MODELS[name]
     # Some vendors write 0 for an unknown limit.
     speed, torque = link.velocity_limit or math.inf, link.effort_limit or math.inf
+    speed = min(speed, sheet.no_load_speed, sheet.fields["velocity_limit"].default * RAD_S_PER_UNIT)
     limits: dict[str, Any] = {
-        "velocity": max(math.floor(100 * min(speed, sheet.no_load_speed)) / 100, 0.01),
+        "velocity": max(math.floor(100 * speed) / 100, 0.01),
         "torque": max(float(f"{min(torque, TORQUE * sheet.stall_torque):.2g}"), rounded_up(sheet.torque(1))),
     }
     mode, zero = "velocity", TICKS_PER_TURN // 2

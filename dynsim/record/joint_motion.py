@@ -216,7 +216,7 @@ def _in_both(record: Record, name: str, rate: str) -> list[str]:
 
 def _write_csv(record: Record, file: TextIO, joints: list[str], time: Array, q: Array, v: Array) -> None:
     units = {
-        joint: (record.units[name], record.units[rate])
+        joint: (record.unit_of(name, joint), record.unit_of(rate, joint))
         for name, rate in reversed(RATES.items())
         if name in record and rate in record
         for joint in _in_both(record, name, rate)

@@ -346,6 +346,26 @@ class Record(Content):
         """Unit of every signal."""
         return Entries("signal", {name: signal.unit for name, signal in self.signals.items()})
 
+    def unit_of(self, signal: str, label: str) -> str:
+        """Return the unit of one column of a signal.
+
+        A signal of revolute and prismatic joints has the unit "rad or m", for example; the scene has the kinds of the
+        joints.
+
+        Examples
+        --------
+        >>> import dynsim
+        >>> record = dynsim.Record([0.0, 1.0])
+        >>> record.add("q", [[0.0], [1.0]], "rad", labels=("elbow",))
+        >>> record.unit_of("q", "elbow")
+        'rad'
+        """
+        unit = self.units[signal]
+        bodies = () if self.scene is None or " or " not in unit else self.scene.bodies
+        kind = next((body.joint.kind for body in bodies if label in body.joint.labels), "")
+        units = {"revolute": ("rad", "rad/s", "N m"), "prismatic": ("m", "m/s", "N")}.get(kind, ())
+        return next((own for own in unit.split(" or ") if own in units), unit)
+
     @property
     def labels(self) -> dict[str, tuple[str, ...]]:
         """Column names of every signal."""

@@ -46,6 +46,8 @@ OK, REFUSED, INTERRUPTED = "ok", "refused", "interrupted"
 FAILURES = TRACEBACK, HANG, CRASH, LOSS, MESSAGE, FILES, NUMBERS, LARGE = (
     "traceback", "hang", "crash", "silent loss", "unclear error", "files changed", "not finite", "memory",
 )  # fmt: skip
+# Errors of commands that have written tables with the reasons.
+EXPLAINED = ("sweep table", "no posture", "no forces")
 READY = "ready"
 # Memory of a worker in addition to its memory after all imports [bytes].
 MEMORY = 4 << 30
@@ -105,7 +107,7 @@ def _run_case(case: Draft, folder: Path, limit: float) -> Outcome:
         after = _snapshot(folder)
         replays = command[:2] in (["hw", "replay"], ["hw", "compare"], ["hw", "recover"])
         reads_only = (
-            (ended.outcome == REFUSED and not replays and not says(ended.detail, "sweep table"))
+            (ended.outcome == REFUSED and not replays and not any(says(ended.detail, phrase) for phrase in EXPLAINED))
             or command[0] == "check"
             or (command[0] == "hw" and not replays)
         )

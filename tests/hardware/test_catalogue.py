@@ -21,6 +21,7 @@ from dynsim.hardware.servo_map import load_servo_map
 from dynsim.hardware.virtual.simulated_plant import MotorLaw, SimulatedArm
 from dynsim.library import families
 from dynsim.model.drives import Servo
+from dynsim.record.joint_motion import export_record
 from dynsim.scenario import build
 
 from .conftest import Rig
@@ -93,6 +94,19 @@ def test_a_drafted_map_replays_its_scenario(arm: Path, tmp_path: Path) -> None:
     run = Rig(servo_map, record, dict(zip(servo_map.joints, record["q"][0].tolist(), strict=True))).run()
     assert run.result.fault is None
     assert np.nanmax(np.abs(run.result.record["q"][:, 1])) > math.radians(30)
+
+
+def test_a_record_with_a_prismatic_joint_is_replayed(tmp_path: Path) -> None:
+    """The unit of its positions is "rad or m"; the scene has the kinds of the joints."""
+    record = simulate(load_scenario("sampled_arm", "servos", {"duration_s": 0.1, "metrics.settle_s": 0}))
+    assert record.units["q"] == "rad or m"
+    assert [record.unit_of("q", joint) for joint in record.labels["q"]] == ["m", *["rad"] * 4]
+    header = export_record(record, tmp_path / "q.csv", "csv").read_text().partition("\n")[0]
+    assert header.startswith("time [s],joint_1 [m],joint_2 [rad]")
+    assert "joint_1 [m/s],joint_2 [rad/s]" in header
+    (tmp_path / "map.yaml").write_text(draft_map(load_scenario("sampled_arm", "servos"), "MX-106"), encoding="utf-8")
+    checked = check_motion(record, load_servo_map(tmp_path / "map.yaml"))
+    assert "joint_1" in " ".join(checked.warnings)
 
 
 def test_a_draft_names_motors_without_servo_model(arm: Path) -> None:

@@ -377,9 +377,9 @@ def _common_angles(simulated: Record, measured: Record) -> list[tuple[str, Array
     offsets = _lifting(simulated, measured)
     pairs = []
     for name, signal in simulated.signals.items():
-        if signal.unit != "rad" or name not in measured or name == WHEEL_ANGLE:
+        if "rad" not in signal.unit.split(" or ") or name not in measured or name == WHEEL_ANGLE:
             continue
-        shared = _columns(simulated, measured, name)
+        shared = [entry for entry in _columns(simulated, measured, name) if simulated.unit_of(name, entry[0]) == "rad"]
         pairs += [(label, ours + offsets.pop(label, 0.0), theirs) for label, ours, theirs in shared]
         for label in [label for label in offsets if label in measured.labels[name]]:
             data = np.asarray(measured[name][:, measured.labels[name].index(label)], dtype=np.float64)

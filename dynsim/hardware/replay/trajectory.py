@@ -455,8 +455,8 @@ def column_of(record: Record, signal: str, servo: MappedServo, unit: str) -> Arr
             f"{servo.entry}: unknown column {servo.label!r} of {signal!r}; "
             f"columns: {', '.join(labels)}{suggest(servo.label, labels)}"
         )
-    if record.units[signal] != unit:
-        raise CheckRefused(f"signal {signal!r} has unit {record.units[signal]!r}; {servo.joint} requires {unit!r}")
+    if (own := record.unit_of(signal, servo.label)) != unit:
+        raise CheckRefused(f"signal {signal!r} of {servo.label} has unit {own!r}; {servo.joint} requires {unit!r}")
     if record[signal].ndim != 2:
         raise CheckRefused(f"signal {signal!r} must have one column per joint, got shape {record[signal].shape}")
     if record.signals[signal].axis != TIME:
