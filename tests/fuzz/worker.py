@@ -47,7 +47,7 @@ FAILURES = TRACEBACK, HANG, CRASH, LOSS, MESSAGE, FILES, NUMBERS, LARGE = (
     "traceback", "hang", "crash", "silent loss", "unclear error", "files changed", "not finite", "memory",
 )  # fmt: skip
 # Errors of commands that have written tables with the reasons.
-EXPLAINED = ("sweep table", "no posture", "no forces")
+EXPLAINED = ("sweep table", "no plan")
 READY = "ready"
 # Memory of a worker in addition to its memory after all imports [bytes].
 MEMORY = 4 << 30

@@ -24,6 +24,7 @@ PHRASES = {
     "late answers": "earlier requests",
     "no browser": "No browser",
     "no forces": "the motion needs forces",
+    "no plan": "no plan: ",
     "no posture": "could be projected onto the hand path",
     "output failed": " failed: ",
     "pulls": "pulls on this brace",
