@@ -322,7 +322,7 @@ def _staged(ended: Ended, stages: Stages) -> Iterator[None]:
         patch.setattr(ports, "line_for_map", line)
         patch.setattr(ports, "VirtualPort", lambda line, clock, baud: make_port(line, ended.clock, baud=baud))
         patch.setattr(ports, "VirtualClock", lambda: ended.clock)
-        patch.setattr(ports, "Clock", lambda origin: ended.clock)
+        patch.setattr(ports, "PacedClock", lambda: ended.clock)
         patch.setattr(follower, "SimulationProcess", Simulation)
         yield
 
