@@ -134,8 +134,15 @@ def test_a_signal_saves_what_was_simulated(tmp_path: Path, number: signal.Signal
     assert says(record.summary["warnings"][-1], "incomplete")
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=lambda number: number.name)
-@pytest.mark.parametrize("jobs", ["1", "2"])
+@pytest.mark.parametrize(
+    ("number", "jobs"),
+    [
+        (signal.SIGINT, "1"),
+        (signal.SIGTERM, "2"),
+        pytest.param(signal.SIGTERM, "1", marks=SLOW),
+        pytest.param(signal.SIGINT, "2", marks=SLOW),
+    ],
+)
 def test_a_signal_ends_runs_whose_steps_do_not(tmp_path: Path, number: signal.Signals, jobs: str):
     """What was recorded before is saved, and no process is left in its step."""
     arguments = ["compare", "elbow_comparison_floor", "--jobs", jobs, *LONG, "--out", "out"]

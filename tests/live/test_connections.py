@@ -63,7 +63,7 @@ server.stop()
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("descriptors", [20, 200])
+@pytest.mark.parametrize("descriptors", [20, pytest.param(200, marks=pytest.mark.slow)])
 def test_idle_connections_delay_the_page_and_are_one_line_of_log(descriptors: int) -> None:
     """Also when the process has too few file descriptors for them."""
     command = [sys.executable, "-c", FLOOD, "150", str(descriptors)]

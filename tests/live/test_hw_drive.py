@@ -194,7 +194,7 @@ def dynsim(*arguments: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
 
 
-@pytest.mark.parametrize("how", ["silent", "gone"])
+@pytest.mark.parametrize("how", ["silent", pytest.param("gone", marks=pytest.mark.slow)])
 def test_a_pilot_who_says_nothing_stops_the_servos(drives: Callable[..., Drive], how: str) -> None:
     drive = drives()
     client = drive.begin()

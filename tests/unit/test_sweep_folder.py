@@ -242,7 +242,7 @@ ARGUMENTS += ["--set", "duration_s=0.01", "--set", "metrics.settle_s=0"]
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no limits there")
-@pytest.mark.parametrize("jobs", ["1", pytest.param("2", marks=pytest.mark.long)])
+@pytest.mark.parametrize("jobs", ["1", pytest.param("2", marks=pytest.mark.slow)])
 def test_a_file_that_may_not_grow_is_named_and_no_run_is_lost(tmp_path: Path, jobs: str):
     """Room for some runs, as on a disk that fills up."""
     command = [sys.executable, "-c", LIMITED, "6000", *ARGUMENTS, "--jobs", jobs]
