@@ -48,9 +48,11 @@ from dynsim.cli.tables import (
     labelled,
     print_choices,
     print_comparison,
+    print_error,
     print_line,
     print_starts,
     print_summary,
+    print_warning,
     print_written,
     progress,
     record_files,
@@ -59,7 +61,7 @@ from dynsim.cli.tables import (
 from dynsim.cli.teleop import teleop
 from dynsim.config import completion
 from dynsim.errors import DynsimError, RecordError, SimulationInterrupted, SimulationStopped
-from dynsim.system.terminal import escaped, escaped_problem
+from dynsim.system.terminal import escaped
 
 if TYPE_CHECKING:
     from dynsim.engine import Start
@@ -224,7 +226,7 @@ def check(
             failed = True
             # Print the start positions, because they help the user to find the error.
             print_starts(console, starts)
-            errors.print(f"[red]error:[/] {escaped_problem(error)}")
+            print_error(error)
         else:
             count = f"{len(variants)} variants" if len(variants) > 1 else "1 variant"
             print_line(f"{escaped(name)}: ok ({count})")
@@ -292,4 +294,4 @@ def _warn_about_plugins() -> None:
     from dynsim.library.families import faults
 
     for fault in faults():
-        errors.print(f"[yellow]warning:[/] {escaped(fault)}")
+        print_warning(fault)

@@ -15,7 +15,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from dynsim.cli.app import QuietOption, RecordsArgument, TrustOption, option
-from dynsim.cli.tables import console, drawing, errors, film_progress, labelled, print_line, print_written, record_files
+from dynsim.cli.tables import (
+    console,
+    drawing,
+    errors,
+    film_progress,
+    labelled,
+    print_line,
+    print_warning,
+    print_written,
+    record_files,
+)
 from dynsim.errors import RecordError
 from dynsim.system import interruption
 from dynsim.system.terminal import escaped
@@ -156,7 +166,7 @@ def warn_about_meshes(scenes: Iterable[Scene | None]) -> None:
     from dynsim.draw.geometry.meshes import mesh_notes
 
     for note in mesh_notes(scenes):
-        errors.print(f"[yellow]warning:[/] {escaped(note)}")
+        print_warning(note)
 
 
 def write_view(records: Mapping[str, Record], folder: Path, quiet: bool) -> Path | None:

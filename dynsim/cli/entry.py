@@ -14,10 +14,10 @@ from typing import Any
 import typer
 
 from dynsim.cli.commands import app
-from dynsim.cli.tables import errors
+from dynsim.cli.tables import print_error, print_warning
 from dynsim.errors import DynsimError, SimulationInterrupted
 from dynsim.system import interruption
-from dynsim.system.terminal import escaped_problem, lenient_streams
+from dynsim.system.terminal import lenient_streams
 
 
 def main(received: Sequence[int]) -> None:
@@ -58,7 +58,7 @@ def _exit_code() -> int:
         return SimulationInterrupted.exit_code
     else:
         return 0
-    errors.print(f"[red]error:[/] {escaped_problem(problem)}")
+    print_error(problem)
     return code
 
 
@@ -88,7 +88,7 @@ def _explain_lost_output(failure: OSError) -> int:
     """Return the exit code after a failed write to stdout; a closed pipe (``| head``) is not reported as an error."""
     if failure.errno == errno.EPIPE:
         return interruption.exit_code([signal.SIGPIPE]) if hasattr(signal, "SIGPIPE") else 1
-    errors.print(f"[red]error:[/] cannot write to standard output ({failure.strerror})")
+    print_error(f"cannot write to standard output ({failure.strerror})")
     return DynsimError.exit_code
 
 
@@ -99,7 +99,7 @@ def _plain_warnings() -> Iterator[None]:
 
     def show(message: Warning | str, category: type[Warning], *location: Any, **options: Any) -> None:
         if issubclass(category, UserWarning):
-            errors.print(f"[yellow]warning:[/] {escaped_problem(message)}")
+            print_warning(message)
         elif not issubclass(category, RuntimeWarning):  # of numpy; results that are not finite have errors of their own
             shown(message, category, *location, **options)
 

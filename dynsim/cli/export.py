@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 import typer
 
 from dynsim.cli.app import SetOption, TrustOption, VariantOption, parsed_overrides
-from dynsim.cli.tables import console, errors, print_line
+from dynsim.cli.tables import console, print_line, print_warning
 from dynsim.errors import DynsimError, RecordError, ScenarioError, first_few
 from dynsim.system.terminal import escaped
 
@@ -135,7 +135,7 @@ def _export_mjcf(scenario: Scenario, target: Path, touching: bool, check: bool) 
     except DynsimError as error:
         if check:
             raise
-        _warn(f"the scenario cannot run, so that its controller is not exported: {error}")
+        print_warning(f"the scenario cannot run, so that its controller is not exported: {error}")
     if prepared is not None and check:
         mujoco_check.mujoco_for(prepared)
     contacts = build.contacts(scenario, model.robot) if prepared is None else prepared.contacts
@@ -144,7 +144,7 @@ def _export_mjcf(scenario: Scenario, target: Path, touching: bool, check: bool) 
         joints = [motor.joint for motor in model.robot.motors]
         gains = dict(zip(joints, zip(control.k_p.tolist(), control.k_d.tolist(), strict=True), strict=True))
         for text in mujoco_check.omissions(scenario, prepared, touching):
-            _warn(text)
+            print_warning(text)
     files, contents = _stl_files(scenario, _shapes(model.robot), f"{target.name.split('.')[0]}_meshes")
     text = model.to_mjcf(contacts, build.surfaces(scenario), gains=gains, meshes=files, touching=touching)
     for name, content in contents.items():
@@ -173,7 +173,7 @@ def _stl_files(scenario: Scenario, shapes: Iterable[Shape], folder: str) -> tupl
         try:
             (mesh,) = simplified([welded(read_mesh(path))], MUJOCO_TRIANGLES)
         except (RecordError, ValueError) as error:
-            _warn(f"{error}; this mesh is omitted")
+            print_warning(f"{error}; this mesh is omitted")
             continue
         paths[name] = f"{folder}/mesh_{len(paths) + 1}.stl"
         contents[paths[name]] = stl_bytes(mesh)
@@ -187,12 +187,8 @@ def _mesh_paths(scene: Scene, shapes: Iterable[Shape], otherwise: str) -> dict[s
     names = dict.fromkeys(shape.file for shape in shapes if shape.kind == "mesh")
     paths = mesh_paths(scene, names)
     if missing := [name for name in names if name not in paths]:
-        _warn(f"meshes not found: {first_few(missing)}; {otherwise}")
+        print_warning(f"meshes not found: {first_few(missing)}; {otherwise}")
     return paths
-
-
-def _warn(text: str) -> None:
-    errors.print(f"[yellow]warning:[/] {escaped(text)}")
 
 
 def _shapes(robot: Robot) -> list[Shape]:

@@ -14,7 +14,7 @@ from rich.table import Table
 
 from dynsim.cli.app import QuietOption, ScenarioArgument, SetOption, TrustOption, parsed_overrides
 from dynsim.cli.drawing import write_view
-from dynsim.cli.tables import errors
+from dynsim.cli.tables import print_error
 from dynsim.cli.teleop import (
     BaseSpeedOption,
     HttpPortOption,
@@ -33,7 +33,7 @@ from dynsim.errors import DynsimError, RecordError
 from dynsim.hardware.errors import ReplayInterrupted, ServoMapError, VerificationFailed
 from dynsim.system import interruption
 from dynsim.system.files import file_name, json_text, write_json
-from dynsim.system.terminal import Terminal, escaped_problem, plain
+from dynsim.system.terminal import Terminal, plain
 
 if TYPE_CHECKING:
     from dynsim.hardware.bus.protocol import Bus, Clock
@@ -627,7 +627,7 @@ def hw_drive(
         if isinstance(done, DynsimError):
             if error is None:
                 raise done
-            errors.print(f"[red]error:[/] {escaped_problem(done)}")
+            print_error(done)
             raise error
     if result is not None and not quiet:
         print_timing(result)
@@ -641,7 +641,7 @@ def hw_drive(
     if error is None and not quiet:
         print_replay(result, "driven", folder / SERVOS, folder / "record.h5")
     if error is not None and done.failure is not None:
-        errors.print(f"[red]error:[/] simulation: {escaped_problem(done.failure)}")
+        print_error(f"simulation: {done.failure}")
     if failure := error or done.failure:
         raise failure
 

@@ -21,7 +21,7 @@ from dynsim.cli.app import (
     option,
     parsed_overrides,
 )
-from dynsim.cli.tables import drawing, errors, print_line, sweep_progress
+from dynsim.cli.tables import drawing, errors, print_line, print_warning, sweep_progress
 from dynsim.errors import ScenarioError, SimulationStopped
 from dynsim.system.terminal import escaped
 
@@ -154,9 +154,9 @@ def _warn_about_unknown(row: SweepRow, plotted: Sequence[str]) -> None:
 
     for number in plotted:
         if number not in row.numbers:
-            named = f" ({escaped(row.variant)})" if row.variant else ""
-            errors.print(
-                f"[yellow]warning:[/] --plot {escaped(number)}: run {row.run}{named} has no such number"
+            named = f" ({row.variant})" if row.variant else ""
+            print_warning(
+                f"--plot {number}: run {row.run}{named} has no such number"
                 f"{suggest(number, row.numbers)}; to change it, press Ctrl-C and use --resume with another --plot"
             )
 

@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.table import Table
 
 from dynsim.errors import RecordError
-from dynsim.system.terminal import Terminal, escaped, escaped_line, plain
+from dynsim.system.terminal import Terminal, escaped, escaped_line, escaped_problem, plain
 
 if TYPE_CHECKING:
     import numpy as np
@@ -381,6 +381,16 @@ def _print_warnings(console: Console, summaries: Mapping[str, Summary]) -> None:
 # No emoji: rich would replace ":b:" in a path or key.
 console = Terminal(emoji=False)
 errors = Terminal(stderr=True, soft_wrap=True, highlight=False, emoji=False)
+
+
+def print_error(text: object) -> None:
+    """Print an error to standard error, as one line and its indented continuation; the text is escaped here."""
+    errors.print(f"[red]error:[/] {escaped_problem(text)}")
+
+
+def print_warning(text: object) -> None:
+    """Print a warning to standard error as :func:`print_error` prints an error."""
+    errors.print(f"[yellow]warning:[/] {escaped_problem(text)}")
 
 
 def print_line(text: str) -> None:
