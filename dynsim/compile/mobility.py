@@ -165,10 +165,8 @@ def without_inertia(model: Model, q: Array) -> list[tuple[int, list[int]]]:
     none = (felt <= np.maximum(NOTHING * about_joint, rounding)) & (known | (about_joint == 0.0))
     last = [k for k in np.flatnonzero(none).tolist() if np.count_nonzero(none & behind[k]) == 1]
     bodies = behind & np.array([link.name not in model.robot.carriers for link in links])
-    return [
-        (k, np.flatnonzero(bodies[k] & (mass > 0.0) if (bodies[k] & (mass > 0.0)).any() else bodies[k]).tolist())
-        for k in last
-    ]
+    massive = bodies & (mass > 0.0)
+    return [(k, np.flatnonzero(massive[k] if massive[k].any() else bodies[k]).tolist()) for k in last]
 
 
 def moving_nothing(model: Model, q: Array) -> str:

@@ -169,17 +169,17 @@ def _limit(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
 
 
-def shapes(link: Link) -> tuple[Shape, ...]:
-    """Return the shapes of a link's body or, if it has no shapes, the cylinder about its axis."""
-    return link.shapes or _rod(link)
+def shapes(link: Link, rod: Literal["cylinder", "capsule"] = "cylinder") -> tuple[Shape, ...]:
+    """Return the shapes of a link's body or, if it has no shapes, the cylinder or capsule about its axis."""
+    return link.shapes or _rod(link, rod)
 
 
 def with_shapes(robot: Robot, rod: Literal["cylinder", "capsule"] = "cylinder") -> Robot:
     """Return the robot with the drawn shapes added to its links; ``rod`` is the shape of links without shapes."""
-    return replace(robot, links=tuple(replace(link, shapes=link.shapes or _rod(link, rod)) for link in robot.links))
+    return replace(robot, links=tuple(replace(link, shapes=shapes(link, rod)) for link in robot.links))
 
 
-def _rod(link: Link, kind: Literal["cylinder", "capsule"] = "cylinder") -> tuple[Shape, ...]:
+def _rod(link: Link, kind: Literal["cylinder", "capsule"]) -> tuple[Shape, ...]:
     """Return the cylinder or capsule about the body's axis; empty if its radius or end is unknown."""
     if link.tip is None or not link.radius > 0.0:
         return ()

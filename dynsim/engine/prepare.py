@@ -286,7 +286,9 @@ def prepare(
         loads = [*loads, *pushes]
     n, na, c = model.n, len(robot.motors), len(contacts)
     real = scenario.config.contacts.law == "unilateral"
-    stops = joint_stops(robot)[: None if real else 0]
+    stops = joint_stops(robot)  # also checks the start, under both laws
+    if not real:
+        stops = []
     stepped = scenario.integrator.method == "time_stepping"
     dry = dry_frictions(robot) if real else []
     watched = real and bool(contacts or stops or dry)

@@ -37,8 +37,8 @@ def export_record(
 ) -> Path:
     """Write the joint positions and rates of a record.
 
-    ``csv``: one row per sample, columns "time [s]", "<joint> [rad]", "<joint> [rad/s]", with the units of the record
-    ("rad or m" if it has both kinds of joints). ``joint-trajectory``: the fields of a ROS
+    ``csv``: one row per sample, columns "time [s]", "<joint> [rad]", "<joint> [rad/s]", with the units of each
+    joint. ``joint-trajectory``: the fields of a ROS
     trajectory_msgs/JointTrajectory as YAML, for a joint trajectory controller; it starts and ends at rest, if necessary
     after a run-up and with a run-out of constant acceleration. ``urdf-log``: one JSON object per line, {"time",
     "position": {joint: rad or m}, "velocity": {joint: rad/s or m/s}}, with the joint names of the URDF.

@@ -57,23 +57,19 @@ def test_a_replay_keeps_its_cycle(servos: Servos, world: str) -> None:
         assert (ended.returncode, lost) == (0, {}), ended.stderr
 
 
+def replay_in(folder: Path) -> list[str]:
+    """Write a record and a map, and return the command that replays the record to the folder ``o``."""
+    swing().save(folder / "rig.h5")
+    (folder / "rig.yaml").write_text(MAP, encoding="utf-8")
+    words = ("replay", folder / "rig.h5", "--map", folder / "rig.yaml", "--port", "virtual", "--out", folder / "o")
+    return command("hw", *words)
+
+
 def test_a_replay_with_blocked_output_ends_at_ctrl_c(tmp_path: Path) -> None:
-    swing().save(tmp_path / "rig.h5")
-    (tmp_path / "rig.yaml").write_text(MAP, encoding="utf-8")
     reader, writer = os.pipe()
     fcntl.fcntl(reader, fcntl.F_SETPIPE_SZ, 4096)
     fill(reader)
-    words = (
-        "replay",
-        tmp_path / "rig.h5",
-        "--map",
-        tmp_path / "rig.yaml",
-        "--port",
-        "virtual",
-        "--out",
-        tmp_path / "o",
-    )
-    process = subprocess.Popen(command("hw", *words), stdout=writer, stderr=writer, preexec_fn=prepare_child)
+    process = subprocess.Popen(replay_in(tmp_path), stdout=writer, stderr=writer, preexec_fn=prepare_child)
     os.close(writer)
     try:
         # The motion does not wait for the reader: all files are complete.
@@ -90,19 +86,7 @@ def test_a_replay_with_blocked_output_ends_at_ctrl_c(tmp_path: Path) -> None:
 
 def test_a_disk_that_becomes_full_leaves_the_end_state(tmp_path: Path) -> None:
     """The limit of file sizes leaves room for the summary, but not for the record."""
-    swing().save(tmp_path / "rig.h5")
-    (tmp_path / "rig.yaml").write_text(MAP, encoding="utf-8")
-    words = (
-        "replay",
-        tmp_path / "rig.h5",
-        "--map",
-        tmp_path / "rig.yaml",
-        "--port",
-        "virtual",
-        "--out",
-        tmp_path / "o",
-    )
-    line = " ".join(f"'{word}'" for word in command("hw", *words))
+    line = " ".join(f"'{word}'" for word in replay_in(tmp_path))
     script = f"ulimit -f 24; NUMBA_CACHE_DIR={tmp_path} exec {line}"
     ended = subprocess.run(["/bin/sh", "-c", script], capture_output=True, text=True, timeout=120, check=False)
     assert ended.returncode == 1, ended.stderr

@@ -213,14 +213,14 @@ class SimulatedArm:
                 servo,
                 mass=mass,
                 mass_point=point,
-                resistance=servo.resistance / labels.count(servo.joint),
-                armature=servo.armature * labels.count(servo.joint),
-                free_drag=servo.free_drag * labels.count(servo.joint),
-                coulomb_friction=float(friction[k]) * labels.count(servo.joint),
+                resistance=servo.resistance / count,
+                armature=servo.armature * count,
+                free_drag=servo.free_drag * count,
+                coulomb_friction=float(friction[k]) * count,
             )
             for k, servo in enumerate(self._law.servos(labels, np.abs(self._scale)))
             if labels.index(servo.joint) == k
-            for mass, point in [masses.get(servo.joint, (0.0, None))]
+            for count, (mass, point) in [(labels.count(servo.joint), masses.get(servo.joint, (0.0, None)))]
         ]
         self._first = [labels.index(label) for label in labels]
         bare = _plant_only(scenario)

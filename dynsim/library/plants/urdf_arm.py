@@ -19,7 +19,7 @@ from dynsim.model.drives import Drive
 from dynsim.system.inputs import is_file
 
 if TYPE_CHECKING:
-    from dynsim.model.urdf.reader import Corrections, UrdfTree
+    from dynsim.model.urdf.reader import Corrections
 
 ENGINE = "dynamics"
 
@@ -200,11 +200,10 @@ def build(config: Config, context: BuildContext) -> Robot:
         If the file is invalid (see :func:`dynsim.model.urdf.reader.read_urdf`), or the body of the hand does not
         exist.
     """
-    from dynsim.model.urdf.reader import read_tree, read_urdf
+    from dynsim.model.urdf.reader import read_urdf
 
     lock = {**{name: float(np.deg2rad(angle)) for name, angle in config.lock_deg.items()}, **config.lock_m}
-    robot = read_urdf(Path(config.file), lock, config.corrections())  # lists all problems of the file
-    tree = read_tree(Path(config.file), config.corrections())
+    robot = read_urdf(Path(config.file), lock, config.corrections())
     initial = {**{name: np.deg2rad(angle) for name, angle in config.initial_deg.items()}, **config.initial_m}
     stated: dict[str, dict[str, Any]] = {
         "revolute": {"damping": config.damping_N_m_s_per_rad, "friction": config.friction_N_m},
@@ -233,7 +232,7 @@ def build(config: Config, context: BuildContext) -> Robot:
         robot,
         links=links,
         motors=tuple(
-            _mounted(families.build("motor", motor, context.at_joint(joint), Drive), robot, tree)
+            _mounted(families.build("motor", motor, context.at_joint(joint), Drive), robot, config)
             for joint, motor in chosen.items()
             if motor is not None
         ),
@@ -249,11 +248,15 @@ def build(config: Config, context: BuildContext) -> Robot:
     )
 
 
-def _mounted(motor: Drive, robot: Robot, tree: UrdfTree) -> Drive:
+def _mounted(motor: Drive, robot: Robot, config: Config) -> Drive:
     """Return the motor with its mass in the axes of the body to which the link before its joint belongs."""
-    parent = tree.joints[motor.joint].link.parent
+    from dynsim.model.urdf.reader import read_tree
+
+    if motor.mass_point is None:
+        return motor
+    parent = read_tree(Path(config.file), config.corrections()).joints[motor.joint].parent
     frame = next((frame for frame in robot.frames if frame.name == parent), None)
-    if frame is None or motor.mass_point is None:
+    if frame is None:
         return motor
     return dataclasses.replace(motor, mass_point=frame.R @ motor.mass_point + frame.p)
 
