@@ -76,6 +76,15 @@ class FigureFormat(StrEnum):
     svg = "svg"
 
 
+SizeOption = Annotated[
+    str | None, option("WxH", "Width, or width and height, of the figures: 3.4, 3.4x2.4 [inch] or 86mm.")
+]
+FontOption = Annotated[
+    str | None, option("FONT", "Size of the letters [point], a font family, or both, e.g. 8 or 'serif 8'.")
+]
+StyleOption = Annotated[
+    str | None, option("SHEETS", "Matplotlib style sheets of the figures: files or names, comma-separated.")
+]
 FormatOption = Annotated[FigureFormat, typer.Option("--format", help="File format of the figures.")]
 
 

@@ -13,11 +13,14 @@ import typer
 from dynsim.cli.app import (
     FigureFormat,
     FiguresOption,
+    FontOption,
     FormatOption,
     QuietOption,
     RecordsArgument,
     ScenarioArgument,
     SetOption,
+    SizeOption,
+    StyleOption,
     TrustOption,
     VariantOption,
     app,
@@ -127,13 +130,18 @@ def compare(
     jobs: Annotated[int, option("N", "Number of worker processes.", min=1)] = 1,
     no_figures: FiguresOption = False,
     format_: FormatOption = FigureFormat.png,
+    size: SizeOption = None,
+    font: FontOption = None,
+    style: StyleOption = None,
     quiet: QuietOption = False,
 ) -> None:
     """Simulate all variants of a scenario and compare them in a table and figures."""
+    from dynsim.draw.figures.look import Look
     from dynsim.engine.recording import COMPARISON_FILES, RUN_FILES, save_run
     from dynsim.scenario import load_scenario, variant_names
     from dynsim.system.files import check_writable, discard
 
+    look = Look.of(size, font, style)
     values = parsed_overrides(overrides)
     loaded = [load_scenario(scenario, name, values) for name in variant_names(scenario)]
     folder = out or Path("results", loaded[0].name if loaded else "")
@@ -174,9 +182,10 @@ def compare(
         with interruptible_drawing(folder):
             if not no_figures:
                 wanted = [
-                    Figures({name: record}, folder / name / "figures", format_) for name, record in records.items()
+                    Figures({name: record}, folder / name / "figures", format_, look)
+                    for name, record in records.items()
                 ]
-                together = Figures(records, folder, format_, together=True)
+                together = Figures(records, folder, format_, look, together=True)
                 page = draw_all([together, *wanted], Page(records, folder), quiet)
         if not quiet:
             print_comparison(console, {name: record.summary for name, record in records.items()})
@@ -249,17 +258,25 @@ def plot(
     records: RecordsArgument,
     out: Annotated[Path | None, option("FOLDER", "Output folder; default: figures/ next to each record.")] = None,
     format_: FormatOption = FigureFormat.png,
+    size: SizeOption = None,
+    font: FontOption = None,
+    style: StyleOption = None,
+    no_title: Annotated[bool, typer.Option("--no-title", help="Omit the titles.")] = False,
+    no_caption: Annotated[bool, typer.Option("--no-caption", help="Omit the notes below the axes.")] = False,
     trust: TrustOption = False,
 ) -> None:
     """Draw the figures of one record, or of several records and their overlay."""
+    from dynsim.draw.figures.look import Look
+
+    look = Look.of(size, font, style, title=not no_title, caption=not no_caption)
     files = record_files(records)
     named = labelled(files, trust=trust)
     if len(named) > 1:  # before the single figures, because it rejects records that do not fit together
-        draw(Figures(named, out or Path("figures"), format_, together=True), quiet=False)
+        draw(Figures(named, out or Path("figures"), format_, look, together=True), quiet=False)
     for path, (label, record) in zip(files, named.items(), strict=True):
         folder = path.parent / "figures" if out is None else out if len(files) == 1 else out / label
         try:
-            draw(Figures({label: record}, folder, format_), quiet=False)
+            draw(Figures({label: record}, folder, format_, look), quiet=False)
         except RecordError as error:
             raise RecordError(f"{path}: {error}") from error
 

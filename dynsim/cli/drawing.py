@@ -31,6 +31,7 @@ from dynsim.system import interruption
 from dynsim.system.terminal import escaped
 
 if TYPE_CHECKING:
+    from dynsim.draw.figures.look import Look
     from dynsim.record import Record
     from dynsim.record.scene import Scene
 
@@ -42,6 +43,7 @@ class Figures:
     records: dict[str, Record]
     folder: Path
     kind: str
+    look: Look | None = None
     together: bool = False
 
     def draw(self) -> None:
@@ -49,10 +51,10 @@ class Figures:
         from dynsim.draw import figures
 
         if self.together:
-            figures.draw_comparison(self.records, self.folder, self.kind)
+            figures.draw_comparison(self.records, self.folder, self.kind, self.look)
         else:
             for record in self.records.values():
-                figures.draw(record, self.folder, self.kind)
+                figures.draw(record, self.folder, self.kind, self.look)
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,13 @@ import typer
 from dynsim.cli.app import (
     FigureFormat,
     FiguresOption,
+    FontOption,
     FormatOption,
     QuietOption,
     ScenarioArgument,
     SetOption,
+    SizeOption,
+    StyleOption,
     VariantOption,
     folder_option,
     option,
@@ -70,6 +73,9 @@ def plan(
     jobs: Annotated[int, option("N", "Number of worker processes; default 0: one per core.", min=0)] = 0,
     no_figures: FiguresOption = False,
     format_: FormatOption = FigureFormat.png,
+    size: SizeOption = None,
+    font: FontOption = None,
+    style: StyleOption = None,
     quiet: QuietOption = False,
 ) -> None:
     """Find where an arm should brace: points, surfaces, posture along the hand path, contact forces and gains.
@@ -78,8 +84,10 @@ def plan(
     friction and surface height. It writes plan.yaml with one variant per plan; run this file with `dynsim run
     results/SCENARIO/plan/plan.yaml`.
     """
+    from dynsim.draw.figures.look import Look
     from dynsim.scenario import load_scenario
 
+    look = Look.of(size, font, style)
     loaded = load_scenario(scenario, variant, parsed_overrides(overrides))
     folder = out or Path("results", loaded.name, loaded.variant, "plan")
     least, most = _numbers(count)
@@ -120,7 +128,7 @@ def plan(
             tell=tell,
         )
         tell("writing", 0.98)
-        save_plan(result, folder, figures=not no_figures, kind=format_.value)
+        save_plan(result, folder, figures=not no_figures, kind=format_.value, look=look)
     if not quiet:
         print_plan(result)
         print_written(folder)

@@ -13,10 +13,13 @@ import typer
 from dynsim.cli.app import (
     FigureFormat,
     FiguresOption,
+    FontOption,
     FormatOption,
     QuietOption,
     ScenarioArgument,
     SetOption,
+    SizeOption,
+    StyleOption,
     folder_option,
     option,
     parsed_overrides,
@@ -26,6 +29,7 @@ from dynsim.errors import ScenarioError, SimulationStopped
 from dynsim.system.terminal import escaped
 
 if TYPE_CHECKING:
+    from dynsim.draw.figures.look import Look
     from dynsim.studies.sweep import SweepRow
     from dynsim.studies.sweep_plan import Plan
 
@@ -80,6 +84,9 @@ def sweep(
     ] = None,
     no_figures: FiguresOption = False,
     format_: FormatOption = FigureFormat.png,
+    size: SizeOption = None,
+    font: FontOption = None,
+    style: StyleOption = None,
     quiet: QuietOption = False,
 ) -> None:
     """Simulate a scenario over a grid of values, random samples, or both; write a table of all runs and figures.
@@ -87,12 +94,14 @@ def sweep(
     The table has a row for each failed run, too, with the reason for the failure. Exit codes: 0 if at least one run
     succeeded, 2 if the input is invalid, 3 if no run succeeded, 130 after Ctrl-C.
     """
+    from dynsim.draw.figures.look import Look
     from dynsim.studies.processes import cores
 
     if jobs is not None and scheduler is not None:
         raise ScenarioError(
             "--jobs (processes on this machine) and --scheduler (workers of a cluster) conflict; use one of them"
         )
+    look = Look.of(size, font, style)
     if plot and no_figures:
         raise ScenarioError("--plot and --no-figures conflict; use one of them")
     from dynsim.scenario import read_scenario
@@ -129,7 +138,7 @@ def sweep(
     if len(failed) > _SHOWN:
         errors.print(f"… and {len(failed) - _SHOWN} more; the table lists all reasons")
     if not no_figures:
-        _draw(name, rows, plan, folder, quiet, format_, plot or ())
+        _draw(name, rows, plan, folder, quiet, format_, look, plot or ())
     if not quiet:
         if not has_parquet():
             print_line(escaped("Parquet file skipped: it requires pyarrow (pip install 'dynsim[tables]')."))
@@ -168,6 +177,7 @@ def _draw(
     folder: Path,
     quiet: bool,
     format_: str,
+    look: Look,
     plotted: Sequence[str] = (),
 ) -> None:
     from dynsim.config.problems import suggest
@@ -191,4 +201,4 @@ def _draw(
         plotted,
     )
     with drawing(folder, quiet):
-        draw(table, folder, format_)
+        draw(table, folder, format_, look)

@@ -6,11 +6,15 @@ plan.yaml is a runnable scenario. :mod:`dynsim.planner.pictures` draws the figur
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from dynsim.planner.answer import BracePlan
 from dynsim.record.csv_rows import csv_table
 from dynsim.scenario import to_yaml
 from dynsim.system.files import check_writable, replacing, write_json
+
+if TYPE_CHECKING:
+    from dynsim.draw.figures.look import Look
 
 PLAN_FILES = ("plan.json", "plan.yaml", "plan_table.csv", "plan_table.json", "view.html")
 
@@ -20,7 +24,7 @@ def check_plan_folder(folder: Path) -> None:
     check_writable(folder, PLAN_FILES)
 
 
-def save_plan(plan: BracePlan, folder: Path, figures: bool = True, kind: str = "png") -> None:
+def save_plan(plan: BracePlan, folder: Path, figures: bool = True, kind: str = "png", look: Look | None = None) -> None:
     """Write the files of a plan to a folder and replace the files of an earlier plan.
 
     If no plan was found, only plan.json and the tables are written. Without ``figures``, the figures and view.html are
@@ -42,4 +46,4 @@ def save_plan(plan: BracePlan, folder: Path, figures: bool = True, kind: str = "
     if figures:
         from dynsim.planner.pictures import draw_plan
 
-        draw_plan(plan, folder, kind)
+        draw_plan(plan, folder, kind, look)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dynsim.draw.figures.look import Look
 from dynsim.draw.figures.plan import PlanPicture, Pose, draw_plan_figures
 from dynsim.draw.geometry.projection import UP, Projection
 from dynsim.errors import SimulationStopped
@@ -21,9 +22,9 @@ POSES = 4
 GRID, BEYOND = 160, 0.15
 
 
-def draw_plan(plan: BracePlan, folder: Path, kind: str) -> None:
+def draw_plan(plan: BracePlan, folder: Path, kind: str, look: Look | None = None) -> None:
     """Draw the figures to ``figures/``, and write ``view.html``."""
-    draw_plan_figures(picture(plan), folder / "figures", kind)
+    draw_plan_figures(picture(plan), folder / "figures", kind, look)
     from dynsim.draw.page import content
 
     shown = _records(plan)

@@ -6,12 +6,13 @@ Matplotlib is loaded when the first figure is drawn.
 from __future__ import annotations
 
 import importlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
 
+from dynsim.draw.figures.look import Look
 from dynsim.errors import DynsimError, RecordError, brief
 from dynsim.record import Record
 from dynsim.system.arguments import names_wrong_types
@@ -30,7 +31,7 @@ MODULES: dict[str, tuple[set[str], ...]] = {
 }
 
 
-def draw(record: Record, folder: Path, kind: str = "png") -> list[Path]:
+def draw(record: Record, folder: Path, kind: str = "png", look: Look | None = None) -> list[Path]:
     """Draw every figure for which the record has data.
 
     Parameters
@@ -41,6 +42,8 @@ def draw(record: Record, folder: Path, kind: str = "png") -> list[Path]:
         Output folder.
     kind : {"png", "pdf", "svg"}, optional
         File format.
+    look : Look, optional
+        Size, font and style; default: for a page.
 
     Returns
     -------
@@ -54,11 +57,14 @@ def draw(record: Record, folder: Path, kind: str = "png") -> list[Path]:
     """
     if not len(record):
         return []
-    with _drawable():
+    style = importlib.import_module("dynsim.draw.figures.style")
+    with _drawable(), style.look(look):
         return list(_module(record).draw(record, Path(folder), kind))
 
 
-def draw_comparison(records: Mapping[str, Record], folder: Path, kind: str = "png") -> list[Path]:
+def draw_comparison(
+    records: Mapping[str, Record], folder: Path, kind: str = "png", look: Look | None = None
+) -> list[Path]:
     """Overlay variants in the order of ``records``; records without samples are skipped.
 
     Parameters
@@ -69,6 +75,8 @@ def draw_comparison(records: Mapping[str, Record], folder: Path, kind: str = "pn
         Output folder.
     kind : {"png", "pdf", "svg"}, optional
         File format.
+    look : Look, optional
+        Size, font and style; default: for a page.
 
     Returns
     -------
@@ -89,12 +97,22 @@ def draw_comparison(records: Mapping[str, Record], folder: Path, kind: str = "pn
         return []
     if len(modules) > 1:
         raise RecordError("cannot overlay records of different kinds")
-    with _drawable():
+    style = importlib.import_module("dynsim.draw.figures.style")
+    with _drawable(), style.look(look):
         return list(modules.pop().draw_comparison(drawn, Path(folder), kind))
 
 
 @names_wrong_types
-def figure(records: Record | Mapping[str, Record], name: str, *, title: bool = True) -> Figure:
+def figure(
+    records: Record | Mapping[str, Record],
+    name: str,
+    *,
+    title: bool = True,
+    caption: bool = True,
+    size: float | tuple[float, float] | str | None = None,
+    font: float | str | None = None,
+    style: str | Path | Sequence[str | Path] | None = None,
+) -> Figure:
     """Draw one figure of a record, or of several overlaid records, and return the matplotlib Figure.
 
     Parameters
@@ -105,6 +123,15 @@ def figure(records: Record | Mapping[str, Record], name: str, *, title: bool = T
         File name without suffix of a figure that ``dynsim plot`` writes: "energy", "compare_energy", …
     title : bool, optional
         Whether the figure has a title; use False for figures with a caption.
+    caption : bool, optional
+        Whether notes are drawn below the axes; the attribute ``caption`` of the figure has their text in any case.
+    size : float, tuple of float or str, optional
+        Width, or width and height [inch], such as 3.4, (3.4, 2.4) or "86mm". Default: 7.2 inches, and the height that
+        the contents require. Figures below 5 inches have their panels below each other.
+    font : float or str, optional
+        Size of the letters [point], a font family, or both: 8, "serif", "serif 8". Default: 8.5 points.
+    style : str, Path or sequence of them, optional
+        Names or files of matplotlib style sheets.
 
     Returns
     -------
@@ -114,14 +141,18 @@ def figure(records: Record | Mapping[str, Record], name: str, *, title: bool = T
     Raises
     ------
     RecordError
-        If no figure has this name, or the record has no data for it.
+        If no figure has this name, the record has no data for it, or size, font or style cannot be used.
+
+    Notes
+    -----
+    Settings in ``matplotlib.rcParams`` that differ from matplotlib's defaults remain, such as ``font.family``.
 
     Examples
     --------
     >>> import dynsim
     >>> scenario = dynsim.load_scenario("elbow_comparison", variant="two_elbows", overrides={"duration_s": 0.1})
     >>> record = dynsim.simulate(scenario)
-    >>> drawing = dynsim.figure(record, "contact_forces", title=False)
+    >>> drawing = dynsim.figure(record, "contact_forces", title=False, size=3.4, font="serif 8")
     >>> drawing.savefig("forces.pdf")  # doctest: +SKIP
     """
     several = not isinstance(records, Record)
@@ -132,8 +163,9 @@ def figure(records: Record | Mapping[str, Record], name: str, *, title: bool = T
     module = _module(next(iter(records.values()))) if isinstance(records, Mapping) else _module(records)
     # Comparisons of measured runs use the figures of simulated runs.
     home = importlib.import_module(SIMULATED) if several and module.__name__ == MEASURED else module
-    style = importlib.import_module("dynsim.draw.figures.style")
-    with _drawable(), style.look():
+    wanted = Look.of(size, font, style, title=title, caption=caption)
+    shared = importlib.import_module("dynsim.draw.figures.style")
+    with _drawable(), shared.look(wanted):
         makers = home.comparisons(records) if several else home.figures(records)
         if name not in makers:
             kind = "several records" if several else "such a record"
@@ -141,9 +173,7 @@ def figure(records: Record | Mapping[str, Record], name: str, *, title: bool = T
         drawn: Figure | None = makers[name](records)
     if drawn is None:
         raise RecordError(f"the record has no data for the figure {name!r}")
-    style.literal(drawn)
-    if not title:
-        drawn.suptitle("")
+    shared.literal(drawn)
     return drawn
 
 

@@ -82,7 +82,7 @@ def margin_comparison(records: Mapping[str, Record]) -> Figure | None:
         return None
     some = list(shown.values())
     figure = style.new_figure(
-        3.4 + len(shown) * style.LEGEND_ROW / 72.0 + contacts.height_of_variants(shown),
+        3.4 + len(shown) * style.legend_row() / 72.0 + contacts.height_of_variants(shown),
         style.comparison_title(some, "tip margin (1: safest, 0: tips over)"),
     )
     series = [(record.time, np.maximum(record[MARGIN], MARGIN_LOW)) for record in some]
@@ -357,7 +357,7 @@ def _draw_base_frame(axes: Axes, body: Skeleton, rows: Rows) -> None:
             corner,
             xytext=away,
             textcoords="offset points",
-            fontsize=7,
+            fontsize=style.letters(7.0),
             ha="center",
             va="center",
             bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 0.5},

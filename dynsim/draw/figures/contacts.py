@@ -150,7 +150,7 @@ def _forces(records: Mapping[str, Record], title: str) -> Figure | None:
     note = "" if len(chosen) == len(names) else f", {len(chosen)} of {len(names)} contacts ({kind} forces)"
     having = {name: {v: r for v, r in records.items() if _touched(r, name)} for name in chosen}
     # The legend of a row has one entry per variant and one for the shading.
-    more = sum(-(-(len(having[name]) + 1) // 2) - 1 for name in chosen) * style.LEGEND_ROW / 72.0
+    more = sum(-(-(len(having[name]) + 1) // 2) - 1 for name in chosen) * style.legend_row() / 72.0
     figure = style.new_figure(1.0 + ROW * len(chosen) + more, title + note)
     series = [[values for r in having[name].values() for values in _series(r, name)] for name in chosen]
     styles = style.variant_styles(list(records))

@@ -198,7 +198,7 @@ def _residual(axes: Axes, record: Record, turnover: float) -> None:
             textcoords="offset points",
             ha="right",
             color=style.PULLING,
-            fontsize=7,
+            fontsize=style.letters(7.0),
         )
     axes.set_ylabel("unexplained\n[J]")
 
@@ -220,7 +220,12 @@ def _totals(axes: Axes, names: Sequence[str], values: Array, colours: Sequence[s
         axes.margins(x=0.05, y=0.08)
     for x, value in zip(places.tolist(), values.tolist(), strict=True):
         part = f"\n1/{style.number(largest / value, 3)}" if logarithmic and value < largest else ""
-        look: dict[str, Any] = {"textcoords": "offset points", "ha": "center", "va": "bottom", "fontsize": 7.5}
+        look: dict[str, Any] = {
+            "textcoords": "offset points",
+            "ha": "center",
+            "va": "bottom",
+            "fontsize": style.letters(7.5),
+        }
         text = f"{style.number(value)}{part}"
         axes.annotate(text, (x, max(value, 0.0)), xytext=(0, 6 if logarithmic else 2), **look)
     axes.set_xticks(places, names, rotation=30 if len(names) <= 4 else 60, ha="right")
@@ -261,7 +266,12 @@ def motors(record: Record) -> Figure | None:
         panels[0].set_ylabel(label)
     contacts.mark_all(rows, record)
     named = f"{LARGEST} largest by\nrms current" if count > LARGEST else None
-    figure.legend(*rows[0][-1].get_legend_handles_labels(), loc="outside right center", title=named, title_fontsize=7.5)
+    figure.legend(
+        *rows[0][-1].get_legend_handles_labels(),
+        loc="outside right center",
+        title=named,
+        title_fontsize=style.letters(7.5),
+    )
     return figure
 
 
@@ -309,7 +319,7 @@ def _paths(records: Mapping[str, Record], title: str) -> Figure | None:
     if not shown:
         return None
     # The height fits three square panels and the legend, without extra space.
-    figure = style.new_figure(2.62 + style.LEGEND_ROW * -(-(3 + len(shown)) // 4) / 72.0, title)
+    figure = style.new_figure(2.62 + style.legend_row() * -(-(3 + len(shown)) // 4) / 72.0, title)
     panels = _planes(figure, list(shown.values()))
     styles = style.variant_styles(list(records))
     for axes, plane in zip(panels, PLANES, strict=True):

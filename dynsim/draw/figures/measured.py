@@ -135,7 +135,7 @@ def _cycles(axes: Axes, record: Record) -> None:
     if "missed" in record and (missed := record["missed"].any(axis=1)).any():
         axes.plot(record.time[missed], np.zeros(missed.sum()), "x", color=style.PULLING, markersize=4)
         text = f"× {missed.sum()} cycles with a servo that did not answer"
-        axes.text(0.01, 0.9, text, transform=axes.transAxes, color=style.PULLING, fontsize=7, va="top")
+        axes.text(0.01, 0.9, text, transform=axes.transAxes, color=style.PULLING, fontsize=style.letters(7.0), va="top")
     _mark_replay(axes, record)
 
 
@@ -187,7 +187,7 @@ def _mark_replay(axes: Axes, record: Record, *, named: bool = False) -> None:
                 xytext=(3, -8),
                 textcoords="offset points",
                 color=colour,
-                fontsize=7,
+                fontsize=style.letters(7.0),
             )
 
 
@@ -276,7 +276,7 @@ def draw_errors(title: str, time: Array, quantities: Sequence[Compared], named: 
         The written file.
     """
     with style.look():
-        rows = [style.LEGEND_ROW / 72.0 * (3 + min(len(quantity.names), HIGHLIGHTED)) / 2 for quantity in quantities]
+        rows = [style.legend_row() / 72.0 * (3 + min(len(quantity.names), HIGHLIGHTED)) / 2 for quantity in quantities]
         figure = style.new_figure(sum(4.2 + row for row in rows), title)
         panels = figure.subplots(2 * len(quantities), 1, sharex=True)
         for quantity, (values, errors) in zip(quantities, panels.reshape(-1, 2), strict=True):

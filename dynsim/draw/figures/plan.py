@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
 from dynsim.draw.figures import style
+from dynsim.draw.figures.look import Look
 from dynsim.draw.figures.style import BLUE, GREEN, GREY, ORANGE, PULLING, Array, number
 
 # Maximum length of the arrow of the largest force, relative to the height of the view.
@@ -138,7 +139,7 @@ def _draw_poses(axes: Axes, picture: PlanPicture, seen: list[int], largest: floa
             textcoords="offset points",
             ha="center",
             va="center",
-            fontsize=7.5,
+            fontsize=style.letters(7.5),
             color=PULLING,
             fontweight="bold",
             path_effects=[withStroke(linewidth=2.0, foreground="white")],
@@ -197,9 +198,15 @@ def _dots(
         # Place the text towards the middle, where there is space.
         offset, side = (7.0, "left") if value <= middle else (-7.0, "right")
         axes.annotate(
-            text, (value, y), xytext=(offset, 0.0), textcoords="offset points", ha=side, va="center", fontsize=7.0
+            text,
+            (value, y),
+            xytext=(offset, 0.0),
+            textcoords="offset points",
+            ha=side,
+            va="center",
+            fontsize=style.letters(7.0),
         )
-    axes.set_yticks(range(len(labels)), labels, fontsize=7.0)
+    axes.set_yticks(range(len(labels)), labels, fontsize=style.letters(7.0))
     axes.set_ylim(len(labels) - 0.5, -0.5)
     axes.set_xlabel(axis)
     if wide:
@@ -228,7 +235,7 @@ def robustness(picture: PlanPicture) -> Figure | None:
     upper.axhline(1.0, color="black", linewidth=0.6)
     upper.set_ylabel("heat / planned heat")
     lower.set_ylabel("hand error, rms [mm]")
-    lower.set_xticks(range(len(labels)), labels, rotation=25.0, ha="right", fontsize=6.5)
+    lower.set_xticks(range(len(labels)), labels, rotation=25.0, ha="right", fontsize=style.letters(6.5))
     style.legend_above(upper, columns=len(shown))
     return figure
 
@@ -241,6 +248,7 @@ FIGURES = {
 }
 
 
-def draw_plan_figures(picture: PlanPicture, folder: Path, kind: str) -> list[Path]:
+def draw_plan_figures(picture: PlanPicture, folder: Path, kind: str, look: Look | None = None) -> list[Path]:
     """Draw all figures of a plan to a folder; return the files."""
-    return style.save_all(FIGURES, picture, folder, kind)
+    with style.look(look):
+        return style.save_all(FIGURES, picture, folder, kind)

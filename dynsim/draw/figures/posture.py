@@ -402,7 +402,7 @@ def _side_view(
             textcoords="offset points",
             ha="center",
             va="center",
-            fontsize=LABEL_SIZE,
+            fontsize=style.letters(LABEL_SIZE),
             linespacing=1.1,
             # A line connects a distant label with its contact.
             arrowprops={"arrowstyle": "-", "color": style.GREY, "lw": 0.5, "shrinkB": 4} if label.level else None,

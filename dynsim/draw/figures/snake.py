@@ -133,7 +133,7 @@ def overview(record: Record) -> Figure:
     side = limits([view.project(view.points, above=False) for view in views], 0.06) if flat else (0.0, 1.0, 0.0, 0.0)
     low = width * (side[3] - side[2]) / (side[1] - side[0])
     height = max(high + low, 1.0) + 1.2 + 0.5 * flat
-    figure = style.new_figure(height, style.title(record, "the run from above"), width=width + 1.4)
+    figure = style.new_figure(height, style.title(record, "the run from above"), page=width + 1.4)
     grid = figure.subplots(1 + flat, 1, squeeze=False, height_ratios=[high, low] if flat else None)
     axis = grid[0, 0]
     shades = ScalarMappable(Normalize(0.0, record.time[-1]), matplotlib.colormaps["viridis_r"] if flat else SHADES)

@@ -111,7 +111,7 @@ def posture_grid(title: str, lines: Mapping[str, Sequence[tuple[View, str]]], on
     heights = [size * (y1 - y0) / (x1 - x0) for x0, x1, y0, y1 in boxes]
     titles = 1 + max(text.count("\n") for line in lines.values() for _, text in line)
     height = sum(heights) + len(lines) * (0.3 + 0.14 * titles) + 0.8
-    figure = style.new_figure(height, title, width=9.0)
+    figure = style.new_figure(height, title, page=9.0)
     axes = figure.subplots(
         len(lines),
         columns,
@@ -132,11 +132,11 @@ def posture_grid(title: str, lines: Mapping[str, Sequence[tuple[View, str]]], on
             axis.plot(*view.path.T, color=TARGET, lw=1.0, zorder=2)
             view.draw(axis, above=True)
             axis.set(xlim=(x0, x1), ylim=(y0, y1))
-            axis.set_title(text, fontsize=7)
+            axis.set_title(text, fontsize=style.letters(7.0))
             axis.set_aspect("equal", adjustable="box")
     for axis in axes[-1]:
         axis.set_xlabel("x [m]")
-    figure.supylabel("y [m]", fontsize=8)
+    figure.supylabel("y [m]", fontsize=style.letters(8.0))
     _explain(figure, [view for line in lines.values() for view, _ in line])
     return figure
 
@@ -149,7 +149,7 @@ def posture_strip(title: str, line: Sequence[tuple[View, str]]) -> Figure:
     tall, low = top[3] - top[2], side[3] - side[2]
     column = 9.0 / len(views)
     height = column * (tall / (top[1] - top[0]) + low / (side[1] - side[0])) + 2.1
-    figure = style.new_figure(max(height, 2.9), title, width=9.0)
+    figure = style.new_figure(max(height, 2.9), title, page=9.0)
     axes = figure.subplots(2, len(views), squeeze=False, height_ratios=[tall, max(low, 0.35 * tall)])
     for (view, text), above, below in zip(line, *axes, strict=True):
         view.draw(above, above=True)
@@ -206,7 +206,14 @@ def mode_chart(axis: Axes, record: Record, title: str = "mode") -> None:
         axis.broken_barh(bars, (i + 0.6, 0.8), facecolors=GROUND, **edge)
     if numbered:
         for start, end in zip(starts, np.append(starts[1:], last), strict=True):
-            axis.text((time[start] + time[end]) / 2, 0.2, str(mode[start]), ha="center", va="center", fontsize=7)
+            axis.text(
+                (time[start] + time[end]) / 2,
+                0.2,
+                str(mode[start]),
+                ha="center",
+                va="center",
+                fontsize=style.letters(7.0),
+            )
     axis.set_xlim(time[0], time[-1])
     axis.set_ylim(pairs + 0.6, -0.2 if numbered else 0.4)
     axis.set_yticks(range(1, pairs + 1))

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -19,6 +21,8 @@ from matplotlib.text import Text
 from matplotlib.ticker import FuncFormatter, LogFormatter, LogLocator, NullFormatter, NullLocator
 from numpy.typing import NDArray
 
+from dynsim.draw.figures.look import Look
+from dynsim.errors import RecordError
 from dynsim.record import Record
 from dynsim.system.files import replacing
 from dynsim.system.terminal import plain
@@ -39,18 +43,24 @@ DEEP = "#882255"
 VARIANT_COLOURS = (BLUE, GREEN, ORANGE, PURPLE, SKY, BLACK, "#8C6D31")
 AXIS_COLOURS = {"x": BLUE, "y": GREEN, "z": ORANGE}
 
-WIDTH = 7.2
-# Size of a figure title [point], and number of characters that fit.
-TITLE, TITLE_LONG = 10.0, 88
+# Width of a figure on a page [inch]; in a figure below NARROW, which fits a column of a paper, panels are below each
+# other.
+WIDTH, NARROW = 7.2, 5.0
+# Size of the letters of labels [point]; the other sizes are multiples.
+POINTS = 8.5
+# Sizes of other texts as multiples of the size of labels.
+_SIZES = {
+    "axes.titlesize": 1.0,
+    "axes.labelsize": 1.0,
+    "legend.fontsize": 0.88,
+    "xtick.labelsize": 0.88,
+    "ytick.labelsize": 0.88,
+    "figure.titlesize": 1.18,
+}
+# Mean width of a letter as a multiple of its size, for the breaking of long lines.
+LETTER = 0.56
 DPI = 170
 _LOOK: Any = {
-    "font.size": 8.5,
-    "axes.titlesize": 8.5,
-    "axes.labelsize": 8.5,
-    "legend.fontsize": 7.5,
-    "xtick.labelsize": 7.5,
-    "ytick.labelsize": 7.5,
-    "figure.titlesize": TITLE,
     "mathtext.fontset": "dejavusans",
     "lines.linewidth": 1.2,
     "lines.solid_capstyle": "round",
@@ -74,23 +84,147 @@ _LOOK: Any = {
 LINE_POINTS = 4000
 # A transient panel shows TRANSIENT_ROOM times the transient, unless this exceeds TRANSIENT_MAX_SHARE of the run.
 TRANSIENT_ROOM, TRANSIENT_MAX_SHARE = 1.2, 0.8
-# Height of a legend row [point].
-LEGEND_ROW = 12.5
+# Height of a legend row as a multiple of the size of its letters.
+LEGEND_ROW = 1.67
+
+
+_drawn: ContextVar[Look | None] = ContextVar("look of the figures", default=None)
 
 
 @contextmanager
-def look() -> Iterator[None]:
-    """Apply dynsim's matplotlib settings in a ``with`` block."""
-    with matplotlib.rc_context(_LOOK):
+def look(wanted: Look | None = None) -> Iterator[None]:
+    """Apply a look in a ``with`` block; the look of an outer block takes precedence.
+
+    Settings of matplotlib that a user changed, in ``rcParams`` or by a style sheet, remain; dynsim sets the others.
+
+    Raises
+    ------
+    RecordError
+        If a style sheet cannot be read, or there is no font of the family.
+    """
+    if _drawn.get() is not None:
         yield
+        return
+    wanted = wanted or Look()
+    with matplotlib.rc_context():
+        _apply_styles(wanted.styles)
+        default = matplotlib.rcParamsDefault
+        changed = {key for key in (*_LOOK, *_SIZES, "font.size") if matplotlib.rcParams[key] != default[key]}
+        points = wanted.points or (matplotlib.rcParams["font.size"] if "font.size" in changed else POINTS)
+        settings: Any = {**_LOOK, **{key: points * share for key, share in _SIZES.items()}}
+        matplotlib.rcParams.update({key: value for key, value in settings.items() if key not in changed})
+        matplotlib.rcParams["font.size"] = points
+        if wanted.family is not None:
+            _check_family(wanted.family)
+            matplotlib.rcParams["font.family"] = [wanted.family]
+        token = _drawn.set(wanted)
+        try:
+            yield
+        finally:
+            _drawn.reset(token)
 
 
-def new_figure(height: float, title: str, *, width: float = WIDTH) -> Figure:
-    """Create an empty figure with ``height`` and ``width`` [inch], independent of pyplot and displays."""
-    figure = Figure(figsize=(width, height), layout="constrained")
+def _apply_styles(sheets: Sequence[str]) -> None:
+    import matplotlib.style
+
+    for sheet in sheets:
+        try:
+            matplotlib.style.use(sheet)
+        except (OSError, ValueError) as error:
+            text = " ".join(str(error).split())
+            raise RecordError(
+                f"style {sheet!r}: {text}; choices: a file, or {', '.join(matplotlib.style.available)}"
+            ) from error
+
+
+def _check_family(family: str) -> None:
+    from matplotlib.font_manager import FontProperties, findfont
+
+    try:
+        findfont(FontProperties(family=family), fallback_to_default=False)
+    except ValueError as error:
+        raise RecordError(
+            f"font {family!r}: this machine has no such font; try serif, sans-serif, or its name"
+        ) from error
+
+
+def width() -> float:
+    """Return the width of the figures [inch]: as wanted, as in ``rcParams``, or that of a page."""
+    wanted = _drawn.get()
+    if wanted is not None and wanted.width is not None:
+        return wanted.width
+    return float(matplotlib.rcParams["figure.figsize"][0]) if _has_own_size() else WIDTH
+
+
+def _has_own_size() -> bool:
+    return bool(matplotlib.rcParams["figure.figsize"] != matplotlib.rcParamsDefault["figure.figsize"])
+
+
+def narrow() -> bool:
+    """Return whether the figures fit a column of a paper, so that panels are below each other."""
+    return width() < NARROW
+
+
+def letters(points: float) -> float:
+    """Return a font size [point] that is ``points`` if labels have their usual size, and in proportion otherwise."""
+    return points / POINTS * float(matplotlib.rcParams["font.size"])
+
+
+def _size(key: str) -> float:
+    """Return a font size of ``rcParams`` [point]; sizes in words are those of dynsim."""
+    size = matplotlib.rcParams[key]
+    return float(size) if isinstance(size, int | float) else letters(_SIZES[key] * POINTS)
+
+
+def broken(text: str, across: float | None = None, points: float | None = None) -> str:
+    """Break a text into lines that fit in ``across`` [inch] (default: the figure), with letters of a size [point]."""
+    size = letters(POINTS) if points is None else points
+    count = max(int(72.0 * (width() if across is None else across) / (LETTER * size)), 12)
+    return "\n".join(textwrap.fill(part, count) for part in text.split("\n"))
+
+
+class Drawing(Figure):
+    """Figure with notes, which are drawn below its axes if the look has a caption.
+
+    Attributes
+    ----------
+    caption : str
+        The notes, one per line: what dashes mean, what was cut off. For the caption of a paper.
+    """
+
+    caption = ""
+
+    def note(self, *notes: str) -> None:
+        """Add notes to the caption."""
+        self.caption = "\n".join([*filter(None, [self.caption]), *notes])
+        wanted = _drawn.get()
+        if self.caption and (wanted is None or wanted.caption):
+            size = letters(7.0)
+            self.supxlabel(
+                broken(self.caption, self.get_figwidth(), size), fontsize=size, color=GREY, x=0.01, ha="left", ma="left"
+            )
+
+
+def new_figure(height: float, title: str, *, page: float = WIDTH) -> Drawing:
+    """Create an empty figure, independent of pyplot and displays.
+
+    Parameters
+    ----------
+    height : float
+        Height [inch], unless the user wants another.
+    title : str
+        Title; a long one has several lines.
+    page : float, optional
+        Width [inch] if the user wants none.
+    """
+    wanted = _drawn.get() or Look()
+    wide = width() if wanted.width is not None or _has_own_size() else page
+    own = float(matplotlib.rcParams["figure.figsize"][1]) if _has_own_size() and wanted.width is None else None
+    figure = Drawing(figsize=(wide, wanted.height or own or height), layout="constrained")
     FigureCanvasAgg(figure)
-    # A long title has a smaller font, so that it is not cut off.
-    figure.suptitle(title, fontsize=TITLE * min(1.0, TITLE_LONG / max(len(title), 1)))
+    if wanted.title and title:
+        size = _size("figure.titlesize")
+        figure.suptitle(broken(title, wide, size), fontsize=size)
     return figure
 
 
@@ -153,11 +287,12 @@ def variant_styles(names: Sequence[T]) -> dict[T, dict[str, Any]]:
     Line styles differ only if there are more than seven curves. Later curves are on top and thinner, so that equal
     curves remain visible.
     """
-    count = len(VARIANT_COLOURS)
+    colours = matplotlib.rcParams["axes.prop_cycle"].by_key().get("color", VARIANT_COLOURS)
+    count = len(colours)
     dashes = ("-", (0, (5, 1.5)), (0, (1, 1)), (0, (5, 1, 1, 1)))
     return {
         name: {
-            "color": VARIANT_COLOURS[k % count],
+            "color": colours[k % count],
             "linestyle": dashes[(k // count) % len(dashes)],
             "linewidth": 1.0 + 1.6 * 0.4**k if len(names) > 1 else 1.4,
         }
@@ -206,29 +341,64 @@ def shade(axes: Axes, time: Array, where: NDArray[np.bool_], colour: str, label:
         axes.fill_between(time, 0.0, 1.0, where=until, transform=axes.get_xaxis_transform(), **look)
 
 
-def legend_beside(axes: Axes) -> None:
-    """Place a legend without repeated entries to the right of the axes."""
-    handles, labels = axes.get_legend_handles_labels()
-    unique = dict(zip(labels, handles, strict=True))
+def legend_row() -> float:
+    """Return the height of a row of a legend [point]."""
+    return LEGEND_ROW * _legend_size()
+
+
+def _legend_size() -> float:
+    """Return the size of the letters of legends [point]."""
+    return _size("legend.fontsize")
+
+
+def fitted_legend(labels: Sequence[str], columns: int) -> tuple[list[str], int, int]:
+    """Return the labels, broken into lines, the number of columns that fit into the figure, and the rows of text."""
+    size = _legend_size()
+    handle = (matplotlib.rcParams["legend.handlelength"] + 2.8) * size
+    available = 72.0 * 0.97 * width()
+    lines = [broken(label, (available - handle) / 72.0, size) for label in labels]
+    widest = max((len(line) for label in lines for line in label.split("\n")), default=1) * LETTER * size + handle
+    columns = max(1, min(columns, len(lines), int(available // widest)))
+    # A legend is filled column by column, and its rows are as high as their highest label.
+    per_column = -(-len(lines) // columns)
+    heights = [max(lines[k].count("\n") + 1 for k in range(row, len(lines), per_column)) for row in range(per_column)]
+    return lines, columns, sum(heights)
+
+
+def legend_beside(axes: Axes, columns: int = 2) -> None:
+    """Place a legend without repeated entries to the right of the axes, or above them in a narrow figure."""
+    if narrow():
+        legend_above(axes, columns)
+        return
+    unique = _named([axes])
     axes.legend(unique.values(), unique.keys(), loc="center left", bbox_to_anchor=(1.0, 0.5))
 
 
 def legend_above(axes: Axes, columns: int = 3) -> None:
     """Place the legend above the axes, where it hides no curves, with space for all of its rows."""
-    rows = -(-len(axes.get_legend_handles_labels()[1]) // columns)
-    legend = axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=columns, borderaxespad=0.0)
+    unique = _named([axes])
+    labels, columns, rows = fitted_legend(list(unique), columns)
+    look: dict[str, Any] = {"ncols": columns, "borderaxespad": 0.0}
+    legend = axes.legend(unique.values(), labels, loc="lower right", bbox_to_anchor=(1.0, 1.0), **look)
     # The legend may extend over the panel to its left; a blank title reserves the space above.
     legend.set_in_layout(False)
-    axes.set_title(" ", y=1.0, pad=6.0 + LEGEND_ROW * max(rows - 1, 0))
+    axes.set_title(" ", y=1.0, pad=6.0 + legend_row() * max(rows - 1, 0))
 
 
 def legend_below(figure: Figure, panels: Sequence[Axes], columns: int) -> None:
     """Place one legend for several panels below the figure."""
-    named: dict[str, Any] = {}
+    unique = _named(panels)
+    labels, columns, _ = fitted_legend(list(unique), columns)
+    figure.legend(unique.values(), labels, loc="outside lower center", ncols=columns)
+
+
+def _named(panels: Sequence[Axes]) -> dict[str, Any]:
+    """Return the entries of the legends of panels by label, each once."""
+    unique: dict[str, Any] = {}
     for axes in panels:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
-            named.setdefault(label, handle)
-    figure.legend(named.values(), named.keys(), loc="outside lower center", ncols=min(len(named), columns))
+            unique.setdefault(label, handle)
+    return unique
 
 
 def sparse(points: Array) -> Array:
@@ -271,7 +441,7 @@ def time_rows(
     longest = TRANSIENT_MAX_SHARE * end / TRANSIENT_ROOM
     transients = [t if t is not None and t.end < longest else None for t in (_transient(row, settle) for row in rows)]
     window = max((transient.end for transient in transients if transient is not None), default=0.0)
-    split = window > 0.0
+    split = window > 0.0 and not narrow()
     grid = figure.subplots(
         len(rows), 1 + split, sharex="col", squeeze=False, width_ratios=[1.0, 2.4] if split else [1.0]
     )
@@ -282,13 +452,16 @@ def time_rows(
             axes[0].set_xlim(0.0, TRANSIENT_ROOM * window)
         if transient is not None:
             axes[-1].set_ylim(transient.low, transient.high)
-            if compress:
-                _compress(axes[0], transient)
+        if transient is not None and split and compress:
+            _compress(axes[0], transient)
     for axis in grid[-1]:
         axis.set_xlabel("time [s]")
     if split:
         grid[-1, 0].set_xlabel("time [s]: initial transient")
         grid[-1, 1].set_xlabel("time [s]: whole run, axes cut to the settled range")
+    elif window > 0.0 and isinstance(figure, Drawing):
+        cut = [number(t.largest, 2) for t in transients if t is not None]
+        figure.note(f"Axes are cut to the settled range; the initial transient reaches {' and '.join(cut)}.")
     return [tuple(axes) for axes in grid]
 
 
@@ -335,4 +508,4 @@ def _compress(axes: Axes, transient: Transient) -> None:
         axes.yaxis.set_minor_locator(NullLocator())
         # Curves have a kink at the point where the scale changes, so the figure states the scale.
         text = f"logarithmic beyond ±{number(settled, 2)}"
-        axes.text(0.98, 0.03, text, transform=axes.transAxes, ha="right", color=GREY, fontsize=6.5)
+        axes.text(0.98, 0.03, text, transform=axes.transAxes, ha="right", color=GREY, fontsize=letters(6.5))

@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from dynsim.draw.figures import style
+from dynsim.draw.figures.look import Look
 from dynsim.draw.figures.style import Array
 from dynsim.record.sensitivity import LEVEL, sensitivities, spread
 
@@ -118,7 +119,7 @@ def named(key: str) -> tuple[str, float]:
     return f"{name}{': ' if name else ''}{' '.join(words)}{f' [{unit}]' if unit else ''}", 1.0
 
 
-def draw(sweep: Sweep, folder: Path, kind: str = "png") -> list[Path]:
+def draw(sweep: Sweep, folder: Path, kind: str = "png", look: Look | None = None) -> list[Path]:
     """Draw every figure for which the table has data; return the files.
 
     Raises
@@ -133,7 +134,8 @@ def draw(sweep: Sweep, folder: Path, kind: str = "png") -> list[Path]:
         "sweep_samples": samples,
         "sweep_tornado": tornado,
     }
-    return style.save_all(makers, sweep, folder, kind) if sweep.rows and sweep.metrics else []
+    with style.look(look):
+        return style.save_all(makers, sweep, folder, kind) if sweep.rows and sweep.metrics else []
 
 
 def lines(sweep: Sweep) -> Figure | None:
@@ -233,7 +235,9 @@ def pareto(sweep: Sweep) -> Figure | None:
     numbered = len(front) <= _NUMBERED and all("run" in row for row in rows)
     for x, y in front if numbered else ():
         run = next(row["run"] for row in rows if (scale * row[error], row[energy]) == (x, y))
-        axes.annotate(f"{run}", (x, y), xytext=(5.0, 4.0), textcoords="offset points", fontsize=7.0, zorder=5)
+        axes.annotate(
+            f"{run}", (x, y), xytext=(5.0, 4.0), textcoords="offset points", fontsize=style.letters(7.0), zorder=5
+        )
     axes.plot(
         *front.T,
         color=style.BLACK,
@@ -282,7 +286,7 @@ def samples(sweep: Sweep) -> Figure | None:
         _PANEL * len(variants) * len(shown) + _ROOM,
         f"{sweep.name}: {len(sweep.rows)} runs with random parameters{sweep.failed}{note}",
         # A panel must be as wide as a title with two numbers and their intervals.
-        width=max(style.WIDTH, _ACROSS * len(metrics)),
+        page=max(style.WIDTH, _ACROSS * len(metrics)),
     )
     rows = [(variant, grid_place) for variant in variants for grid_place in shown]
     ends = [key.split(".")[-1] for key in sweep.grid]
@@ -305,10 +309,10 @@ def samples(sweep: Sweep) -> Figure | None:
 def _distribution(axes: Axes, values: Array, head: str, colour: str) -> None:
     """Draw the histogram of the draws at one grid point, with the mean, its interval, and the interval of the draws."""
     if len(values) < 2:
-        axes.set_title(f"{head}too few runs with numbers: {len(values)}", fontsize=7.5)
+        axes.set_title(f"{head}too few runs with numbers: {len(values)}", fontsize=style.letters(7.5))
         return
     if np.ptp(values) == 0.0:
-        axes.set_title(f"{head}{len(values)} runs, all {style.number(values[0])}", fontsize=7.5)
+        axes.set_title(f"{head}{len(values)} runs, all {style.number(values[0])}", fontsize=style.letters(7.5))
         return
     # Bin width by the rule of Freedman and Diaconis, or of Sturges for few samples.
     bins = min(_BINS, len(np.histogram_bin_edges(values, "auto")) - 1)
@@ -321,7 +325,7 @@ def _distribution(axes: Axes, values: Array, head: str, colour: str) -> None:
         f"{statistics.count} runs: mean {_with_interval(statistics.mean, statistics.mean_high - statistics.mean)}, "
         f"{100 * LEVEL:g} % in {style.number(statistics.low)} … {style.number(statistics.high)}"
     )
-    axes.set_title(f"{head}{of_all}", fontsize=7.5)
+    axes.set_title(f"{head}{of_all}", fontsize=style.letters(7.5))
     axes.margins(x=0.03)
 
 
@@ -356,7 +360,7 @@ def tornado(sweep: Sweep) -> Figure | None:
             axes.grid(visible=False, axis="y")
             axes.margins(x=0.05)
             explained = f"linear fit explains {100.0 * fit.explained:.3g} % of the variance"
-            axes.set_title("\n".join([variant] * bool(variant) + [explained]), fontsize=7.5)
+            axes.set_title("\n".join([variant] * bool(variant) + [explained]), fontsize=style.letters(7.5))
     return figure
 
 

@@ -158,7 +158,7 @@ def sag_and_feedback(records: Mapping[str, Record]) -> Figure:
             axis.plot(record.time, record["w"][:, i], color=GROUND, label="simulated")
             axis.plot(record.time, record["w_target"][:, i], ":", color="red", lw=1.4, label="target")
             style.at_least(axis, 0.02)
-        column[0].set_title(title, fontsize=8)
+        column[0].set_title(title, fontsize=style.letters(8.0))
         column[-1].set_xlabel("t [s]")
     for i, axis in enumerate(axes[:, 0]):
         axis.set_ylabel(f"{SYMBOLS.get(COORDINATES[i], COORDINATES[i])}$_h$ [{'m' if i < 3 else 'rad'}]")
@@ -216,7 +216,7 @@ def head_and_cost(record: Record) -> Figure:
         style.at_least(axis, 4 * scale * error)
         axis.set_ylabel(f"{SYMBOLS.get(COORDINATES[i], COORDINATES[i])}$_h$ [{unit}]")
         off = scale * np.abs(record["w"][:, i] - record["w_target"][:, i]).max()
-        axis.set_title(f"largest error {off:.1e} {unit}", fontsize=7)
+        axis.set_title(f"largest error {off:.1e} {unit}", fontsize=style.letters(7.0))
     axes[3, 0].step(time, record["mode"], where="post", color=GROUND)
     axes[3, 0].set(ylabel="σ", ylim=(0.5, record["mode"].max() + 0.5), xlabel="t [s]")
     axes[3, 0].set_yticks(np.unique(record["mode"]))

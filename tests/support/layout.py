@@ -1,0 +1,101 @@
+"""Faults in the layout of a figure that a reader sees at once: texts that leave the canvas or overlap other texts."""
+
+from __future__ import annotations
+
+import itertools
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.text import Text
+from matplotlib.transforms import Bbox
+
+# Texts may touch by this much [point]: the box of a text is larger than its ink.
+SLACK = 1.2
+
+
+def layout_faults(figure: Figure) -> list[str]:
+    """Return the texts that leave the canvas, pairs of texts that overlap, and legends over another panel's curves.
+
+    Only texts that are really drawn count; invisible ticks and texts outside a clip path do not.
+    """
+    slack = SLACK * figure.dpi / 72.0
+    canvas = Bbox.from_bounds(-slack, -slack, figure.bbox.width + 2 * slack, figure.bbox.height + 2 * slack)
+    boxes = [(text, _ink(text)) for text in _drawn_texts(figure)]
+    faults = [f"{_name(text)} leaves the canvas" for text, box in boxes if not _inside(box, canvas)]
+    for (first, a), (second, b) in itertools.combinations(boxes, 2):
+        across = min(a.x1, b.x1) - max(a.x0, b.x0)
+        along = min(a.y1, b.y1) - max(a.y0, b.y0)
+        if across > slack and along > slack and not _apart(first, second, slack):
+            faults.append(f"{_name(first)} overlaps {_name(second)}")
+    return faults
+
+
+def _drawn_texts(figure: Figure) -> list[Text]:
+    """Draw the figure and return its texts in the order in which they were drawn."""
+    seen: dict[int, Text] = {}
+    original = Text.draw
+
+    def draw(self: Text, renderer: object, *args: object, **options: object) -> None:
+        if self.get_visible() and self.get_text().strip() and self.get_alpha() != 0.0:
+            seen[id(self)] = self
+        original(self, renderer, *args, **options)
+
+    Text.draw = draw
+    try:
+        FigureCanvasAgg(figure).draw()
+    finally:
+        Text.draw = original
+    return [text for text in seen.values() if _is_shown(text)]
+
+
+def _is_shown(text: Text) -> bool:
+    box = text.get_window_extent()
+    if text.get_clip_on() and text.clipbox is not None:
+        return bool(box.overlaps(text.clipbox))
+    return box.width > 0.0
+
+
+def _ink(text: Text) -> Bbox:
+    return text.get_window_extent()
+
+
+def _inside(box: Bbox, canvas: Bbox) -> bool:
+    return bool(box.x0 >= canvas.x0 and box.x1 <= canvas.x1 and box.y0 >= canvas.y0 and box.y1 <= canvas.y1)
+
+
+def _apart(first: Text, second: Text, slack: float) -> bool:
+    """Return whether slanted texts are apart although their upright boxes overlap (separating axes)."""
+    if not (first.get_rotation() % 90.0 or second.get_rotation() % 90.0):
+        return False
+    import numpy as np
+
+    corners = [_corners(text) for text in (first, second)]
+    for shape in corners:
+        for k in range(2):
+            edge = shape[k + 1] - shape[k]
+            normal = np.array([-edge[1], edge[0]]) / (np.hypot(*edge) or 1.0)
+            a, b = (points @ normal for points in corners)
+            if min(a.max(), b.max()) - max(a.min(), b.min()) <= slack:
+                return True
+    return False
+
+
+def _corners(text: Text):
+    """Corners of a text's slanted box [pixel], (4, 2)."""
+    import numpy as np
+
+    angle = text.get_rotation()
+    text.set_rotation(0.0)
+    flat = text.get_window_extent()
+    text.set_rotation(angle)
+    upright = text.get_window_extent()
+    c, s = np.cos(np.radians(angle)), np.sin(np.radians(angle))
+    half = 0.5 * np.array(
+        [[-flat.width, -flat.height], [flat.width, -flat.height], [flat.width, flat.height], [-flat.width, flat.height]]
+    )
+    middle = np.array([0.5 * (upright.x0 + upright.x1), 0.5 * (upright.y0 + upright.y1)])
+    return middle + half @ np.array([[c, s], [-s, c]])
+
+
+def _name(text: Text) -> str:
+    return repr(" ".join(text.get_text().split())[:60])
