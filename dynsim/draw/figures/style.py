@@ -16,6 +16,7 @@ from cycler import cycler
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 from matplotlib.ticker import FuncFormatter, LogFormatter, LogLocator, NullFormatter, NullLocator
@@ -287,7 +288,10 @@ def variant_styles(names: Sequence[T]) -> dict[T, dict[str, Any]]:
     Line styles differ only if there are more than seven curves. Later curves are on top and thinner, so that equal
     curves remain visible.
     """
-    colours = matplotlib.rcParams["axes.prop_cycle"].by_key().get("color", VARIANT_COLOURS)
+    colours: Sequence[str] = VARIANT_COLOURS
+    if _drawn.get() is not None:
+        cycle = matplotlib.rcParams["axes.prop_cycle"].by_key().get("color", VARIANT_COLOURS)
+        colours = [to_hex(colour) for colour in cycle]
     count = len(colours)
     dashes = ("-", (0, (5, 1.5)), (0, (1, 1)), (0, (5, 1, 1, 1)))
     return {
