@@ -40,6 +40,11 @@ STEPS = tuple(1e-2 / 3.0**k for k in range(9))
 ZERO_ROW = 1e-6
 MODES = {ka.OPEN: "open", ka.SLIDING: "sliding", ka.STICKING: "sticking"}
 _AXES = "xyz"
+# Singular values below this fraction of the largest belong to directions that constraints block; they are rounding
+# errors of about 1e-13.
+BLOCKED = 1e-9
+# Largest part of the state equations that leaves the free directions, relative to the largest entry.
+TURNING = 1e-4
 
 
 @dataclass(frozen=True)
@@ -69,6 +74,8 @@ class Linearization:
     error : float
         Estimated error of the least accurate entry, relative to the largest entry of its row; accurate to a factor of
         about ten.
+    basis : (x, z) ndarray or None
+        Free directions of a reduced system, whose state z describes x = x₀ + basis z; None for the whole state.
     """
 
     A: Array
@@ -83,12 +90,19 @@ class Linearization:
     xdot: Array
     modes: dict[str, str] = field(default_factory=dict)
     error: float = 0.0
+    basis: Array | None = None
+
+    def reduced_state(self, x: Array) -> Array:
+        """Return the state z of a reduced system, (z,), for a state x, (x,), with the least distance from it."""
+        assert self.basis is not None
+        z: Array = np.linalg.pinv(self.basis) @ (np.asarray(x) - self.x)
+        return z
 
     def __iter__(self) -> Iterator[Array]:
         return iter((self.A, self.B, self.C, self.D))
 
 
-def linearized(prepared: Prepared, inputs: Sequence[str], outputs: Sequence[str]) -> Linearization:
+def linearized(prepared: Prepared, inputs: Sequence[str], outputs: Sequence[str], reduced: bool) -> Linearization:
     """Linearize a run at its present state and time, see :meth:`dynsim.Simulation.linearize`."""
     frozen = _Frozen(prepared)
     entries = _selected("input", inputs, frozen.inputs())
@@ -101,12 +115,21 @@ def linearized(prepared: Prepared, inputs: Sequence[str], outputs: Sequence[str]
     robot = prepared.model.robot
     circuits = [m.joint for a, m in enumerate(robot.motors) if prepared.system.drives.table[a, ka.CIRCUIT] >= 0]
     names = [("q", robot.position_names), ("v", robot.joint_names), ("current", circuits)]
+    states = tuple(f"{kind}.{label}" for kind, labels in names for label in labels)
+    basis = _free_states(frozen, by_x[:n], len(robot.position_names), len(robot.joint_names)) if reduced else None
+    if basis is not None:
+        left, count = np.linalg.pinv(basis), (basis.shape[1] - len(circuits)) // 2
+        states = tuple(f"{kind}.free_{k}" for kind in ("q", "v") for k in range(1, count + 1))
+        states += tuple(f"current.{joint}" for joint in circuits)
+        by_x = np.vstack([left @ by_x[:n], by_x[n:]]) @ basis
+        by_u = np.vstack([left @ by_u[:n], by_u[n:]])
+    order = len(states)
     return Linearization(
-        A=by_x[:n],
-        B=by_u[:n],
-        C=by_x[n:],
-        D=by_u[n:],
-        states=tuple(f"{kind}.{label}" for kind, labels in names for label in labels),
+        A=by_x[:order],
+        B=by_u[:order],
+        C=by_x[order:],
+        D=by_u[order:],
+        states=states,
         inputs=tuple(entries),
         outputs=tuple(columns),
         time=frozen.time,
@@ -117,7 +140,41 @@ def linearized(prepared: Prepared, inputs: Sequence[str], outputs: Sequence[str]
             for k, contact in enumerate(prepared.contacts)
         },
         error=max([error_x, *(error for _, error in parts)]),
+        basis=basis,
     )
+
+
+def _free_states(frozen: _Frozen, A: Array, n_q: int, n_v: int) -> Array:
+    """Return a basis, (x, z), of the states that the active constraints leave free: free motions, and all currents.
+
+    Forces on the bodies accelerate them in the free directions only, whatever blocks the others: contacts, stops,
+    couplings, joints at rest by friction.
+
+    Raises
+    ------
+    ScenarioError
+        If the free directions turn so fast that the equations leave them.
+    """
+    from scipy.linalg import block_diag  # imported here because it loads slowly
+
+    inputs, nothing = frozen.inputs(), np.zeros(0, dtype=int)
+    pushes = [*inputs["force"].values(), *inputs["torque"].values()]
+    # With fixed modes accelerations are linear in the forces, so one difference is exact.
+    rates = [push(nothing, np.ones(1)) - push(nothing, -np.ones(1)) for push in pushes]
+    accelerations = np.stack(rates, axis=1)[n_q : n_q + n_v]
+    directions, sizes, _ = np.linalg.svd(accelerations, full_matrices=False)
+    free = directions[:, sizes > BLOCKED * sizes[0]]
+    turned = A[:n_q, n_q : n_q + n_v] @ free
+    basis = block_diag(turned, free, np.eye(len(A) - n_q - n_v))
+    moved = A @ basis
+    leaving = moved - basis @ (np.linalg.pinv(basis) @ moved)
+    motion = slice(0, n_q + n_v)
+    if np.abs(leaving[motion]).max() > TURNING * np.abs(moved[motion]).max():
+        raise ScenarioError(
+            "Simulation.linearize: reduced=True requires a state near rest; here the directions that the contacts "
+            "leave free turn too fast; advance to an instant at which the robot rests"
+        )
+    return basis
 
 
 class _Frozen:

@@ -1021,7 +1021,11 @@ class Simulation:
         self._restart()
 
     def linearize(
-        self, inputs: Sequence[str] = ("command",), outputs: Sequence[str] = ("hand_position",)
+        self,
+        inputs: Sequence[str] = ("command",),
+        outputs: Sequence[str] = ("hand_position",),
+        *,
+        reduced: bool = False,
     ) -> Linearization:
         """Linearize the complete system about the present state: δẋ = A δx + B δu, δy = C δx + D δu.
 
@@ -1035,6 +1039,9 @@ class Simulation:
         outputs : sequence of str, optional
             ``q``, ``v``, ``current``, ``vdot``, ``voltage``, ``motor_torque``, ``hand_position``,
             ``contact_normal_force``, ``contact_force``, ``contact_gap``, or their members.
+        reduced : bool, optional
+            Whether the state contains free motions only, without the directions that contacts, stops and couplings
+            block. Controllers such as an LQR require it, because no input moves a blocked direction.
 
         Returns
         -------
@@ -1045,7 +1052,7 @@ class Simulation:
         ------
         ScenarioError
             If an input or output does not exist, or with ``integrator.method: time_stepping``, which has no modes
-            between its steps.
+            between its steps; with ``reduced`` also if the robot moves too fast.
 
         Notes
         -----
@@ -1071,7 +1078,7 @@ class Simulation:
             if self._prepared.run.count[ki.STARTED] == 0:
                 # Contact modes are chosen at the start of a step; no step is taken here.
                 driver.advance(self._prepared.system, self._prepared.workspace, self._prepared.run, 0)
-            return linearized(self._prepared, inputs, outputs)
+            return linearized(self._prepared, inputs, outputs, reduced)
         finally:
             self._restore_arrays(before)
 

@@ -7,6 +7,8 @@ test_commands.py looks at what it says.
 
 from __future__ import annotations
 
+import contextlib
+import io
 import os
 import re
 import shlex
@@ -68,4 +70,6 @@ def test_a_page_runs(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
                 for line in text.strip().splitlines():
                     assert words(line) in words(printed), f"{page}: {line!r} is not in\n{printed}"
             case "python":
-                exec(compile(text, page, "exec"), names)
+                with contextlib.redirect_stdout(io.StringIO()) as output:
+                    exec(compile(text, page, "exec"), names)
+                printed = output.getvalue()

@@ -286,3 +286,58 @@ def test_time_stepping_is_refused_in_words() -> None:
     simulation = Simulation(load_scenario("elbow_comparison_floor", overrides={"integrator.method": "time_stepping"}))
     with raises(DynsimError, "Simulation.linearize", "integrator.method: auto"):
         simulation.linearize()
+
+
+@pytest.mark.parametrize(
+    ("name", "variant", "changes", "blocked"),
+    [
+        ("elbow_comparison", "no_elbow", {}, 0),
+        ("elbow_comparison_floor", "elbow_7", {"contacts.friction": 0.8}, 3),  # sticks
+        ("elbow_comparison_floor", "elbow_7", {"contacts.friction": 0.0}, 1),  # slides
+    ],
+)
+def test_the_reduced_system_has_the_free_motions_only(name: str, variant: str, changes: dict, blocked: int) -> None:
+    """It loses two zero eigenvalues for each blocked direction, keeps the others, and moves no contact."""
+    changes = {"controller.hand": None, "duration_s": 2.5, **changes}
+    simulation = Simulation(load_scenario(name, variant, changes))
+    simulation.advance(2.0)
+    whole = simulation.linearize(outputs=["hand_position", "contact_gap"])
+    small = simulation.linearize(outputs=["hand_position", "contact_gap"], reduced=True)
+    assert len(small.states) == len(small.A) == len(whole.A) - 2 * blocked
+    assert small.basis is not None
+    assert small.basis.shape == (30, 30 - 2 * blocked)
+    ours, theirs = (np.sort_complex(np.linalg.eigvals(linear.A)) for linear in (small, whole))
+    lasting = theirs[np.argsort(np.abs(theirs))[2 * blocked :]]
+    assert_near(ours, np.sort_complex(lasting), 1e-6)
+    assert_near(whole.A @ small.basis, small.basis @ small.A, 1e-6)
+    gaps = [k for k, label in enumerate(whole.outputs) if label.startswith("contact_gap.elbow_7")]
+    assert np.abs(small.C[gaps]).max(initial=0.0) < (1e-9 if blocked else np.inf)
+    # The same response of the hand to a voltage, at every frequency.
+    for frequency in (1.0, 30.0, 300.0):
+        response = [
+            linear.C[:3] @ np.linalg.solve(1j * frequency * np.eye(len(linear.A)) - linear.A, linear.B)
+            for linear in (whole, small)
+        ]
+        assert np.abs(response[1] - response[0]).max() < 1e-6 * np.abs(response[0]).max()
+
+
+def test_a_reduced_state_is_that_of_a_free_motion() -> None:
+    changes = {"controller.hand": None, "duration_s": 2.5, "contacts.friction": 0.8}
+    simulation = Simulation(load_scenario("elbow_comparison_floor", "elbow_7", changes))
+    simulation.advance(2.0)
+    small = simulation.linearize(reduced=True)
+    assert small.basis is not None
+    z = np.random.default_rng(0).normal(size=len(small.states))
+    assert_near(small.reduced_state(small.x + small.basis @ z), z, 1e-10)
+    simulation.set_wrench("link_10", force=[0.0, 0.0, -0.5])
+    state = simulation.advance(2.02)
+    x = np.concatenate([state.q, state.v, state.current])
+    off = x - small.x - small.basis @ small.reduced_state(x)
+    assert np.abs(off[:10]).max() < 1e-3 * np.abs((x - small.x)[:10]).max()
+
+
+def test_fast_motion_has_no_reduced_system() -> None:
+    simulation = Simulation(load_scenario("elbow_comparison_floor", "elbow_7"))
+    simulation.advance(0.05)
+    with raises(DynsimError, "near rest"):
+        simulation.linearize(reduced=True)
