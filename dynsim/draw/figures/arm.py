@@ -18,6 +18,7 @@ FIGURES: dict[str, Callable[[Record], Figure | None]] = {
     "energy_ledger": energy.ledger,
     "contact_forces": contacts.forces,
     "motors": energy.motors,
+    "torques": energy.torques,
     "posture": posture.posture,
     "base": base.top_view,
     "overturning": base.overturning,

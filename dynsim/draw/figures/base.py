@@ -66,12 +66,11 @@ def overturning(record: Record) -> Figure | None:
         style.legend_above(panels[-1], columns=4)
     note = []
     if np.nanmax(traction, initial=0.0) > TRACTION_TOP:
-        note.append(f"traction demand cut off at {TRACTION_TOP:g}: almost no load")
+        note.append(f"Traction demand: cut off at {TRACTION_TOP:g}, which a wheel with almost no load exceeds.")
     if bare.any():
-        note.append(f"undefined if a wheel carries no load: {percent(float(bare.mean()))} of the samples")
-    last = rows[2][-1]
-    last.set_xlabel("\n".join([last.get_xlabel(), *note]))
-    contacts.mark_all(rows, record)
+        note.append(f"No traction demand if a wheel carries no load: {percent(float(bare.mean()))} of the samples.")
+    figure.note(*note)
+    contacts.mark_all(figure, rows, record)
     return figure
 
 
@@ -94,7 +93,7 @@ def margin_comparison(records: Mapping[str, Record]) -> Figure | None:
         _frame_margin(axes)
         _mark_tipping(axes, some, [styles[name]["color"] for name in shown])
     panels[0].set_ylabel("tip margin")
-    contacts.mark_variants([panels], shown, styles)
+    contacts.mark_variants(figure, [panels], shown, styles)
     style.legend_below(figure, panels[-1:], 1)
     return figure
 
@@ -144,7 +143,7 @@ def tracking(record: Record) -> Figure | None:
                 axes.axhline(0.0, color=style.GREY, linewidth=0.6)
         panels[0].set_ylabel(name)
         style.legend_above(panels[-1], columns=4)
-    contacts.mark_all(rows, record)
+    contacts.mark_all(figure, rows, record)
     figure.align_ylabels([panels[0] for panels in rows])
     return figure
 

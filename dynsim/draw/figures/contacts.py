@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.transforms import ScaledTranslation
 
 from dynsim.draw.figures import style
@@ -21,25 +22,22 @@ from dynsim.record import Record
 from dynsim.record.content import Event
 from dynsim.record.measures import percent
 
-# Kinds of events that are marked: matplotlib marker, the same marker as a character, and its meaning. Other kinds of
-# events have separate figures.
-MARKS: dict[str, tuple[str, str, str]] = {
-    "landing": ("v", "▼", "landing"),
-    "lift_off": ("^", "▲", "lift-off"),
-    "bounce": ("o", "●", "bounce"),
-    "slip_start": (">", "▶", "slip starts"),
-    "slip_stop": ("s", "■", "slip stops"),
-    "stop_hit": ("P", "✚", "joint stop hit"),
-    "stop_left": ("X", "✖", "joint stop left"),
-    "chatter": ("*", "★", "chatter"),
+# Kinds of events that are marked: marker and meaning. Other kinds of events have separate figures.
+MARKS = {
+    "landing": ("v", "landing"),
+    "lift_off": ("^", "lift-off"),
+    "bounce": ("o", "bounce"),
+    "slip_start": (">", "slip starts"),
+    "slip_stop": ("s", "slip stops"),
+    "stop_hit": ("P", "joint stop hit"),
+    "stop_left": ("X", "joint stop left"),
+    "chatter": ("*", "chatter"),
 }
 COLOUR = "#555555"
 # Maximum number of events with vertical lines; more lines would hide the curves.
 LINES = 40
 # Distance of the marks from the upper edge, and between rows of marks [point].
 BELOW, MARK_ROW = 4.0, 6.0
-# Maximum line length of the legend of marks, which fits below the narrowest panel.
-WIDEST = 50
 
 
 def marked(record: Record, names: Iterable[str] | None = None) -> list[Event]:
@@ -58,7 +56,7 @@ def mark(axes: Axes, events: Sequence[Event], colour: str = COLOUR, *, row: int 
     down = ScaledTranslation(0.0, -(BELOW + MARK_ROW * row) / 72.0, axes.figure.dpi_scale_trans)
     transform = axes.get_xaxis_transform() + down
     look: dict[str, Any] = {"color": colour, "markersize": 3.2, "markeredgewidth": 0.0, "zorder": 6, "clip_on": False}
-    for kind, (marker, _, _) in MARKS.items():
+    for kind, (marker, _) in MARKS.items():
         times = [event.time for event in inside if event.kind == kind]
         if not times:
             continue
@@ -69,13 +67,13 @@ def mark(axes: Axes, events: Sequence[Event], colour: str = COLOUR, *, row: int 
     axes.set_xlim(low, high)
 
 
-def mark_all(rows: Sequence[Sequence[Axes]], record: Record) -> None:
-    """Mark all events of a run in every panel, with a legend below the last one."""
+def mark_all(figure: style.Drawing, rows: Sequence[Sequence[Axes]], record: Record) -> None:
+    """Mark all events of a run in every panel, with a legend below the figure."""
     events = marked(record)
     for panels in rows:
         for axes in panels:
             mark(axes, events)
-    explain(rows[-1][-1], events)
+    explain(figure, events)
 
 
 def height_of_variants(records: Mapping[str, Record]) -> float:
@@ -84,9 +82,12 @@ def height_of_variants(records: Mapping[str, Record]) -> float:
 
 
 def mark_variants(
-    rows: Sequence[Sequence[Axes]], records: Mapping[str, Record], styles: Mapping[str, Mapping[str, Any]]
+    figure: style.Drawing,
+    rows: Sequence[Sequence[Axes]],
+    records: Mapping[str, Record],
+    styles: Mapping[str, Mapping[str, Any]],
 ) -> None:
-    """Mark the events of several runs above every panel, one coloured row per run, with a legend below the last panel.
+    """Mark the events of several runs above every panel, one coloured row per run, with a legend below the figure.
 
     Inside the panel the marks would cover the curves of other variants.
     """
@@ -98,34 +99,25 @@ def mark_variants(
                 mark(axes, events, styles[name]["color"], row=-1 - row, lines=len(everything) <= LINES)
             # A blank title reserves the space for the marks.
             axes.set_title(" ", fontsize=1.0, y=1.0, pad=MARK_ROW * len(having))
-    explain(rows[-1][-1], everything)
+    explain(figure, everything)
 
 
-def explain(axes: Axes, events: Sequence[Event]) -> None:
-    """Add a legend of the marks, with the number of events, below the label of the time axis."""
+def explain(figure: style.Drawing, events: Sequence[Event]) -> None:
+    """Add the marks, with the number of events, to the legend below a figure."""
     count = Counter(event.kind for event in events)
-    lines = [axes.get_xlabel()]
-    for part in (f"{sign} {text} ({count[kind]})" for kind, (_, sign, text) in MARKS.items() if count[kind]):
-        joined = f"{lines[-1]}   {part}"
-        if len(lines) == 1 or len(joined) > WIDEST:
-            lines.append(part)
-        else:
-            lines[-1] = joined
-    if len(lines) > 1:
-        axes.set_xlabel("\n".join(lines))
+    look: dict[str, Any] = {"color": COLOUR, "linestyle": "none", "markersize": 4.0, "markeredgewidth": 0.0}
+    kinds = {f"{text} ({count[kind]})": marker for kind, (marker, text) in MARKS.items() if count[kind]}
+    handles = {label: Line2D([], [], marker=marker, **look) for label, marker in kinds.items()}
+    figure.put_below(handles, 4, last=True)
 
 
 # Maximum number of rows on a page; height of a row [inch].
 ROWS, ROW = 8, 1.75
 # Maximum number of samples that are drawn as dots.
 DOTS = 150
-# Modes by number: name, colour of the bands, and summary key of the fraction of time.
+# Colours of the bands for the modes, by number.
 MODE = "contact_mode"
-MODES = (
-    ("open", "#EFEFEF", "closed_fraction"),
-    ("slides", "#FCE3B0", "sliding_fraction"),
-    ("sticks", "#BFE6D8", "sticking_fraction"),
-)
+BANDS = {"open": "#EFEFEF", "slides": "#FCE3B0", "sticks": "#BFE6D8"}
 
 
 def forces(record: Record) -> Figure | None:
@@ -161,7 +153,9 @@ def _forces(records: Mapping[str, Record], title: str) -> Figure | None:
         for axes in panels:
             for row, (variant, record) in enumerate(having[name].items()):
                 force, colour = _force(record, name), str(styles[variant]["color"])
-                label = f"{variant or name}: {_share(record, name)}{_within(record, name)}"
+                label = (
+                    f"{variant or name}: {_share(record, name)}{_modes(record, name) * alone}{_within(record, name)}"
+                )
                 style.line(axes, record.time, force, label=label, **styles[variant])
                 for value in _extremes(record, name):
                     axes.axhline(value, color=colour, linestyle=(0, (5, 3)), linewidth=0.7)
@@ -176,10 +170,12 @@ def _forces(records: Mapping[str, Record], title: str) -> Figure | None:
                     _draw_samples(axes, record, name, colour)
             if not all(map(is_unilateral, having[name].values())):
                 style.shade_below_zero(axes, "surface pulls")
-        panels[0].set_ylabel(f"{name}\nfₙ [N]")
-        style.legend_above(panels[-1], columns=4 if alone else 2)
-    _note_sampling(rows, runs)
-    explain(rows[-1][-1], [event for record in runs for event in marked(record, chosen)])
+        panels[0].set_ylabel(f"{name}\nnormal force [N]")
+        style.legend_above(panels[-1], columns=2)
+    _note_sampling(figure, rows, runs)
+    bands = [bar for panels in rows for bar in panels[-1].collections if str(bar.get_label())[1:] in BANDS]
+    figure.put_below({str(bar.get_label())[1:]: bar for bar in bands}, 4)
+    explain(figure, [event for record in runs for event in marked(record, chosen)])
     return figure
 
 
@@ -204,6 +200,13 @@ def _share(record: Record, name: str) -> str:
     state, key = ("closed", "closed_fraction") if is_unilateral(record) else ("pulling", "pulling_fraction")
     contact = _summary(record, name)
     return f"{state} {percent(contact[key])} of the run" if contact else f"{state} for an unknown time"
+
+
+def _modes(record: Record, name: str) -> str:
+    contact = _summary(record, name)
+    if not contact or not is_unilateral(record):
+        return ""
+    return f" (slides {percent(contact['sliding_fraction'])}, sticks {percent(contact['sticking_fraction'])})"
 
 
 def _within(record: Record, name: str) -> str:
@@ -241,17 +244,13 @@ def _draw_samples(axes: Axes, record: Record, name: str, colour: str) -> None:
         axes.plot(record.time[inside], _force(record, name)[inside], ".", color=colour, markersize=2.5)
 
 
-def _note_sampling(rows: Sequence[Sequence[Axes]], records: Sequence[Record]) -> None:
-    """Add a note below the last panel about the sampling interval and the dashed lines."""
+def _note_sampling(figure: style.Drawing, rows: Sequence[Sequence[Axes]], records: Sequence[Record]) -> None:
+    """Add a note about the sampling interval and the dashed lines."""
     steps = [float(np.median(np.diff(record.time))) for record in records if len(record) > 1]
-    if not steps:
-        return
-    note = f"sampled every {style.number(1e3 * max(steps), 3)} ms"
-    if any(line.get_marker() == "." for panels in rows for line in panels[0].get_lines()):
-        note += " (dots)"
-    note += "; dashed: extremes of all steps"
-    last = rows[-1][-1]
-    last.set_xlabel(f"{last.get_xlabel()}\n{note}")
+    if steps:
+        dots = any(line.get_marker() == "." for panels in rows for line in panels[0].get_lines())
+        sampled = f"Sampled every {style.number(1e3 * max(steps), 3)} ms{' (dots)' * dots}."
+        figure.note(f"{sampled} Dashed lines: extremes over all integration steps.")
 
 
 def _force(record: Record, name: str) -> Array:
@@ -289,16 +288,11 @@ def mode_bands(record: Record, name: str) -> list[tuple[float, float, int]]:
 
 
 def _draw_modes(axes: Axes, record: Record, name: str) -> None:
-    """Draw bands behind the curve for open, sliding and sticking, with the fraction of the run in the legend."""
-    bands, contact = mode_bands(record, name), _summary(record, name)
-    limits = axes.get_xlim()
-    for mode, (text, colour, key) in enumerate(MODES):
+    """Draw bands behind the curve for open, sliding and sticking."""
+    bands, limits = mode_bands(record, name), axes.get_xlim()
+    look: dict[str, Any] = {"transform": axes.get_xaxis_transform(), "linewidth": 0, "zorder": 0.2}
+    for mode, (text, colour) in enumerate(BANDS.items()):
         spans = [(begin, end - begin) for begin, end, which in bands if which == mode]
-        share = None if not contact else contact[key] if mode else 1.0 - contact[key]
-        if not spans and not share:
-            continue
-        label = text if share is None else f"{text} {percent(share)}"
-        axes.broken_barh(
-            spans, (0.0, 1.0), transform=axes.get_xaxis_transform(), color=colour, linewidth=0, zorder=0.2, label=label
-        )
+        if spans:
+            axes.broken_barh(spans, (0.0, 1.0), color=colour, label=f"_{text}", **look)
     axes.set_xlim(limits)

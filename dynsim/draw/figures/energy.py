@@ -56,18 +56,18 @@ def energy(record: Record) -> Figure | None:
     top, bottom = figure.subplots(2, 1, sharex=True)
     net, drawn = record["energy_electrical"], record["energy_electrical_drawn"]
     apart = bool(np.abs(drawn - net).max() > DIFFER * np.abs(drawn).max())
-    label = f"net ∫ Σ u·i dt: {_joules(net)}" + ("" if apart else f" (drawn ∫ Σ max(u·i, 0) dt: {_joules(drawn)})")
+    label = f"net: {_joules(net)}" + ("" if apart else f" (drawn, without recovery: {_joules(drawn)})")
     style.line(top, record.time, net, label=label, color=style.BLUE, lw=1.8)
     if apart:
-        label = f"drawn ∫ Σ max(u·i, 0) dt: {_joules(drawn)}"
+        label = f"drawn, without recovery: {_joules(drawn)}"
         style.line(top, record.time, drawn, label=label, color=style.ORANGE, linestyle=(0, (4, 3)))
-    top.set_ylabel("electrical energy [J]")
+    top.set_ylabel("electrical\nenergy [J]")
     work = record["work_mechanical"]
-    style.line(bottom, record.time, work, label=f"∫ Σ τ·q̇ dt: {_joules(work)}", color=style.GREEN)
+    style.line(bottom, record.time, work, label=f"of the motors on the joints: {_joules(work)}", color=style.GREEN)
     bottom.axhline(0.0, color=style.GREY, linewidth=0.6)
-    bottom.set_ylabel("mechanical work [J]")
+    bottom.set_ylabel("mechanical\nwork [J]")
     bottom.set_xlabel("time [s]")
-    contacts.mark_all([(top,), (bottom,)], record)
+    contacts.mark_all(figure, [(top,), (bottom,)], record)
     for axes in (top, bottom):
         style.legend_above(axes, columns=2)
     return figure
@@ -78,13 +78,18 @@ def energy_comparison(records: Mapping[str, Record]) -> Figure | None:
     shown = {name: record for name, record in records.items() if has_motors(record)}
     if not shown:
         return None
-    height = 5.0 + 2.0 * contacts.height_of_variants(shown)
-    figure = style.new_figure(
-        height, style.comparison_title(list(shown.values()), "electrical energy and mechanical work")
-    )
-    grid = figure.add_gridspec(2, 2, width_ratios=[1.6, 1.0])
-    over_time, total = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[:, 1])
-    work = figure.add_subplot(grid[1, 0], sharex=over_time)
+    height = 4.6 + 2.0 * contacts.height_of_variants(shown)
+    title = style.comparison_title(list(shown.values()), "electrical energy and mechanical work")
+    figure = style.new_figure(height + 2.2 * style.narrow(), title)
+    # In a narrow figure, the totals are below the curves.
+    if style.narrow():
+        grid = figure.add_gridspec(3, 1, height_ratios=[1.0, 1.0, 1.1])
+        cells = grid[0], grid[2], grid[1]
+    else:
+        grid = figure.add_gridspec(2, 2, width_ratios=[1.6, 1.0])
+        cells = grid[0, 0], grid[:, 1], grid[1, 0]
+    over_time, total = (figure.add_subplot(cell) for cell in cells[:2])
+    work = figure.add_subplot(cells[2], sharex=over_time)
     finals = np.array([record["energy_electrical"][-1] for record in shown.values()])
     logarithmic = bool(finals.min() > 0.0 and finals.max() > LOG_RATIO * finals.min())
     least = 0.02 * float(finals.min())
@@ -96,14 +101,16 @@ def energy_comparison(records: Mapping[str, Record]) -> Figure | None:
         style.log_axis(over_time)
         # Values in the first milliseconds would extend the axis by many almost empty decades.
         over_time.set_ylim(least, 1.6 * finals.max())
-    over_time.set_ylabel("electrical energy [J]")
+    over_time.set_ylabel("electrical\nenergy [J]")
     over_time.tick_params(labelbottom=False)
     work.axhline(0.0, color=style.GREY, linewidth=0.6)
-    work.set_ylabel("mechanical work [J]")
+    work.set_ylabel("mechanical\nwork [J]")
     work.set_xlabel("time [s]")
-    contacts.mark_variants([(over_time,), (work,)], shown, styles)
+    contacts.mark_variants(figure, [(over_time,), (work,)], shown, styles)
     _totals(total, list(shown), finals, [str(styles[name]["color"]) for name in shown], logarithmic)
     style.legend_below(figure, [over_time], 5)
+    if logarithmic:
+        figure.note("Fractions at the totals: relative to the largest.")
     return figure
 
 
@@ -122,29 +129,35 @@ def ledger(record: Record) -> Figure | None:
     turnover = energy_turnover(record)
     dominant = bool(np.abs(terms["heat_joule"]).max() > DOMINANT * turnover > 0.0)
     near = bool(np.abs(record["energy_residual"]).max() > SMALL_RESIDUAL * RESIDUAL_LIMIT * turnover > 0.0)
-    figure = style.new_figure(3.9 + 1.3 * near, style.title(record, "energy ledger"))
-    grid = figure.add_gridspec(1 + near, 1 + dominant, width_ratios=[3.2, 1.0][: 1 + dominant])
-    if near:
-        grid.set_height_ratios([2.4, 1.0])
-    whole = figure.add_subplot(grid[0, -1])
+    below = dominant and style.narrow()
+    figure = style.new_figure(3.5 + 1.3 * near + 1.7 * below, style.title(record, "energy ledger"))
+    # The panel with all terms is to the right of the main panel or, in a narrow figure, below it.
+    rows, columns = 1 + near + below, 1 + (dominant and not below)
+    widths, heights = [3.2, 1.0][:columns], [2.4, *[1.6] * below, *[1.0] * near]
+    grid = figure.add_gridspec(rows, columns, width_ratios=widths, height_ratios=heights)
+    whole = figure.add_subplot(grid[1 if below else 0, -1])
     _stack(whole, record.time, terms, supplied, source)
     main = whole
     if dominant:
         whole.set_title("with Joule heat", loc="left")
-        whole.set_xlabel("time [s]")
+        whole.set_xlabel("time [s]" if not below else "")
         main = figure.add_subplot(grid[0, 0], sharex=whole)
         others = {name: values for name, values in terms.items() if name != "heat_joule"}
         _stack(main, record.time, others, supplied - terms["heat_joule"], source)
         main.set_title("without Joule heat", loc="left")
     main.set_ylabel("energy since start [J]")
-    panels = [main, figure.add_subplot(grid[1, 0], sharex=main)] if near else [main]
+    panels = [main, figure.add_subplot(grid[-1, 0], sharex=main)] if near else [main]
     if near:
         _residual(panels[1], record, turnover)
+    if near or below:
         main.tick_params(labelbottom=False)
-    panels[-1].set_xlabel("time [s]")
-    contacts.mark_all([(axes,) for axes in panels], record)
+    if below:
+        whole.set_ylabel("energy since start [J]")
+        whole.tick_params(labelbottom=not near)
+    (panels[-1] if near or not below else whole).set_xlabel("time [s]")
+    contacts.mark_all(figure, [(axes,) for axes in panels], record)
     if not near:
-        panels[-1].set_xlabel(f"{panels[-1].get_xlabel()}\n{_residual_note(record, turnover)}")
+        figure.note(_residual_note(record, turnover))
     style.legend_below(figure, [whole], 3)
     return figure
 
@@ -152,9 +165,10 @@ def ledger(record: Record) -> Figure | None:
 def _residual_note(record: Record, turnover: float) -> str:
     largest = float(np.abs(record["energy_residual"]).max())
     if not turnover > 0.0:
-        return f"unexplained: at most {style.number(largest, 2)} J"
+        return f"Unexplained energy: at most {style.number(largest, 2)} J."
     share = style.number(largest / turnover, 2)
-    return f"unexplained: at most {style.number(largest, 2)} J, {share} of the turnover (limit {RESIDUAL_LIMIT:g})"
+    limit = style.number(RESIDUAL_LIMIT)
+    return f"Unexplained energy: at most {style.number(largest, 2)} J, {share} of the turnover (limit {limit})."
 
 
 def _stack(axes: Axes, time: Array, terms: Mapping[str, Array], supplied: Array, source: str) -> None:
@@ -165,7 +179,7 @@ def _stack(axes: Axes, time: Array, terms: Mapping[str, Array], supplied: Array,
         base = np.zeros(len(kept))
         for name, values in terms.items():
             part = clip(values[kept], 0.0)
-            if not np.any(part):
+            if not np.abs(part).max(initial=0.0) > NOTHING * largest:
                 continue
             text, colour = TERMS[name]
             known = axes.get_legend_handles_labels()[1]
@@ -200,7 +214,9 @@ def _residual(axes: Axes, record: Record, turnover: float) -> None:
             color=style.PULLING,
             fontsize=style.letters(7.0),
         )
-    axes.set_ylabel("unexplained\n[J]")
+        # The first steps would extend the axis by many empty decades.
+        axes.set_ylim(bottom=max(axes.get_ylim()[0], 1e-3 * limit))
+    axes.set_ylabel("unexplained\nenergy [J]")
 
 
 def _totals(axes: Axes, names: Sequence[str], values: Array, colours: Sequence[str], logarithmic: bool) -> None:
@@ -230,7 +246,7 @@ def _totals(axes: Axes, names: Sequence[str], values: Array, colours: Sequence[s
         axes.annotate(text, (x, max(value, 0.0)), xytext=(0, 6 if logarithmic else 2), **look)
     axes.set_xticks(places, names, rotation=30 if len(names) <= 4 else 60, ha="right")
     axes.grid(axis="x", visible=False)
-    axes.set_title("electrical energy of the run, net [J]" + (",\nand relative to the largest" if logarithmic else ""))
+    axes.set_ylabel("electrical energy\nof the run, net [J]")
 
 
 def _joules(values: Array, largest: float = 0.0) -> str:
@@ -239,46 +255,108 @@ def _joules(values: Array, largest: float = 0.0) -> str:
     return f"{style.number(0.0 if abs(last) < NOTHING * largest else last)} J"
 
 
-# Motor currents and voltages. Maximum number of motors with separate lines, selected by their currents; if there are
-# more motors, the envelope of all motors is drawn too.
+# Motors. Maximum number with separate lines; if there are more, the envelope of all motors is drawn too.
 LARGEST = 6
+# Name, unit, and keys of limit and rating in the summary of loads of motors, by the unit in the keys.
+TORQUES = {
+    "N_m": ("torque", "N m", "stall_torque_N_m", "nominal_torque_N_m"),
+    "N": ("force", "N", "stall_force_N", "nominal_force_N"),
+}
+# A limit above this multiple of the largest value is in the notes, because its line would compress the curves.
+FAR = 3.0
+LIMIT: dict[str, Any] = {"linestyle": "--", "linewidth": 0.9}
+RATING: dict[str, Any] = {"linestyle": (0, (1, 1.5)), "linewidth": 1.1}
 
 
 def motors(record: Record) -> Figure | None:
-    """Draw motor currents and terminal voltages; return None without motors."""
+    """Draw torques, currents and voltages of the motors, with limits and ratings; return None without currents."""
     if "current" not in record or record["current"].shape[1] == 0:
         return None
-    signals = (("current", "current [A]"), ("voltage", "voltage [V]"))
-    count = record["current"].shape[1]
-    # Select the motors by their current after the start, when all are active; both panels show the same motors.
-    settled = record.time >= record.settle_time
-    late = settled if settled.any() else slice(None)
-    effort = np.sqrt((record["current"][late] ** 2).mean(axis=0))
-    shown = np.arange(count) if count <= LARGEST else np.sort(np.argsort(effort)[::-1][:LARGEST])
-    figure = style.new_figure(4.4, style.title(record, "motor currents and voltages"))
-    rows = style.time_rows(
-        figure, [[(record.time, record[name])] for name, _ in signals], record.settle_time, compress=True
+    loads = {motor["joint"]: motor for motor in record.summary.get("motors", ())}
+    volts = None if record.scene is None else record.scene.voltage_limit
+    units = [unit for unit in TORQUES if any(f"{TORQUES[unit][0]}_rms_{unit}" in motor for motor in loads.values())]
+    label = " or ".join(f"{TORQUES[unit][0]} [{TORQUES[unit][1]}]" for unit in units) or "torque [N m]"
+    # Label, limits by joint, and their keys.
+    signals: dict[str, tuple[str, Mapping[str, Any], Sequence[str]]] = {
+        "torque": (label, loads, TORQUES[units[0]][2:] if len(units) == 1 else ()),
+        "current": ("current [A]", loads, ("peak_current_A", "nominal_current_A")),
+        "voltage": ("voltage [V]", {name: {"limit": volts} for name in record.labels["current"]}, ("limit",)),
+    }
+    signals = {name: signal for name, signal in signals.items() if name in record}
+    columns = {name: [record.labels[name].index(joint) for joint in record.labels["current"]] for name in signals}
+    shown = _most_loaded(record)
+    figure = style.new_figure(
+        1.2 + 1.55 * len(signals), style.title(record, "torques, currents and voltages of the motors")
     )
-    looks = style.variant_styles(shown.tolist())
-    for (name, label), panels in zip(signals, rows, strict=True):
+    series = [[(record.time, record[name][:, columns[name]])] for name in signals]
+    rows = style.time_rows(figure, series, record.settle_time, compress=True)
+    for (name, (label, entries, keys)), panels in zip(signals.items(), rows, strict=True):
         for axes in panels:
-            _draw(axes, record, name, shown, looks)
-        panels[0].set_ylabel(label)
-    contacts.mark_all(rows, record)
-    named = f"{LARGEST} largest by\nrms current" if count > LARGEST else None
-    figure.legend(
-        *rows[0][-1].get_legend_handles_labels(),
-        loc="outside right center",
-        title=named,
-        title_fontsize=style.letters(7.5),
-    )
+            _draw(axes, record, name, columns[name], shown)
+        _draw_limits(figure, panels[-1], [entries.get(record.labels["current"][k], {}) for k in shown], keys, label)
+        panels[0].set_ylabel(label.replace(" [", "\n["))
+    style.legend_below(figure, [panels[-1] for panels in rows], 4)
+    contacts.mark_all(figure, rows, record)
+    if len(shown) < record["current"].shape[1]:
+        figure.note(f"Lines: the {len(shown)} motors with the largest rms current after the start.")
     return figure
 
 
-def _draw(axes: Axes, record: Record, name: str, shown: np.ndarray, looks: Mapping[int, Mapping[str, Any]]) -> None:
-    values, labels = record[name], record.labels[name]
-    called = {} if record.scene is None else record.scene.wheel_names
-    if len(shown) < values.shape[1]:
+def torques(record: Record) -> Figure | None:
+    """Draw the load of each motor next to its limit and rating as bars; return None without loads in the summary."""
+    loads = {
+        unit: [motor for motor in record.summary.get("motors", ()) if f"{name}_rms_{unit}" in motor]
+        for unit, (name, *_) in TORQUES.items()
+    }
+    loads = {unit: motors for unit, motors in loads.items() if motors}
+    if not loads:
+        return None
+    limits = {key for unit, motors in loads.items() for motor in motors for key in TORQUES[unit][2:] if key in motor}
+    subject = "load of each motor, with limit and rating" if limits else "load of each motor"
+    heights = [0.55 + 0.17 * len(motors) for motors in loads.values()]
+    figure = style.new_figure(0.7 + sum(heights), style.title(record, subject))
+    panels = figure.subplots(len(loads), 1, height_ratios=heights, squeeze=False)[:, 0]
+    called = _names(record)
+    for (unit, motors), axes in zip(loads.items(), panels, strict=True):
+        name, symbol, *keys = TORQUES[unit]
+        level = np.arange(len(motors))
+        most, rms = ([motor[f"{name}_{kind}_{unit}"] for motor in motors] for kind in ("max", "rms"))
+        axes.barh(level, most, color="#CFCFCF", height=0.7, label="maximum")
+        axes.barh(level, rms, color=style.BLUE, height=0.4, label="rms")
+        for key, text, look in zip(keys, ("limit (stall)", "rating (for the rms)"), (LIMIT, RATING), strict=True):
+            known = [(motor[key], k) for k, motor in enumerate(motors) if key in motor]
+            for value, k in known:
+                axes.plot([value, value], [k - 0.45, k + 0.45], color=style.PULLING, **look)
+            if known:
+                axes.plot([], [], color=style.PULLING, label=text, **look)
+        axes.set_yticks(level, [called.get(motor["joint"], motor["joint"]) for motor in motors])
+        axes.set(ylim=(len(motors) - 0.4, -0.6), xlabel=f"{name} [{symbol}]")
+        axes.set_xlim(0.0, 1.05 * axes.get_xlim()[1])
+        axes.grid(axis="y", visible=False)
+    style.legend_below(figure, list(panels), 4)
+    if not limits:
+        figure.note("The scenario has neither torque limits nor torque ratings of motors.")
+    return figure
+
+
+def _most_loaded(record: Record) -> list[int]:
+    """Return the positions of the ``LARGEST`` motors with the largest rms currents after the start, in order."""
+    # Select the motors after the start, when all are active.
+    settled = record.time >= record.settle_time
+    effort = np.sqrt((record["current"][settled if settled.any() else slice(None)] ** 2).mean(axis=0))
+    return sorted(np.argsort(-effort, kind="stable")[:LARGEST].tolist())
+
+
+def _names(record: Record) -> Mapping[str, str]:
+    """Return the names of wheels by joint."""
+    return {} if record.scene is None else record.scene.wheel_names
+
+
+def _draw(axes: Axes, record: Record, name: str, columns: Sequence[int], shown: Sequence[int]) -> None:
+    """Draw a signal of the ``shown`` motors as lines, and the envelope of all motors if there are more."""
+    values, labels = record[name][:, columns], [record.labels[name][k] for k in columns]
+    called, looks = _names(record), style.variant_styles(list(shown))
+    if len(shown) < len(labels):
         low, high = values.min(axis=1), values.max(axis=1)
         axes.fill_between(record.time, low, high, color="#CFCFCF", linewidth=0, label=f"all {len(labels)} motors")
     for k in shown:
@@ -286,11 +364,33 @@ def _draw(axes: Axes, record: Record, name: str, shown: np.ndarray, looks: Mappi
     axes.axhline(0.0, color=style.GREY, linewidth=0.6)
 
 
+def _draw_limits(
+    figure: style.Drawing, axes: Axes, motors: Sequence[Mapping[str, Any]], keys: Sequence[str], label: str
+) -> None:
+    """Draw limits and ratings of motors if their lines are near the curves; otherwise add a note."""
+    quantity, _, unit = label.rstrip("]").partition(" [")
+    for key, text, look in zip(keys, ("limit", "rating"), (LIMIT, RATING), strict=False):
+        for value in sorted({float(motor[key]) for motor in motors if motor.get(key) is not None}):
+            low, high = axes.get_ylim()
+            name = f"{text} of the {quantity}: {style.number(value)} {unit}"
+            if value > FAR * max(-low, high):
+                figure.note(f"Beyond the axes: {name}.")
+                continue
+            sides = [side for side in (-value, value) if FAR * max(side * low, side * high) > value * value]
+            for side in sides:
+                axes.axhline(side, color=style.PULLING, label=name if side is sides[-1] else None, **look)
+            axes.set_ylim(min(low, 1.08 * min(sides)), max(high, 1.08 * max(sides)))
+
+
 # Hand and target: paths in three planes, and tracking error over time ([WM] Figs 4–6).
 PLANES = ((0, 1), (0, 2), (1, 2))
+# A path whose extent along an axis is below this fraction of the largest extent is drawn in the other plane only.
+EDGE_ON = 2e-3
 MILLI = 1e3
 # A target that moves by less than this counts as fixed [m].
 HELD = 1e-6
+# Maximum number of legend entries in the free corner of a narrow figure.
+CORNER = 7
 # Legend entries for targets that follow from a hand path, and from the goals of the joints.
 TARGET, GOALS = "target", "goals"
 # Marker for the start position of the hand, which is the same for all variants.
@@ -318,17 +418,37 @@ def _paths(records: Mapping[str, Record], title: str) -> Figure | None:
     shown = {name: record for name, record in records.items() if "hand_position" in record}
     if not shown:
         return None
-    # The height fits three square panels and the legend, without extra space.
-    figure = style.new_figure(2.62 + style.legend_row() * -(-(3 + len(shown)) // 4) / 72.0, title)
-    panels = _planes(figure, list(shown.values()))
+    low, high = _box(list(shown.values()))
+    planes, note = _planes(low, high)
+    wide = not style.narrow()
+    corner = len(planes) == 3 and not wide
+    figure = style.new_figure(2.5 if wide else 3.6 if corner else 1.1 + 2.0 * len(planes), title)
+    if corner:
+        # As in a technical drawing: xz is below xy, and yz beside it.
+        grid = figure.add_gridspec(2, 2)
+        panels = [figure.add_subplot(grid[cell]) for cell in ((0, 0), (1, 0), (1, 1))]
+    else:
+        panels = list(figure.subplots(*((1, len(planes)) if wide else (len(planes), 1)), squeeze=False).ravel())
+    _frame(panels, planes, low, high)
+    if corner:
+        panels[0].set_anchor("S")
     styles = style.variant_styles(list(records))
-    for axes, plane in zip(panels, PLANES, strict=True):
+    for axes, plane in zip(panels, planes, strict=True):
         _draw_target(axes, next(iter(shown.values())), plane)
         for name, record in shown.items():
             position = style.sparse(record["hand_position"][:, plane])
             axes.plot(*position.T, label=name, **styles[name])
             axes.plot(*position[0], **START)
-    _legend_below(figure, panels[0])
+    _add_starts(panels[0])
+    handles, labels = panels[0].get_legend_handles_labels()
+    if corner and len(labels) <= CORNER:
+        free = figure.add_subplot(grid[0, 1])
+        free.set_axis_off()
+        free.legend(handles, [style.broken(label, 1.1) for label in labels], loc="center")
+    else:
+        style.legend_below(figure, panels[:1], 4)
+    if note:
+        figure.note(note)
     return figure
 
 
@@ -345,22 +465,25 @@ def error(record: Record) -> Figure | None:
     looks = style.variant_styles("xyz")
     for axes in rows[0]:
         for k, name in enumerate("xyz"):
-            style.line(axes, record.time, deviation[:, k], label=name, **looks[name])
+            style.line(axes, record.time, deviation[:, k], label=f"${name}$", **looks[name])
     for axes in rows[1]:
-        style.line(axes, record.time, norm, label=_error_label("|e|", record), color=style.BLACK)
+        style.line(axes, record.time, norm, label=_error_label("distance", record), color=style.BLACK)
         axes.set_ylim(bottom=0.0)
-    rows[0][0].set_ylabel(f"hand − {target_name(record)} [mm]")
-    rows[1][0].set_ylabel(f"distance from {target_name(record)} [mm]")
+    rows[0][0].set_ylabel(f"hand − {target_name(record)}\n[mm]")
+    rows[1][0].set_ylabel(f"distance from\n{target_name(record)} [mm]")
     for panels in zip(*rows, strict=True):
         _mark_settle(panels, record)
-    contacts.mark_all(rows, record)
+    contacts.mark_all(figure, rows, record)
     style.legend_above(rows[0][-1], columns=4)
     style.legend_above(rows[1][-1])
     return figure
 
 
 def error_comparison(records: Mapping[str, Record]) -> Figure | None:
-    """Draw the tracking errors of all variants: distance from the target (logarithmic) and vertical error."""
+    """Draw the tracking errors of all variants: distance from the target and vertical error.
+
+    The axis of the distance is logarithmic if the settled distances differ by more than ``LOG_RATIO``.
+    """
     shown = {name: record for name, record in records.items() if hand_target(record) is not None}
     if not shown:
         return None
@@ -378,45 +501,64 @@ def error_comparison(records: Mapping[str, Record]) -> Figure | None:
             style.line(distance, record.time, norms[name], label=_error_label(name, record), **styles[name])
             style.line(vertical, record.time, deviations[name][:, 2], **styles[name])
         _mark_settle((distance, vertical), next(iter(shown.values())))
-    if any((norm > 0.0).any() for norm in norms.values()):
-        late = np.concatenate([norms[name][record.time >= settle] for name, record in shown.items()])
-        _log_rows(rows[0], late[late > 0.0])
-    rows[0][0].set_ylabel("distance from target [mm]")
-    rows[1][0].set_ylabel("vertical error [mm]")
-    contacts.mark_variants(rows, shown, styles)
+    _scale_distances(rows[0], [norms[name][record.time >= settle] for name, record in shown.items()])
+    rows[0][0].set_ylabel("distance from\ntarget [mm]")
+    rows[1][0].set_ylabel("vertical\nerror [mm]")
+    contacts.mark_variants(figure, rows, shown, styles)
     style.legend_below(figure, rows[0][-1:], 2)
     return figure
 
 
-def _log_rows(panels: Sequence[Axes], settled: Array) -> None:
-    """Make the axes logarithmic; axes of the whole run show only the settled range if there is a transient panel."""
+def _scale_distances(panels: Sequence[Axes], settled: Sequence[Array]) -> None:
+    """Set the axes of distances, (n,) [mm] per variant, so that the settled ones of all variants can be read."""
+    typical = [float(np.median(values)) for values in settled if values.size]
+    if not typical or not 0.0 < LOG_RATIO * min(typical) < max(typical):
+        for axes in panels:
+            axes.set_ylim(bottom=0.0)
+        return
+    low = min(float(np.percentile(values, 2.0)) for values in settled if values.size) / 1.3
     for axes in panels:
         axes.autoscale(axis="y")
+        # Distances near zero would extend the axis by many empty decades.
+        axes.set_ylim(max(low, 1e-4 * max(typical)), axes.get_ylim()[1])
         style.log_axis(axes)
-    if len(panels) > 1 and settled.size:
-        panels[-1].set_ylim(float(settled.min()) / 1.3, 1.3 * float(settled.max()))
+    if len(panels) > 1:
+        panels[-1].set_ylim(top=1.3 * max(float(values.max()) for values in settled if values.size))
         style.log_axis(panels[-1])
 
 
-def _planes(figure: Figure, records: list[Record]) -> list[Axes]:
-    """Create three square panels with one scale that contain all hand paths and targets."""
+def _box(records: list[Record]) -> tuple[Array, Array]:
+    """Return the corners of the box with all hand paths and targets [m]."""
     points = [record["hand_position"] for record in records]
     points += [target for record in records if (target := hand_target(record)) is not None]
-    low, high = box_about(points)
+    return box_about(points)
+
+
+def _planes(low: Array, high: Array) -> tuple[Sequence[tuple[int, int]], str]:
+    """Return the planes in which a path is not edge-on, and a note on the coordinate that is omitted."""
+    size = high - low
+    flat = [k for k in range(3) if size[k] < EDGE_ON * size.max()]
+    if len(flat) != 1:
+        return PLANES, ""
+    (k,) = flat
+    constant = f"{style.number(0.5 * (low[k] + high[k]), 3)} m, within {style.number(0.5 * MILLI * size[k], 2)} mm"
+    return [plane for plane in PLANES if k not in plane], f"Coordinate {'xyz'[k]}: {constant}."
+
+
+def _frame(panels: Sequence[Axes], planes: Sequence[tuple[int, int]], low: Array, high: Array) -> None:
+    """Set limits of square panels with equal scale, and label their axes."""
     span = float((high - low).max())
     half = 0.56 * span if span > 0.0 else 0.05
     middle = 0.5 * (low + high)
-    panels = list(figure.subplots(1, 3))
-    for axes, (i, j) in zip(panels, PLANES, strict=True):
+    for axes, (i, j) in zip(panels, planes, strict=True):
         axes.set_aspect("equal", anchor="N")  # put unused space above the legend
         axes.set_xlim(middle[i] - half, middle[i] + half)
         axes.set_ylim(middle[j] - half, middle[j] + half)
-        axes.set_xlabel(f"{'xyz'[i]} [m]")
-        axes.set_ylabel(f"{'xyz'[j]} [m]")
+        axes.set_xlabel(f"${'xyz'[i]}$ [m]")
+        axes.set_ylabel(f"${'xyz'[j]}$ [m]")
         # Use fewer ticks along x, because labels such as "−0.050" are wide.
-        axes.locator_params(axis="x", nbins=4)
+        axes.locator_params(axis="x", nbins=4 if len(planes) == 1 or not style.narrow() else 3)
         axes.locator_params(axis="y", nbins=5)
-    return panels
 
 
 def _draw_target(axes: Axes, record: Record, plane: tuple[int, int]) -> None:
@@ -454,14 +596,14 @@ def edge_on(points: Array) -> Array:
     return points[[int(along.argmin()), int(along.argmax())]]
 
 
-def _legend_below(figure: Figure, axes: Axes) -> None:
+def _add_starts(axes: Axes) -> None:
+    """Add legend entries for the markers at the starts of hand and target."""
     followed = {line.get_label() for line in axes.get_lines() if line.get_linestyle() != "None"}
     axes.plot([], [], label="start of the hand", **START)
     for target in (TARGET, GOALS):
         # A fixed target is itself drawn as a marker.
         if target in followed:
             axes.plot([], [], "x", color=style.BLACK, markersize=5, label=f"start of the {target}")
-    style.legend_below(figure, [axes], 4)
 
 
 def _error_label(name: str, record: Record) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -18,6 +19,8 @@ from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.legend import Legend
 from matplotlib.text import Text
 from matplotlib.ticker import FuncFormatter, LogFormatter, LogLocator, NullFormatter, NullLocator
 from numpy.typing import NDArray
@@ -39,6 +42,8 @@ BLUE, ORANGE, GREEN, PURPLE, SKY, BLACK = "#0072B2", "#E69F00", "#009E73", "#CC7
 # This colour is reserved for pulling contacts in every figure, so no variant uses it.
 PULLING = "#D55E00"
 GREY = "#7F7F7F"
+# Colour of notes, which is dark enough for small letters.
+NOTE = "#555555"
 # Colour of parts of links that are below a surface because they have no contact point.
 DEEP = "#882255"
 VARIANT_COLOURS = (BLUE, GREEN, ORANGE, PURPLE, SKY, BLACK, "#8C6D31")
@@ -58,6 +63,8 @@ _SIZES = {
     "ytick.labelsize": 0.88,
     "figure.titlesize": 1.18,
 }
+# Labels of coordinates, with an italic symbol.
+_COORDINATE = re.compile(r"\$[xyz]\$( \[m+\])?")
 # Mean width of a letter as a multiple of its size, for the breaking of long lines.
 LETTER = 0.56
 DPI = 170
@@ -109,8 +116,9 @@ def look(wanted: Look | None = None) -> Iterator[None]:
     wanted = wanted or Look()
     with matplotlib.rc_context():
         _apply_styles(wanted.styles)
-        default = matplotlib.rcParamsDefault
-        changed = {key for key in (*_LOOK, *_SIZES, "font.size") if matplotlib.rcParams[key] != default[key]}
+        now: Any = matplotlib.rcParams
+        default: Any = matplotlib.rcParamsDefault
+        changed = {key for key in (*_LOOK, *_SIZES, "font.size") if now[key] != default[key]}
         points = wanted.points or (matplotlib.rcParams["font.size"] if "font.size" in changed else POINTS)
         settings: Any = {**_LOOK, **{key: points * share for key, share in _SIZES.items()}}
         matplotlib.rcParams.update({key: value for key, value in settings.items() if key not in changed})
@@ -173,7 +181,8 @@ def letters(points: float) -> float:
 
 def _size(key: str) -> float:
     """Return a font size of ``rcParams`` [point]; sizes in words are those of dynsim."""
-    size = matplotlib.rcParams[key]
+    settings: Any = matplotlib.rcParams
+    size = settings[key]
     return float(size) if isinstance(size, int | float) else letters(_SIZES[key] * POINTS)
 
 
@@ -185,25 +194,81 @@ def broken(text: str, across: float | None = None, points: float | None = None) 
 
 
 class Drawing(Figure):
-    """Figure with notes, which are drawn below its axes if the look has a caption.
+    """Figure with one legend and notes below its axes, with space for both.
 
     Attributes
     ----------
     caption : str
-        The notes, one per line: what dashes mean, what was cut off. For the caption of a paper.
+        The notes, one per line: what dashes mean, what was cut off. For the caption of a paper. They are drawn if the
+        look has a caption.
+    grows : bool
+        Whether lines of title, legend and notes make the figure higher; False if the user set its height.
     """
 
     caption = ""
+    grows = True
+    _note: Text | None = None
+    _below: Legend | None = None
+    _rows = 1
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        self._entries: dict[str, Any] = {}
 
     def note(self, *notes: str) -> None:
         """Add notes to the caption."""
         self.caption = "\n".join([*filter(None, [self.caption]), *notes])
         wanted = _drawn.get()
-        if self.caption and (wanted is None or wanted.caption):
-            size = letters(7.0)
-            self.supxlabel(
-                broken(self.caption, self.get_figwidth(), size), fontsize=size, color=GREY, x=0.01, ha="left", ma="left"
-            )
+        if not self.caption or (wanted is not None and not wanted.caption):
+            return
+        size, before = letters(7.0), ""
+        if self._note is not None:
+            before = self._note.get_text()
+            self._note.remove()
+        text = broken(self.caption, self.get_figwidth() - 0.15, size)
+        look: Any = {"fontsize": size, "color": NOTE, "ha": "left", "va": "bottom", "in_layout": False}
+        self._note = self.text(0.07 / self.get_figwidth(), 0.0, text, **look)
+        self.grow(1.25 * size * (_lines(text) - _lines(before)))
+
+    def put_below(self, entries: Mapping[str, Any], columns: int, *, last: bool = False) -> None:
+        """Add entries (handles by label) to the legend below the axes, first or last, in at most so many columns."""
+        if not entries:
+            return
+        if self._below is not None:
+            self._below.remove()
+        self._entries = {**self._entries, **entries} if last else {**entries, **self._entries}
+        before = self._rows
+        labels, columns, self._rows = fitted_legend(list(self._entries), columns)
+        anchor: dict[str, Any] = {"loc": "lower center", "bbox_to_anchor": (0.5, 0.0), "borderaxespad": 0.0}
+        self._below = self.legend(list(self._entries.values()), labels, ncols=columns, **anchor)
+        self._below.set_in_layout(False)
+        self.grow(legend_row() * (self._rows - before))
+
+    def grow(self, points: float) -> None:
+        """Make the figure higher [point], unless the user set its height."""
+        if self.grows:
+            self.set_figheight(self.get_figheight() + points / 72.0)
+
+    def draw(self, renderer: Any) -> None:
+        """Draw the figure, with notes at its lower edge, the legend above them, and the axes in the space above."""
+        engine, gap, used = self.get_layout_engine(), 4.0 * self.dpi / 72.0, 0.0
+        for below in (self._note, self._below):
+            if below is None:
+                continue
+            level = (used + 0.6 * gap) / self.bbox.height
+            if isinstance(below, Text):
+                below.set_y(level)
+            else:
+                below.set_bbox_to_anchor((0.5, level), transform=self.transFigure)
+            used += below.get_window_extent(renderer).height + gap
+        if isinstance(engine, ConstrainedLayoutEngine):
+            share = min(used / self.bbox.height, 0.8)
+            engine.set(rect=(0.0, share, 1.0, 1.0 - share))
+        super().draw(renderer)
+
+
+def _lines(text: str) -> int:
+    return text.count("\n") + 1 if text else 0
 
 
 def new_figure(height: float, title: str, *, page: float = WIDTH) -> Drawing:
@@ -212,7 +277,8 @@ def new_figure(height: float, title: str, *, page: float = WIDTH) -> Drawing:
     Parameters
     ----------
     height : float
-        Height [inch], unless the user wants another.
+        Height [inch], unless the user wants another, with one line of title and of legend; further lines and notes are
+        added to it.
     title : str
         Title; a long one has several lines.
     page : float, optional
@@ -222,19 +288,25 @@ def new_figure(height: float, title: str, *, page: float = WIDTH) -> Drawing:
     wide = width() if wanted.width is not None or _has_own_size() else page
     own = float(matplotlib.rcParams["figure.figsize"][1]) if _has_own_size() and wanted.width is None else None
     figure = Drawing(figsize=(wide, wanted.height or own or height), layout="constrained")
+    figure.grows = not (wanted.height or own)
     FigureCanvasAgg(figure)
     if wanted.title and title:
         size = _size("figure.titlesize")
-        figure.suptitle(broken(title, wide, size), fontsize=size)
+        text = broken(title, wide, size)
+        figure.suptitle(text, fontsize=size)
+        figure.grow(1.2 * size * (_lines(text) - 1))
     return figure
 
 
 def literal(figure: Figure) -> None:
-    """Draw all texts literally: names from files may contain formulas, and control characters that have no glyphs."""
+    """Draw all texts literally: names from files may contain formulas, and control characters that have no glyphs.
+
+    Only powers of ten, and the symbols of coordinates, are formulas.
+    """
     powers = {label for axes in figure.axes for axis in (axes.xaxis, axes.yaxis) for label in _powers(axis)}
     for text in figure.findobj(Text):
         text.set_text(plain(text.get_text()))
-        text.set_parse_math(text in powers)
+        text.set_parse_math(text in powers or _COORDINATE.fullmatch(text.get_text()) is not None)
 
 
 def _powers(axis: Axis) -> list[Text]:
@@ -389,11 +461,9 @@ def legend_above(axes: Axes, columns: int = 3) -> None:
     axes.set_title(" ", y=1.0, pad=6.0 + legend_row() * max(rows - 1, 0))
 
 
-def legend_below(figure: Figure, panels: Sequence[Axes], columns: int) -> None:
+def legend_below(figure: Drawing, panels: Sequence[Axes], columns: int) -> None:
     """Place one legend for several panels below the figure."""
-    unique = _named(panels)
-    labels, columns, _ = fitted_legend(list(unique), columns)
-    figure.legend(unique.values(), labels, loc="outside lower center", ncols=columns)
+    figure.put_below(_named(panels), columns)
 
 
 def _named(panels: Sequence[Axes]) -> dict[str, Any]:
@@ -417,7 +487,7 @@ def line(axes: Axes, time: Array, values: Array, **options: Any) -> None:
 
 
 def time_rows(
-    figure: Figure, rows: Sequence[Sequence[Series]], settle: float, *, compress: bool = False
+    figure: Drawing, rows: Sequence[Sequence[Series]], settle: float, *, compress: bool = False
 ) -> list[tuple[Axes, ...]]:
     """Create axes for quantities over time, one row each, with a column for the initial transient if needed.
 
@@ -427,7 +497,7 @@ def time_rows(
 
     Parameters
     ----------
-    figure : Figure
+    figure : Drawing
         Figure to which the axes are added.
     rows : sequence of sequences of Series
         For each row, the series that will be drawn in it.
@@ -463,9 +533,8 @@ def time_rows(
     if split:
         grid[-1, 0].set_xlabel("time [s]: initial transient")
         grid[-1, 1].set_xlabel("time [s]: whole run, axes cut to the settled range")
-    elif window > 0.0 and isinstance(figure, Drawing):
-        cut = [number(t.largest, 2) for t in transients if t is not None]
-        figure.note(f"Axes are cut to the settled range; the initial transient reaches {' and '.join(cut)}.")
+    elif window > 0.0:
+        figure.note("Axes are cut to the settled range; the initial transient exceeds it.")
     return [tuple(axes) for axes in grid]
 
 
