@@ -9,11 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -21,34 +18,31 @@ from dynsim.draw import film
 from dynsim.draw.figures import snake_tasks, style, tanaka2019
 from dynsim.draw.figures.snake_view import (
     BODY,
+    COORDINATE_NAMES,
     GROUND,
     HEAD,
-    MIN_HEIGHT,
     NUMBERED,
-    SYMBOLS,
-    TARGET,
+    ROUNDING,
     View,
     error_axis,
     greek,
     interval_starts,
-    limits,
+    is_numbered,
+    limit_line,
     mode_chart,
     mode_starts,
     mode_steps,
     moments,
+    overlaid,
     overlay_margins,
     posture_grid,
-    posture_strip,
 )
 from dynsim.record import Record
 from dynsim.snake.lifting import snake_geometry
 
 # Number of postures in an animation, in a row, and overlaid in one picture.
 FRAMES, IN_A_ROW, IN_A_PICTURE = 50, 6, 7
-# A logarithmic axis cannot show an error of exactly zero.
-TINY = 1e-16
-# Shades of grey for postures over time, because the lines next to them are coloured.
-SHADES = LinearSegmentedColormap.from_list("shades", ["#CFCFCF", "#000000"])
+DEGREES = 180.0 / np.pi
 
 
 def draw(record: Record, folder: Path, kind: str = "png") -> list[Path]:
@@ -89,94 +83,73 @@ def comparisons(records: Mapping[str, Record]) -> dict[str, Callable[[Mapping[st
 def comparison(records: Mapping[str, Record]) -> Figure:
     """Draw cost, largest yaw angle relative to its limit, support margin and head error of all variants."""
     title = style.comparison_title(list(records.values()), "cost, angles, margin and error")
-    figure = style.new_figure(7.0, title)
+    figure = style.new_figure(6.6 + 0.2 * (len(records) > 6), title)
     axes = figure.subplots(4, 1, sharex=True)
-    overlay_margins(axes[:3], records)
-    for record in records.values():
-        axes[3].semilogy(record.time, np.maximum(record["position_error"], TINY))
-    error_axis(axes[3], *(record["position_error"] for record in records.values()))
-    axes[3].set_ylabel("position error [m]")
-    style.legend_beside(axes[0])
-    axes[-1].set_xlabel("t [s]")
+    looks, entries = style.family_styles(list(records))
+    overlay_margins(axes[:3], records, looks)
+    errors = {name: 1e3 * record["position_error"] for name, record in records.items()}
+    for name, record in records.items():
+        axes[3].plot(record.time, errors[name], **looks[name])
+    error_axis(axes[3], *errors.values())
+    axes[3].set_ylabel("position error\n[mm]")
+    axes[-1].set_xlabel("time [s]")
+    axes[-1].set_xlim(0.0, max(record.time[-1] for record in records.values()) or None)
+    figure.align_ylabels(axes)
+    figure.put_below(entries, 6)
+    exact = [name for name, error in errors.items() if error.max() < ROUNDING]
+    if exact and axes[3].get_yscale() == "log":
+        figure.note(f"Position errors below {ROUNDING:g} mm are not shown ({len(exact)} of {len(records)} variants).")
     return figure
 
 
 def strips(records: Mapping[str, Record]) -> Figure:
-    """Draw the postures of every variant over time, one row per variant."""
-    lines = {}
+    """Draw the postures of every variant over time, overlaid."""
+    runs = {}
     for name, record in records.items():
-        views = [View(record, row) for row in moments(record, IN_A_ROW)]
         waiting = record.summary["waiting_s"]
-        label = name.replace("_", "\n") + (f"\n(waited {waiting:.0f} s)" if waiting >= 0.5 else "")
-        lines[label] = [(view, f"{view.time:.1f} s, mode {view.mode}") for view in views]
-    title = style.comparison_title(list(records.values()), "postures over time")
-    return posture_grid(title, lines, one_scale=False)
+        label = f"{name}, {record.time[-1]:.3g} s" + (f", {waiting:.0f} s of it waiting" if waiting >= 0.5 else "")
+        runs[label] = (record, [View(record, row) for row in moments(record, IN_A_PICTURE)])
+    return overlaid(style.comparison_title(list(records.values()), "postures over time"), runs)
 
 
 def postures(record: Record) -> Figure:
-    """Draw postures over time: top view above, side view along the heading of the base part below."""
+    """Draw postures over time: top view, and side view along the heading of the base part below."""
     views = [View(record, row) for row in moments(record, IN_A_ROW)]
-    texts = [f"{view.time:.1f} s, mode {view.mode}" for view in views]
-    return posture_strip(style.title(record, "postures over time"), list(zip(views, texts, strict=True)))
+    line = [(view, f"{view.time:.1f} s, mode {view.mode}") for view in views]
+    return posture_grid(style.title(record, "postures over time"), {"": line}, side=True)
 
 
 def overview(record: Record) -> Figure:
-    """Draw the whole run from above: postures over time, path of the controlled point and its target.
-
-    A robot that stays in place and works with its head is only a thin strip, so a side view is added below.
-    """
-    views = [View(record, row) for row in moments(record, IN_A_PICTURE)]
-    x0, x1, y0, y1 = limits([*(view.project(view.points, above=True) for view in views), record["w"][:, :2]], 0.06)
-    flat = y1 - y0 < MIN_HEIGHT * (x1 - x0)
-    width = 6.4 if flat else 5.0
-    high = width * (y1 - y0) / (x1 - x0)
-    side = limits([view.project(view.points, above=False) for view in views], 0.06) if flat else (0.0, 1.0, 0.0, 0.0)
-    low = width * (side[3] - side[2]) / (side[1] - side[0])
-    height = max(high + low, 1.0) + 1.2 + 0.5 * flat
-    figure = style.new_figure(height, style.title(record, "the run from above"), page=width + 1.4)
-    grid = figure.subplots(1 + flat, 1, squeeze=False, height_ratios=[high, low] if flat else None)
-    axis = grid[0, 0]
-    shades = ScalarMappable(Normalize(0.0, record.time[-1]), matplotlib.colormaps["viridis_r"] if flat else SHADES)
-    body = {"lw": 1.6 if flat else 4.0, "solid_capstyle": "round"}
-    for panel, above in zip(grid[:, 0], (True, False), strict=False):
-        for view in views:
-            points, shade = view.project(view.points, above), shades.to_rgba(record.time[view.row])
-            panel.plot(*points.T, "-", color=shade, **body)
-            panel.plot(*points[0], "o", color=shade, ms=4 if flat else 6)
-        panel.set_aspect("equal", adjustable="box")
-    axis.plot(*record["w"][:, :2].T, color=HEAD, lw=1.0, label="controlled point")
-    axis.plot(*record["w_target"][:, :2].T, "--", color=TARGET, lw=1.0, label="target")
-    axis.plot(*record["base_pose"][:, :2].T, color=GROUND, lw=0.8, label="wheel pair 1")
-    axis.set(xlabel="x [m]", ylabel="y [m]", xlim=(x0, x1), ylim=(y0, y1))
-    if flat:
-        below = grid[1, 0]
-        below.axhline(0.0, color="#BBBBBB", lw=0.8, zorder=0)
-        below.set(xlabel="along the heading of the base part [m]", ylabel="height [m]")
-        below.set(xlim=side[:2], ylim=(min(side[2], -0.02), side[3]))
-    figure.colorbar(shades, ax=grid.ravel().tolist(), label="posture at t [s]")
-    figure.legend(loc="outside lower center", ncols=3)
-    return figure
+    """Draw the whole run in one picture: postures over time, path of the controlled point and its target."""
+    rows = moments(record, IN_A_PICTURE)
+    views = [View(record, row) for row in rows]
+    every = f", one every {record.time[rows[1]] - record.time[rows[0]]:.2g} s" if len(rows) > 1 else ""
+    return overlaid(style.title(record, f"postures{every}"), {"": (record, views)})
 
 
 def tracking(record: Record) -> Figure:
     """Draw the six coordinates of the controlled point with their targets, and the errors."""
-    figure = style.new_figure(6.2, style.title(record, "controlled point and its target"))
-    axes = figure.subplots(4, 2, sharex=True)
-    labels = record.labels["w"]
-    for i, (name, axis) in enumerate(zip(labels, axes[:3].T.ravel(), strict=True)):
-        axis.plot(record.time, record["w"][:, i], color=GROUND, label="controlled point")
-        axis.plot(record.time, record["w_target"][:, i], "--", color=HEAD, lw=0.9, label="target")
-        style.at_least(axis, 2e-3)
-        axis.set_ylabel(f"{SYMBOLS.get(name, name)} [{'m' if i < 3 else 'rad'}]")
-        style.shade(axis, record.time, record["gripper"] > 0, "#EEEEEE", "gripper closed")
-    # Use a white background, so that grey entries are visible on an entirely grey panel.
-    axes[0, 0].legend(facecolor="white", edgecolor="none")
-    for axis, part, unit in zip(axes[3], ("position", "attitude"), ("m", "rad"), strict=True):
-        error = record[f"{part}_error"]
-        axis.semilogy(record.time, np.maximum(error, TINY), color=BODY)
-        axis.set_ylabel(f"{part} error [{unit}]")
-        error_axis(axis, error)
-        axis.set_xlabel("t [s]")
+    columns = 1 if style.narrow() else 2
+    figure = style.new_figure(8.6 / columns + 2.0, style.title(record, "controlled point and its target"))
+    axes = figure.subplots(8 // columns, columns, sharex=True, squeeze=False)
+    panels, time = list(axes.T.ravel()), record.time
+    parts = (("position", range(3), 1.0, "m", 2e-3), ("attitude", range(3, 6), DEGREES, "°", 0.2))
+    for k, (part, coordinates, scale, unit, least) in enumerate(parts):
+        *own, last = panels[4 * k : 4 * k + 4]
+        for i, axis in zip(coordinates, own, strict=True):
+            axis.plot(time, scale * record["w"][:, i], color=GROUND, label="controlled point")
+            axis.plot(time, scale * record["w_target"][:, i], "--", color=HEAD, lw=0.9, label="target")
+            style.at_least(axis, least)
+            axis.set_ylabel(f"{COORDINATE_NAMES.get(record.labels['w'][i], record.labels['w'][i])} [{unit}]")
+            style.shade(axis, time, record["gripper"] > 0, "#EEEEEE", "gripper closed")
+        error = (1e3 if unit == "m" else scale) * record[f"{part}_error"]
+        last.plot(time, error, color=BODY)
+        error_axis(last, error)
+        last.set_ylabel(f"{part} error\n[{'mm' if unit == 'm' else unit}]")
+    for axis in axes[-1]:
+        axis.set_xlabel("time [s]")
+    figure.align_ylabels(axes)
+    style.legend_below(figure, panels[:1], 3)
     return figure
 
 
@@ -184,30 +157,35 @@ def joints(record: Record) -> Figure:
     """Draw the joint angles of the head and base part with their limits; dots mark joints excluded from allocation."""
     geometry = snake_geometry(record)
     n_h, pitch, upper, lower = geometry.head_joints, geometry.pitch, geometry.upper, geometry.lower
-    phi, labels = record["phi"], record.labels["phi"]
+    phi, labels = DEGREES * record["phi"], record.labels["phi"]
     parts = [
-        ("head yaw", np.flatnonzero(~pitch[:n_h])),
-        ("head pitch", np.flatnonzero(pitch[:n_h])),
-        ("base yaw", np.arange(n_h, len(labels))),
+        ("yaw of the head", np.flatnonzero(~pitch[:n_h])),
+        ("pitch of the head", np.flatnonzero(pitch[:n_h])),
+        ("yaw of the base", np.arange(n_h, len(labels))),
     ]
-    figure = style.new_figure(5.9, style.title(record, "joint angles and their limits"))
-    axes = figure.subplots(3, 1, sharex=True)
+    parts = [(title, group) for title, group in parts if len(group)]
+    figure = style.new_figure(2.0 * len(parts) + 0.4, style.title(record, "joint angles and their limits"))
+    axes = figure.subplots(len(parts), 1, sharex=True, squeeze=False)[:, 0]
     for axis, (title, group) in zip(axes, parts, strict=True):
-        for j in group:
-            (line,) = axis.plot(record.time, phi[:, j], label=greek(labels[j]))
+        looks = style.variant_styles(group.tolist())
+        for j in group.tolist():
+            axis.plot(record.time, phi[:, j], label=greek(labels[j]), **looks[j])
             out = record["at_limit"][:, j] > 0
-            axis.plot(record.time[out], phi[out, j], ".", color=line.get_color(), ms=3)
-        for limit in {*upper[group], *lower[group]}:
-            axis.axhline(limit, color="black", ls="-.", lw=0.8)
-        axis.set_ylabel(f"{title} [rad]")
-        style.legend_beside(axis)
-    axes[-1].set_xlabel("t [s]      (dash-dotted: limits; dots: joint excluded from allocation at its limit)")
+            axis.plot(record.time[out], phi[out, j], ".", color=looks[j]["color"], ms=3)
+        for limit in sorted({*upper[group], *lower[group]}):
+            limit_line(axis, DEGREES * limit, "limits" if limit == max(upper[group]) else "")
+        axis.set_ylabel(f"{title} [°]")
+        style.legend_beside(axis, 6)
+    axes[-1].set_xlabel("time [s]")
+    axes[-1].set_xlim(record.time[0], record.time[-1] or None)
+    if record["at_limit"].any():
+        figure.note("Dots: the joint is excluded from allocation because it is at its limit.")
     return figure
 
 
 def redundancy(record: Record) -> Figure:
     """Draw modes (grounded wheels), cost, smallest singular value and support margin over time."""
-    many = len(mode_starts(record)) > NUMBERED  # the mode numbers then have a separate panel
+    many = not is_numbered(record)  # the mode numbers then have a separate panel
     ratios = [1.3, *([0.8] if many else []), 1, 1, 1]
     figure = style.new_figure(6.7 + 1.1 * many, style.title(record, "modes and margins"))
     axes = figure.subplots(len(ratios), 1, sharex=True, height_ratios=ratios, squeeze=False)
@@ -218,14 +196,18 @@ def redundancy(record: Record) -> Figure:
     cost.plot(record.time, record["cost"], color=GROUND)
     cost.set_ylabel("cost V")
     cost.set_ylim(bottom=0)
-    _over_time(sigma, record, record["sigma_min"], many)
-    sigma.set_ylabel("σ_min of B̃")
+    dense = len(mode_starts(record)) > NUMBERED
+    _over_time(sigma, record, record["sigma_min"], dense)
+    sigma.set_ylabel("smallest singular\nvalue σ_min of B̃")
     sigma.set_ylim(bottom=0)
-    _over_time(margin, record, 1e3 * record["support_margin"], many)
-    margin.axhline(0.0, color=HEAD, ls="-.", lw=0.8)
-    margin.set_ylabel("support margin [mm]")
+    _over_time(margin, record, 1e3 * record["support_margin"], dense)
     margin.set_ylim(bottom=min(0.0, 1e3 * float(record["support_margin"].min())) - 4)
-    margin.set_xlabel("t [s]      (margin below zero: the robot tips)")
+    limit_line(margin, 0.0, "tips below zero")
+    margin.set_ylabel("support margin\n[mm]")
+    margin.set_xlabel("time [s]")
+    if dense:
+        style.legend_below(figure, [margin], 2)
+    figure.align_ylabels(axes[:, 0])
     return figure
 
 
@@ -237,9 +219,9 @@ def _over_time(axis: Axes, record: Record, values: NDArray[np.float64], many: bo
     starts = interval_starts(len(values))
     low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
     time = np.append(record.time[starts], record.time[-1])
-    axis.stairs(high, time, baseline=low, fill=True, color=GROUND, alpha=0.25, lw=0, label="range")
-    axis.plot(record.time[starts], low, color=GROUND, lw=1.0, label="lowest")
-    style.legend_beside(axis)
+    label = f"range in {(time[-1] - time[0]) / len(starts):.2g} s"
+    axis.stairs(high, time, baseline=low, fill=True, color=GROUND, alpha=0.25, lw=0, label=label)
+    axis.plot(record.time[starts], low, color=GROUND, lw=1.0, label="smallest value")
 
 
 def animate(record: Record, path: Path) -> Path:

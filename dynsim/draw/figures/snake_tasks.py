@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from dynsim.draw.figures import style
-from dynsim.draw.figures.snake_view import BODY, HEAD, TARGET, greek, object_bodies
+from dynsim.draw.figures.snake_view import BODY, GROUND, HEAD, TARGET, greek, object_bodies, pair_wheels
 from dynsim.draw.figures.style import Array
 from dynsim.record import Record
 from dynsim.record.measures import GRIPPER_STATES
@@ -33,8 +33,12 @@ ON_AXIS = 0.01
 def makers(record: Record) -> dict[str, Callable[[Record], Figure]]:
     """Return the drawing functions by file name for which the record has data."""
     made: dict[str, Callable[[Record], Figure]] = {}
-    if any("stall_torque_N_m" in motor for motor in record.summary.get("motors", ())):
-        made["servos"] = servos
+    if _kinds(record):
+        made |= {"servos": servos, "servo_loads": servo_loads}
+    if "energy_electrical" in record:
+        made["power"] = power
+    if "contact_normal_force" in record:
+        made["wheels"] = wheels
     if "gripper_state" in record:
         made["gripper"] = gripper
     if object_bodies(record):
@@ -42,15 +46,28 @@ def makers(record: Record) -> dict[str, Callable[[Record], Figure]]:
     return made
 
 
+def _kinds(record: Record) -> dict[tuple[float, float, float], list[dict[str, Any]]]:
+    """Return the summaries of the servos by their stall torque, nominal torque and gear friction [N m]."""
+    kinds: dict[tuple[float, float, float], list[dict[str, Any]]] = {}
+    for motor in record.summary.get("motors", ()):
+        if "stall_torque_N_m" in motor:
+            rated = (
+                motor["stall_torque_N_m"],
+                motor.get("nominal_torque_N_m", 0.0),
+                motor.get("gear_friction_N_m", 0.0),
+            )
+            kinds.setdefault(rated, []).append(motor)
+    return kinds
+
+
 def servos(record: Record) -> Figure:
     """Draw the shaft torques with stall torque, nominal torque and gear friction; servos of one type share a panel."""
-    kinds: dict[tuple[float, ...], list[dict[str, Any]]] = {}
-    for motor in record.summary["motors"]:
-        if "stall_torque_N_m" in motor:
-            keys = ("stall_torque_N_m", "nominal_torque_N_m", "gear_friction_N_m")
-            kinds.setdefault(tuple(motor.get(key, 0.0) for key in keys), []).append(motor)
+    kinds = _kinds(record)
     heights = [1.0 if k == 0 else 0.6 for k in range(len(kinds))]
-    figure = style.new_figure(0.9 + 3.4 * sum(heights), style.title(record, "torques of the servos and their limits"))
+    # In a narrow figure the legends are above the panels.
+    legends = 8 * len(kinds) * style.legend_row() / 72.0 if style.narrow() else 0.0
+    title = style.title(record, "torques of the servos and their limits")
+    figure = style.new_figure(0.9 + 3.4 * sum(heights) + 0.6 * legends, title)
     axes = figure.subplots(len(kinds), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]
     for axis, ((stall, nominal, friction), motors) in zip(axes, kinds.items(), strict=True):
         order = sorted(motors, key=lambda motor: -motor["torque_rms_N_m"])
@@ -68,11 +85,99 @@ def servos(record: Record) -> Figure:
         if nominal:
             _both(axis, nominal, f"nominal, rms: {nominal:g} N m", color="black", ls=":", lw=0.9)
         if friction:
-            label = f"friction of the gear {friction:g} N m:\nheld without current"
+            label = f"gear friction {friction:g} N m: carried\nwithout current"
             axis.axhspan(-friction, friction, color=style.SKY, alpha=0.25, lw=0, zorder=0, label=label)
         axis.set(xlim=(record.time[0], record.time[-1]), ylim=(-1.1 * stall, 1.1 * stall), ylabel="torque [N m]")
         style.legend_beside(axis)
-    axes[-1].set_xlabel("t [s]")
+    axes[-1].set_xlabel("time [s]")
+    return figure
+
+
+def servo_loads(record: Record) -> Figure:
+    """Draw the rms and largest torque of each servo next to its nominal torque and its stall torque."""
+    kinds = _kinds(record)
+    below = style.narrow()
+    figure = style.new_figure(
+        2.9 * (len(kinds) if below else 1) + 0.5, style.title(record, "torque of each servo and its limits")
+    )
+    ratios = [len(motors) + 2.0 for motors in kinds.values()]
+    shape: Any = {"height_ratios": [1.0] * len(kinds)} if below else {"width_ratios": ratios}
+    axes = figure.subplots(len(kinds) if below else 1, 1 if below else len(kinds), squeeze=False, **shape).ravel()
+    for axis, ((stall, nominal, _), motors) in zip(axes, kinds.items(), strict=True):
+        rms = np.array([motor["torque_rms_N_m"] for motor in motors])
+        places = np.arange(len(motors))
+        above = (rms > nominal) & (nominal > 0.0)
+        for chosen, colour, label in ((~above, style.BLUE, "rms torque"), (above, style.ORANGE, "rms above nominal")):
+            if chosen.any():
+                axis.bar(places[chosen], rms[chosen], width=0.7, color=colour, label=label)
+        axis.plot(
+            places, [motor["torque_max_N_m"] for motor in motors], "_", color="black", ms=6, label="largest torque"
+        )
+        axis.axhline(stall, color=HEAD, ls="--", lw=0.9, label="stall torque")
+        if nominal:
+            axis.axhline(nominal, color="black", ls=":", lw=1.0, label="nominal torque")
+        axis.set_xticks(places, [greek(motor["joint"]) for motor in motors], rotation=90)
+        axis.set(xlim=(-0.7, len(motors) - 0.3), ylim=(0.0, 1.08 * stall), ylabel="torque [N m]")
+        axis.grid(axis="x", visible=False)
+    style.legend_below(figure, list(axes), 5)
+    return figure
+
+
+def power(record: Record) -> Figure:
+    """Draw the electrical and mechanical power of all motors over time, with their means and totals."""
+    figure = style.new_figure(4.4, style.title(record, "power of the motors"))
+    axes = figure.subplots(2, 1, sharex=True)
+    parts = (("energy_electrical", "electrical", style.ORANGE), ("work_mechanical", "mechanical", style.GREEN))
+    length = float(record.time[-1] - record.time[0])
+    for axis, (signal, text, colour) in zip(axes, parts, strict=True):
+        total = float(record[signal][-1] - record[signal][0])
+        mean = f"mean {style.number(total / length, 3)} W, " if length else ""
+        label = f"{mean}total {style.number(total, 3)} J"
+        # The mean power between samples, so that the area below the line is the energy.
+        steps = np.diff(record[signal]) / np.diff(record.time)
+        axis.stairs(steps, record.time, color=colour, lw=1.0, baseline=None, label=label)
+        axis.axhline(0.0, color=style.GREY, lw=0.6)
+        axis.set_ylabel(f"{text}\npower [W]")
+        style.legend_above(axis)
+    axes[-1].set(xlabel="time [s]", xlim=(record.time[0], record.time[-1] or None))
+    figure.align_ylabels(axes)
+    return figure
+
+
+def wheels(record: Record) -> Figure:
+    """Draw the load of each wheel pair, the times at which wheels on the ground carry nothing, and slip speeds."""
+    figure = style.new_figure(6.2 + 0.6 * style.narrow(), style.title(record, "loads and slip of the wheels"))
+    axes = figure.subplots(3, 1, sharex=True, height_ratios=[1.0, 0.9, 1.0])
+    time, pairs = record.time, pair_wheels(record)
+    looks = style.variant_styles(list(pairs))
+    grounded = record["grounded"] > 0
+    slip = 1e3 * np.linalg.norm(record["contact_slip_velocity"], axis=2)
+    loads = record["contact_normal_force"]
+    for k, (pair, columns) in enumerate(pairs.items()):
+        axes[0].plot(time, loads[:, columns].sum(axis=1), label=pair, **(looks[pair] | {"linewidth": 1.0}))
+        touching = loads[:, columns] > 0.0
+        bare = grounded[:, k] & ~touching.all(axis=1)
+        for where, colour, label in ((grounded[:, k], GROUND, "on the ground"), (bare, HEAD, "a wheel lifts off")):
+            if where.any():
+                axes[1].fill_between(
+                    time, k + 0.62, k + 1.38, where=where, step="post", color=colour, lw=0, label=label
+                )
+        # Wheels in the air do not slip.
+        axes[2].plot(time, np.where(touching, slip[:, columns], 0.0).max(axis=1), **(looks[pair] | {"linewidth": 1.0}))
+    axes[0].set_ylabel("load of the pair\n[N]")
+    axes[0].set_ylim(bottom=0.0)
+    axes[1].set(ylim=(len(pairs) + 0.5, 0.5), ylabel="wheel pair", yticks=range(1, len(pairs) + 1))
+    axes[1].grid(visible=False)
+    axes[2].set_ylabel("slip speed\n[mm/s]")
+    style.at_least(axes[2], 1.0)
+    axes[2].set_ylim(bottom=0.0)
+    axes[2].set(xlabel="time [s]", xlim=(time[0], time[-1] or None))
+    figure.align_ylabels(axes)
+    style.legend_below(figure, axes[:2], 5)
+    contacts = {contact["name"]: contact for contact in record.summary.get("contacts", ())}
+    named = [contacts[record.labels["contact_normal_force"][k]] for columns in pairs.values() for k in columns]
+    slipped = max((1e3 * contact["slip_distance_m"], contact["name"]) for contact in named)
+    figure.note(f"Largest slip distance: {style.number(slipped[0], 3)} mm, {slipped[1]}.")
     return figure
 
 
@@ -100,9 +205,9 @@ def gripper(record: Record) -> Figure:
                 _both(axis, bound, f"bound {bound:g} {unit}", color=HEAD, ls="--", lw=0.9)
             axis.set_ylabel(label)
     _finish(axes, record)
-    axes[-1].set_xlabel(
-        "t [s]" + ("" if forces is None else "      (of the gripper on the object; x: along the gripper)")
-    )
+    axes[-1].set_xlabel("time [s]")
+    if forces is not None:
+        figure.note("Force and torque of the gripper on the object; x: along the gripper.")
     return figure
 
 
@@ -118,7 +223,7 @@ def objects(record: Record) -> Figure:
     for axis, panel in zip(axes, panels, strict=True):
         panel(axis)
     _finish(axes, record)
-    axes[-1].set_xlabel("t [s]")
+    axes[-1].set_xlabel("time [s]")
     return figure
 
 
@@ -248,7 +353,7 @@ def _finish(axes: Array, record: Record) -> None:
     texts = [*STATES, *EVENTS]
     shown = {text: named[f"_{text}"] for text in texts if f"_{text}" in named}
     if shown:
-        axes[0].figure.legend(shown.values(), shown.keys(), loc="outside lower center", ncols=len(shown))
+        axes[0].figure.put_below(shown, 7)
 
 
 def _both(axis: Axes, value: float, label: str, **look: Any) -> None:

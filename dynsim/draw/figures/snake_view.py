@@ -27,6 +27,14 @@ from dynsim.snake.published import used_limit
 BODY, HEAD, GROUND, LIFT, TARGET, SUPPORT = "#444444", style.PULLING, style.BLUE, "#FFFFFF", style.GREEN, style.SKY
 OBJECT = "#E9CFA6"
 SYMBOLS = {"alpha": "α", "beta": "β", "gamma": "γ"}
+COORDINATE_NAMES = {
+    "x": "$x$",
+    "y": "$y$",
+    "z": "height $z$",
+    "alpha": r"roll $\alpha$",
+    "beta": r"pitch $\beta$",
+    "gamma": r"yaw $\gamma$",
+}
 # Maximum number of modes whose numbers fit above the bars of a chart.
 NUMBERED = 30
 # Number of intervals into which a run is divided. If it has more modes than this, fractions and ranges for each
@@ -36,8 +44,12 @@ INTERVALS = 160
 SHARES = LinearSegmentedColormap.from_list("shares", [LIFT, GROUND])
 # Minimum height of a top view relative to its width, because a straight robot appears as a thin line.
 MIN_HEIGHT = 0.3
-# Font size of tick labels at the vertical axes of postures [point].
-SMALL = 6.5
+# Font size of tick labels of postures [point]; greatest and smallest height of their panels [inch].
+SMALL, TALLEST, LOWEST = 6.5, 4.6, 0.5
+# If a point of the body rises or sinks by more than this, there is a side view [m].
+RISES = 0.01
+# Errors below this are rounding errors [mm or °]; ratio of errors above which their axis is logarithmic.
+ROUNDING, SPREAD = 1e-3, 30.0
 
 
 def object_bodies(record: Record) -> dict[str, int]:
@@ -87,9 +99,7 @@ class View:
             axes.plot(*self.centre[:2], "x", color="black", ms=4, mew=1.0, zorder=6)
         else:
             axes.axhline(0.0, color="#BBBBBB", lw=0.8, zorder=0)
-        flat = self.project(self.points, above)
-        axes.plot(*flat.T, "-", color=BODY, lw=1.8, zorder=3, solid_capstyle="round")
-        axes.plot(*flat[0], "o", color=HEAD, ms=4, zorder=5)
+        self.draw_body(axes, above, BODY, HEAD)
         for down, pair in zip(self.grounded, self.wheels, strict=True):
             # In side view, a lifted pair is drawn slightly above the ground; the model has no height for it ([T] II.A).
             raised = np.array([0.0, 0.0 if above or down else 0.35 * self.radius])
@@ -97,91 +107,220 @@ class View:
             wheels = (self.project(corners, above) + raised for corners in pair)
             add_outlines(axes, wheels, zorder=4 if above else 2, **look)
 
+    def draw_body(self, axes: Axes, above: bool, colour: Any, head: Any) -> None:
+        """Draw the body and the controlled point."""
+        flat = self.project(self.points, above)
+        axes.plot(*flat.T, "-", color=colour, lw=1.8, zorder=3, solid_capstyle="round")
+        axes.plot(*flat[0], "o", color=head, ms=4, zorder=5)
 
-def posture_grid(title: str, lines: Mapping[str, Sequence[tuple[View, str]]], one_scale: bool = True) -> Figure:
-    """Draw labelled rows of top views with their titles, and the path of the controlled point in green.
 
-    With ``one_scale``, the areas of all rows have the same size; otherwise each row shows the area that it needs.
+Box = tuple[float, float, float, float]
+
+
+def _top_box(clouds: list[Array]) -> Box:
+    return _not_flat(limits(clouds, 0.06))
+
+
+def _side_box(clouds: list[Array]) -> Box:
+    x0, x1, low, high = limits(clouds, 0.04)
+    return x0, x1, min(low, -0.02), high
+
+
+def _columns(count: int, box: Box) -> int:
+    """Return how many of ``count`` panels fit next to each other: fewer if their contents are long and flat."""
+    flat = box[3] - box[2] < 0.6 * (box[1] - box[0])
+    most = max(int(style.width() / (1.6 if flat else 1.15)), 1)
+    return -(-count // -(-count // most))
+
+
+def _grid(title: str, rows: Sequence[Sequence[Box]], columns: int, lines: int) -> tuple[style.Drawing, NDArray[Any]]:
+    """Create axes in rows of ``columns`` cells; a cell has one panel per box, below each other, at one scale.
+
+    Parameters
+    ----------
+    title : str
+        Title of the figure.
+    rows : sequence of sequences of Box
+        Limits of the panels of the cells in each row.
+    columns : int
+        Number of cells in a row.
+    lines : int
+        Number of lines of the titles of cells.
     """
-    columns = max(map(len, lines.values()))
-    clouds = [[view.extent(above=True) for view, _ in line] for line in lines.values()]
-    pooled = [cloud for line in clouds for cloud in line]
-    boxes = [_not_flat(limits(pooled if one_scale else line, 0.06)) for line in clouds]
-    size = 8.6 / columns
-    heights = [size * (y1 - y0) / (x1 - x0) for x0, x1, y0, y1 in boxes]
-    titles = 1 + max(text.count("\n") for line in lines.values() for _, text in line)
-    height = sum(heights) + len(lines) * (0.3 + 0.14 * titles) + 0.8
-    figure = style.new_figure(height, title, page=9.0)
-    axes = figure.subplots(
-        len(lines),
-        columns,
-        squeeze=False,
-        sharex="all" if one_scale else "row",
-        sharey="row",
-        height_ratios=heights,
-    )
-    for k, ((label, line), (x0, x1, y0, y1)) in enumerate(zip(lines.items(), boxes, strict=True)):
-        row = axes[k]
-        row[0].set_ylabel(label, rotation=0, ha="right", va="center")
-        row[0].tick_params(axis="y", labelsize=SMALL)
-        for column in range(len(line), columns):
-            row[column].set_visible(False)
-            if k > 0:
-                axes[k - 1, column].tick_params(labelbottom=True)  # the lowest panel in this column
-        for axis, (view, text) in zip(row, line, strict=False):
-            axis.plot(*view.path.T, color=TARGET, lw=1.0, zorder=2)
-            view.draw(axis, above=True)
-            axis.set(xlim=(x0, x1), ylim=(y0, y1))
-            axis.set_title(text, fontsize=style.letters(7.0))
-            axis.set_aspect("equal", adjustable="box")
-    for axis in axes[-1]:
-        axis.set_xlabel("x [m]")
-    figure.supylabel("y [m]", fontsize=style.letters(8.0))
-    _explain(figure, [view for line in lines.values() for view, _ in line])
+    # A single cell is not so wide that it would be higher than TALLEST.
+    cell = min((style.width() - 0.7) / columns, *(TALLEST * (b[1] - b[0]) / (b[3] - b[2]) for row in rows for b in row))
+    heights = [max(cell * (box[3] - box[2]) / (box[1] - box[0]), LOWEST) for row in rows for box in row]
+    ticks = len(heights) if len(heights) > len(rows) else 1
+    texts = ticks * style.letters(18.0) + len(rows) * style.letters(6.0 + 10.0 * lines)
+    figure = style.new_figure(sum(heights) + texts / 72.0 + 1.2, title)
+    axes = figure.subplots(len(heights), columns, squeeze=False, height_ratios=heights)
+    for panel in axes.ravel():
+        panel.set_aspect("equal", adjustable="box")
+        panel.locator_params(axis="x", nbins=4)
+        panel.locator_params(axis="y", nbins=3)
+        panel.tick_params(labelsize=style.letters(SMALL))
+    return figure, axes.reshape(len(rows), -1, columns)
+
+
+def _frame(axes: NDArray[Any], boxes: Sequence[Box], used: int, column: int, last: bool) -> list[Axes]:
+    """Set the limits and labels of one cell of a row, hide the cells after the last one; return its panels."""
+    panels = list(axes[:, column])
+    names = (("$x$ [m]", "$y$ [m]"), ("along heading [m]", "height [m]"))
+    for panel, (x0, x1, y0, y1), (across, up) in zip(panels, boxes, names, strict=False):
+        panel.set(xlim=(x0, x1), ylim=(y0, y1))
+        panel.tick_params(labelleft=column == 0, labelbottom=last or len(panels) > 1)
+        panel.set_xlabel(across if last else "", fontsize=style.letters(7.5))
+        panel.set_ylabel(up if column == 0 else "", fontsize=style.letters(7.5))
+    for empty in axes[:, used:].ravel() if column == used - 1 else ():
+        empty.set_visible(False)
+    return panels
+
+
+def posture_grid(
+    title: str, lines: Mapping[str, Sequence[tuple[View, str]]], *, side: bool = False, one_scale: bool = True
+) -> Figure:
+    """Draw labelled lines of postures with their titles, and the path of the controlled point in green.
+
+    Parameters
+    ----------
+    title : str
+        Title of the figure.
+    lines : mapping of str to sequence of (View, str)
+        Views and their titles by the label of the line; a long line is continued in further rows of panels.
+    side : bool, optional
+        Whether the side view along the heading of the base is drawn below the top view.
+    one_scale : bool, optional
+        Whether the areas of all lines have the same limits; otherwise each line shows the area that it needs.
+    """
+    views = {label: [view for view, _ in line] for label, line in lines.items()}
+    pooled = [view for line in views.values() for view in line]
+    boxes = {
+        label: [maker([view.extent(above) for view in (pooled if one_scale else line)]) for maker, above in sides]
+        for label, line in views.items()
+        for sides in [((_top_box, True), (_side_box, False))[: 1 + side]]
+    }
+    columns = min(_columns(len(line), boxes[label][0]) for label, line in lines.items())
+    rows = [(label, line[k : k + columns]) for label, line in lines.items() for k in range(0, len(line), columns)]
+    cell = (style.width() - 0.7) / columns
+    size = style.letters(7.0)
+    texts = {id(view): style.broken(text, cell, size) for line in lines.values() for view, text in line}
+    named = [label for label in lines if label.strip()]
+    most = max(text.count("\n") for text in texts.values()) + 1 + bool(named)
+    figure, axes = _grid(title, [boxes[label] for label, _ in rows], columns, most)
+    for k, ((label, line), row) in enumerate(zip(rows, axes, strict=True)):
+        below = len(rows[k + 1][1]) if k + 1 < len(rows) else 0
+        for column, (view, _) in enumerate(line):
+            panels = _frame(row, boxes[label], len(line), column, last=column >= below)
+            panels[0].plot(*view.path.T, color=TARGET, lw=1.0, zorder=2)
+            for panel, above in zip(panels, (True, False), strict=False):
+                view.draw(panel, above=above)
+            first = column == 0 and label.strip() and view is lines[label][0][0]
+            panels[0].set_title((f"{label}\n" if first else "") + texts[id(view)], fontsize=size)
+    _explain(figure, pooled, {"its path": Line2D([], [], color=TARGET, lw=1.0)})
     return figure
 
 
-def posture_strip(title: str, line: Sequence[tuple[View, str]]) -> Figure:
-    """Draw postures with their titles: the top view above, and the side view along the heading of the base below."""
-    views = [view for view, _ in line]
-    top = _not_flat(limits([view.extent(above=True) for view in views], 0.08))
-    side = limits([view.extent(above=False) for view in views], 0.08)
-    tall, low = top[3] - top[2], side[3] - side[2]
-    column = 9.0 / len(views)
-    height = column * (tall / (top[1] - top[0]) + low / (side[1] - side[0])) + 2.1
-    figure = style.new_figure(max(height, 2.9), title, page=9.0)
-    axes = figure.subplots(2, len(views), squeeze=False, height_ratios=[tall, max(low, 0.35 * tall)])
-    for (view, text), above, below in zip(line, *axes, strict=True):
-        view.draw(above, above=True)
-        view.draw(below, above=False)
-        above.set(xlim=top[:2], ylim=top[2:], title=text)
-        below.set(xlim=side[:2], ylim=(min(side[2], -0.02), side[3]))
-        for axis in (above, below):
-            axis.set_aspect("equal", adjustable="box")
-            if axis is not axes[0, 0] and axis is not axes[1, 0]:
-                axis.tick_params(labelleft=False)
-            axis.tick_params(axis="x", labelrotation=45)
-    for axis, name in ((axes[0, 0], "y [m]"), (axes[1, 0], "height [m]")):
-        axis.set_ylabel(name)
-        axis.tick_params(axis="y", labelsize=SMALL)
-    for above, below in axes.T:
-        above.set_xlabel("x [m]")
-        below.set_xlabel("along heading [m]")
-    _explain(figure, views)
+def overlaid(title: str, runs: Mapping[str, tuple[Record, Sequence[View]]]) -> Figure:
+    """Draw one cell for each run: postures over time, earlier ones in lighter grey, and paths on the ground.
+
+    Cells have one scale. If a point of the body rises or sinks by more than ``RISES``, or the robot is straight, a side
+    view along the heading of the base is added below.
+    """
+    views = [view for _, line in runs.values() for view in line]
+    high = [np.stack([view.points[:, 2] for view in line]) for _, line in runs.values()]
+    side = max(float(np.ptp(heights, axis=0).max()) for heights in high) > RISES
+    tops, sides = [], []
+    for record, line in runs.values():
+        paths = [record["w"][:, :2], record["base_pose"][:, :2]]
+        tops.append(limits([*(view.extent(above=True) for view in line), *paths], 0.06))
+        sides.append(_side_box([view.extent(above=False) for view in line]))
+    x0, x1, y0, y1 = np.array(tops).T
+    side = side or bool(np.max(y1 - y0) < MIN_HEIGHT * np.max(x1 - x0))
+    half = 0.5 * np.array([np.max(x1 - x0), max(np.max(y1 - y0), MIN_HEIGHT * np.max(x1 - x0))])
+    low, top = np.min(np.array(sides)[:, [0, 2]], axis=0), np.max(np.array(sides)[:, [1, 3]], axis=0)
+    profile = (float(low[0]), float(top[0]), float(low[1]), float(top[1]))
+    columns = _columns(len(runs), (0.0, 2.0 * half[0], 0.0, 2.0 * half[1]))
+    size = style.letters(7.0)
+    labels = [style.broken(label, (style.width() - 0.7) / columns, size) if label else "" for label in runs]
+    cells = []
+    for box in tops:
+        x, y = 0.5 * (box[0] + box[1]), 0.5 * (box[2] + box[3])
+        cells.append([(x - half[0], x + half[0], y - half[1], y + half[1]), profile][: 1 + side])
+    starts = range(0, len(runs), columns)
+    lines = max(label.count("\n") + bool(label) for label in labels)
+    figure, axes = _grid(title, [cells[start] for start in starts], columns, lines)
+    for k, ((record, line), label) in enumerate(zip(runs.values(), labels, strict=True)):
+        row, column = divmod(k, columns)
+        used = min(columns, len(runs) - row * columns)
+        panels = _frame(axes[row], cells[k], used, column, last=k + columns >= len(runs))
+        for panel, above in zip(panels, (True, False), strict=False):
+            for shade, view in zip(np.linspace(0.82, 0.4, len(line) - 1), line, strict=False):
+                view.draw_body(panel, above, str(shade), str(shade))
+            line[-1].draw(panel, above=above)
+        if column > 0 and not side:
+            panels[0].tick_params(labelleft=True)
+        panels[0].plot(*record["base_pose"][:, :2].T, color=GROUND, lw=0.8, zorder=2)
+        panels[0].plot(*record["w"][:, :2].T, color=HEAD, lw=1.0, zorder=5.5)
+        panels[0].plot(*record["w_target"][:, :2].T, "--", color=TARGET, lw=1.0, zorder=5.6)
+        panels[0].set_title(label, fontsize=size)
+    more: dict[str, Any] = {
+        "earlier posture": Line2D([], [], color="0.65", lw=1.8),
+        "its path": Line2D([], [], color=HEAD, lw=1.0),
+        "its target": Line2D([], [], color=TARGET, ls="--", lw=1.0),
+        "path of pair 1": Line2D([], [], color=GROUND, lw=0.8),
+    }
+    _explain(figure, views, more)
     return figure
 
 
-def overlay_margins(axes: Sequence[Axes], records: Mapping[str, Record]) -> None:
+def overlay_margins(
+    axes: Sequence[Axes], records: Mapping[str, Record], looks: Mapping[str, Mapping[str, Any]]
+) -> None:
     """Overlay cost, largest yaw angle relative to its limit, and support margin of labelled runs in three panels."""
     for label, record in records.items():
-        axes[0].plot(record.time, record["cost"], label=label)
-        axes[1].plot(record.time, used_limit(record))
-        axes[2].plot(record.time, 1e3 * record["support_margin"])
-    for axis, limit, text in zip(axes[1:], (1.0, 0.0), ("largest |θ| / limit", "support margin [mm]"), strict=True):
-        axis.axhline(limit, color="black", ls="-.", lw=0.8)
+        axes[0].plot(record.time, record["cost"], label=label, **looks[label])
+        axes[1].plot(record.time, used_limit(record), **looks[label])
+        axes[2].plot(record.time, 1e3 * record["support_margin"], **looks[label])
+    texts = ("largest yaw angle\n/ its limit", "support margin\n[mm]")
+    for axis, limit, name, text in zip(axes[1:], (1.0, 0.0), ("limit", "tips"), texts, strict=True):
+        limit_line(axis, limit, name)
         axis.set_ylabel(text)
     axes[0].set_ylabel("cost V")
     axes[0].set_ylim(bottom=0)
+
+
+def limit_line(axis: Axes, value: float, text: str = "") -> None:
+    """Draw a limit as a dash-dotted line, with its name, if any, above the right end."""
+    axis.axhline(value, color=HEAD, ls="-.", lw=0.8)
+    if not text:
+        return
+    low, high = axis.get_ylim()
+    axis.set_ylim(min(low, value), max(high, value + 0.14 * (max(high, value) - min(low, value))))
+    axis.annotate(
+        text,
+        (1.0, value),
+        xycoords=("axes fraction", "data"),
+        xytext=(-2, 1.5),
+        textcoords="offset points",
+        ha="right",
+        color=HEAD,
+        fontsize=style.letters(7.0),
+    )
+
+
+def pair_wheels(record: Record) -> dict[str, list[int]]:
+    """Return the columns of the contact signals that belong to each wheel pair, by its name in words."""
+    names = record.labels["contact_normal_force"]
+    return {
+        pair.replace("pair", "pair "): [k for k, n in enumerate(names) if n[:-1] == pair.replace("pair", "wheel")]
+        for pair in record.labels["grounded"]
+    }
+
+
+def pair_loads(record: Record) -> dict[str, Array]:
+    """Return the load of each wheel pair [N], (T,), by its name in words."""
+    forces = record["contact_normal_force"]
+    return {pair: forces[:, columns].sum(axis=1) for pair, columns in pair_wheels(record).items()}
 
 
 def mode_starts(record: Record) -> NDArray[np.int64]:
@@ -194,7 +333,8 @@ def mode_chart(axis: Axes, record: Record, title: str = "mode") -> None:
     """Draw grounded (filled) and lifted (white) wheel pairs over time, with mode numbers if they fit."""
     grounded, time, mode = record["grounded"], record.time, record["mode"]
     starts, last, pairs = mode_starts(record), len(time) - 1, grounded.shape[1]
-    numbered, dense = len(starts) <= NUMBERED, len(starts) > INTERVALS
+    middles = 0.5 * (time[starts] + time[np.append(starts[1:], last)])
+    numbered, dense = is_numbered(record), len(starts) > INTERVALS
     if dense:
         _shares(axis, record, grounded, np.arange(1.0, pairs + 1.0))
     for i in range(0 if dense else pairs):
@@ -205,15 +345,8 @@ def mode_chart(axis: Axes, record: Record, title: str = "mode") -> None:
         edge = {"edgecolors": "white", "linewidth": 0.4} if numbered else {"linewidth": 0.0}
         axis.broken_barh(bars, (i + 0.6, 0.8), facecolors=GROUND, **edge)
     if numbered:
-        for start, end in zip(starts, np.append(starts[1:], last), strict=True):
-            axis.text(
-                (time[start] + time[end]) / 2,
-                0.2,
-                str(mode[start]),
-                ha="center",
-                va="center",
-                fontsize=style.letters(7.0),
-            )
+        for start, middle in zip(starts, middles, strict=True):
+            axis.text(middle, 0.2, str(mode[start]), ha="center", va="center", fontsize=style.letters(7.0))
     axis.set_xlim(time[0], time[-1])
     axis.set_ylim(pairs + 0.6, -0.2 if numbered else 0.4)
     axis.set_yticks(range(1, pairs + 1))
@@ -222,7 +355,17 @@ def mode_chart(axis: Axes, record: Record, title: str = "mode") -> None:
     title = f"{title}, and the " if numbered else title.removesuffix("mode")
     length = (time[-1] - time[0]) / INTERVALS
     lifted = f"share of each {length:.2g} s, white: lifted" if dense else "blue) or lifted (white"
-    axis.set_title(f"{title}wheel pairs on the ground ({lifted})", loc="left")
+    text = style.broken(f"{title}wheel pairs on the ground ({lifted})", style.width() - 0.6)
+    axis.set_title(text, loc="left")
+
+
+def is_numbered(record: Record) -> bool:
+    """Return whether the numbers of the modes fit above a chart of the modes."""
+    starts = record.time[mode_starts(record)]
+    middles = 0.5 * (starts + np.append(starts[1:], record.time[-1]))
+    length = (record.time[-1] - record.time[0]) or 1.0
+    apart = np.diff(middles).min(initial=length) / length * 72.0 * (style.width() - 0.8)
+    return len(starts) <= NUMBERED and bool(apart > style.letters(7.0))
 
 
 def mode_steps(axis: Axes, record: Record) -> None:
@@ -254,13 +397,19 @@ def _shares(axis: Axes, record: Record, holds: NDArray[Any], places: NDArray[np.
 
 
 def error_axis(axis: Axes, *errors: NDArray[np.float64]) -> None:
-    """Set the limits of a logarithmic error axis so that rounding errors (an exact first sample) do not extend it."""
+    """Set the limits of an axis of errors [mm or °], logarithmic if the errors differ by more than ``SPREAD``.
+
+    Rounding errors, and a peak or an exact sample at the start, do not extend the axis.
+    """
     values = np.concatenate(errors)
-    values = values[values > 1e-15]
-    if len(values):
-        axis.set_ylim(10.0 ** np.floor(np.log10(np.percentile(values, 2))), 3.0 * values.max())
-    else:
-        axis.set_ylim(1e-16, 1e-14)
+    high = max(float(values.max(initial=0.0)), ROUNDING)
+    seen = values[values > ROUNDING]
+    low = float(np.percentile(seen, 2)) if len(seen) else high
+    if high < SPREAD * low:
+        axis.set_ylim(0.0, 1.1 * high)
+        return
+    axis.set_ylim(0.7 * low, 1.5 * high)
+    style.log_axis(axis)
 
 
 def moments(record: Record, count: int) -> NDArray[np.int64]:
@@ -287,16 +436,17 @@ def greek(name: str) -> str:
     return name.replace("theta", "θ").replace("psi", "ψ")
 
 
-def _explain(figure: Figure, views: Sequence[View]) -> None:
+def _explain(figure: style.Drawing, views: Sequence[View], more: Mapping[str, Any]) -> None:
     """Add a legend of the views below a figure."""
-    handles: list[Any] = [
-        Line2D([], [], color=HEAD, marker="o", ls="", ms=4, label="controlled point"),
-        Line2D([], [], color=BODY, lw=1.8, label="body"),
-        Patch(facecolor=GROUND, edgecolor=GROUND, label="wheel on the ground"),
-        Patch(facecolor=LIFT, edgecolor=GROUND, label="wheel lifted"),
-        Patch(facecolor=SUPPORT, alpha=0.25, label="support polygon"),
-        Line2D([], [], color="black", marker="x", ls="", ms=4, label="centre of mass"),
-    ]
+    entries: dict[str, Any] = {
+        "body": Line2D([], [], color=BODY, lw=1.8),
+        "wheel on ground": Patch(facecolor=GROUND, edgecolor=GROUND),
+        "wheel lifted": Patch(facecolor=LIFT, edgecolor=GROUND),
+        "support polygon": Patch(facecolor=SUPPORT, alpha=0.25),
+        "centre of mass": Line2D([], [], color="black", marker="x", ls="", ms=4),
+        "controlled point": Line2D([], [], color=HEAD, marker="o", ls="", ms=4),
+        **more,
+    }
     if any(view.objects for view in views):
-        handles.append(Patch(facecolor=OBJECT, edgecolor=BODY, lw=0.5, label="object"))
-    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
+        entries["object"] = Patch(facecolor=OBJECT, edgecolor=BODY, lw=0.5)
+    figure.put_below(entries, 5)

@@ -21,6 +21,7 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.legend import Legend
+from matplotlib.lines import Line2D
 from matplotlib.text import Text
 from matplotlib.ticker import FuncFormatter, LogFormatter, LogLocator, NullFormatter, NullLocator
 from numpy.typing import NDArray
@@ -64,7 +65,7 @@ _SIZES = {
     "figure.titlesize": 1.18,
 }
 # Labels of coordinates, with an italic symbol.
-_COORDINATE = re.compile(r"\$[xyz]\$( \[m+\])?")
+_COORDINATE = re.compile(r"(height |roll |pitch |yaw )?\$(x|y|z|\\alpha|\\beta|\\gamma)\$( \[(m|mm|rad|mrad|°)\])?")
 # Mean width of a letter as a multiple of its size, for the breaking of long lines.
 LETTER = 0.56
 DPI = 170
@@ -360,10 +361,7 @@ def variant_styles(names: Sequence[T]) -> dict[T, dict[str, Any]]:
     Line styles differ only if there are more than seven curves. Later curves are on top and thinner, so that equal
     curves remain visible.
     """
-    colours: Sequence[str] = VARIANT_COLOURS
-    if _drawn.get() is not None:
-        cycle = matplotlib.rcParams["axes.prop_cycle"].by_key().get("color", VARIANT_COLOURS)
-        colours = [to_hex(colour) for colour in cycle]
+    colours = _colours()
     count = len(colours)
     dashes = ("-", (0, (5, 1.5)), (0, (1, 1)), (0, (5, 1, 1, 1)))
     return {
@@ -374,6 +372,68 @@ def variant_styles(names: Sequence[T]) -> dict[T, dict[str, Any]]:
         }
         for k, name in enumerate(names)
     }
+
+
+def _colours() -> Sequence[str]:
+    """Return the colours of variants: those of the look, and dynsim's own outside of a look."""
+    if _drawn.get() is None:
+        return VARIANT_COLOURS
+    cycle = matplotlib.rcParams["axes.prop_cycle"].by_key().get("color", VARIANT_COLOURS)
+    return [to_hex(colour) for colour in cycle]
+
+
+# Line styles of variants that share a colour; legend entry of variants without an ending.
+ALONE = "without ending"
+DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1, 1)), (0, (5, 1, 1, 1)), (0, (8, 3)), (0, (3, 1, 1, 1, 1, 1)))
+
+
+def families(names: Sequence[str]) -> dict[str, tuple[str, str]]:
+    """Split the names of variants at an underscore into a stem, which related variants share, and an ending.
+
+    The stem is the shortest beginning that is the name of a variant: "x_slow" belongs to "x". If no name begins with
+    the name of another variant, the ending is the last word: "ii_z" has the stem "ii".
+    """
+    stems = {}
+    for name in names:
+        words = name.split("_")
+        beginnings = ["_".join(words[:k]) for k in range(1, len(words) + 1)]
+        stems[name] = next(part for part in beginnings if part in names)
+    if list(stems) == list(stems.values()):
+        stems = {name: name.rpartition("_")[0] or name for name in names}
+    return {name: (stem, name[len(stem) + 1 :]) for name, stem in stems.items()}
+
+
+def family_styles(names: Sequence[str]) -> tuple[dict[str, dict[str, Any]], dict[str, Line2D]]:
+    """Return the look of each variant, and the lines of their legend by label.
+
+    If there are more variants than colours, related variants share a colour and differ in their line style, see
+    :func:`families`: the colour is that of the stem, or of the ending if there are more endings than stems. The legend
+    then explains colours and line styles separately.
+    """
+    colours, parts = _colours(), families(names)
+    stems, endings = (list(dict.fromkeys(part)) for part in zip(*parts.values(), strict=True))
+    if len(names) <= len(colours) or len(names) in (len(stems), len(endings)):
+        looks = variant_styles(names)
+        return looks, {name: Line2D([], [], **look) for name, look in looks.items()}
+    coloured, dashed = (stems, endings) if len(stems) >= len(endings) else (endings, stems)
+    looks = {}
+    for name, (stem, ending) in parts.items():
+        colour, dash = (stem, ending) if coloured is stems else (ending, stem)
+        # If the colours do not suffice, they are used again with other line styles.
+        turn, k = divmod(coloured.index(colour), len(colours))
+        line_style = DASHES[(dashed.index(dash) + turn * len(dashed)) % len(DASHES)]
+        looks[name] = {"color": colours[k], "linestyle": line_style, "linewidth": 1.2}
+    if len(coloured) > len(colours):
+        return looks, {name: Line2D([], [], **look) for name, look in looks.items()}
+    texts = ("{}", "…_{}") if coloured is stems else ("…_{}", "{}_…")
+    entries: dict[str, Line2D] = {}
+    for k, part in enumerate(coloured):
+        entries[texts[0].format(part) if part else ALONE] = Line2D([], [], color=colours[k])
+    for k, part in enumerate(dashed):
+        entries[texts[1].format(part) if part else ALONE] = Line2D(
+            [], [], color=BLACK, linestyle=DASHES[k % len(DASHES)]
+        )
+    return looks, entries
 
 
 def number(value: float, digits: int = 4) -> str:

@@ -8,18 +8,17 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from dynsim.draw.figures import style
 from dynsim.draw.figures.snake_view import (
+    COORDINATE_NAMES,
     GROUND,
     HEAD,
     SYMBOLS,
@@ -27,8 +26,8 @@ from dynsim.draw.figures.snake_view import (
     greek,
     mode_chart,
     overlay_margins,
+    pair_loads,
     posture_grid,
-    posture_strip,
 )
 from dynsim.draw.figures.style import VARIANT_COLOURS
 from dynsim.record import Record
@@ -92,66 +91,63 @@ def write_tables(scenario: str, records: Mapping[str, Record], folder: Path) -> 
     return written
 
 
-def _bars(
-    axis: Axes, moved: Sequence[str], places: NDArray[Any], i: int, scale: float, deviations: float, **look: Any
-) -> None:
-    """Draw how far coordinate i was from its target in [T], ± a number of standard ``deviations``."""
-    published = [TABLE_III[name] for name in moved]
-    off = [scale * (p.mean[i] - p.target[i]) for p in published]
-    axis.bar(places, off, yerr=[deviations * scale * p.deviation[i] for p in published], capsize=2, **look)
+# Names of the sources of a displacement, and their markers, by the keys of ``SOURCES``.
+MARKS: dict[str, tuple[str, dict[str, Any]]] = {
+    "kinematic": ("simulated, kinematic", {"marker": "s", "color": "black", "mfc": "none"}),
+    "dynamic": ("simulated with forces, feedforward", {"marker": "D", "color": HEAD}),
+    "measured": ("simulated with forces, head pose fed back", {"marker": "o", "color": GROUND}),
+}
 
 
 def positioning(records: Mapping[str, Record]) -> Figure:
     """Draw Table III of [T]: deviation from the target displacement, measured in [T] and simulated here."""
-    moved = [name for name in TABLE_III if name in records]
-    figure = style.new_figure(4.7, "displacements of the head and Table III of [T]")
-    axes = figure.subplots(2, 1, sharex=True)
-    width = 0.8 / 3
-    for axis, part, unit in ((axes[0], range(3), "mm"), (axes[1], range(3, 6), "rad")):
-        scale = 1e3 if unit == "mm" else 1.0
-        for k, i in enumerate(part):
-            positions = np.arange(len(moved)) + (k - 1) * width
-            name = SYMBOLS.get(COORDINATES[i], COORDINATES[i])
-            look = {"color": VARIANT_COLOURS[k], "alpha": 0.6, "label": f"Δ{name}, [T]"}
-            _bars(axis, moved, positions, i, scale, 1.0, width=0.9 * width, **look)
-            ours = [scale * (displacement(records[m])[i] - TABLE_III[m].target[i]) for m in moved]
-            axis.plot(positions, ours, "D", color="black", ms=3, label="simulated, no slip" if k == 2 else None)
-        axis.axhline(0.0, color="black", lw=0.6)
-        axis.set_ylabel(f"off target [{unit}]")
-        style.legend_beside(axis)
-    axes[1].set_xticks(range(len(moved)), [f"moving {SYMBOLS.get(m, m)}" for m in moved])
-    axes[1].set_xlim(-0.6, len(moved) - 0.4)
-    return figure
+    return _deviations(records, {"kinematic": ""})
 
 
 def dynamic_positioning(records: Mapping[str, Record]) -> Figure:
     """Draw Table III of [T]: deviation from the target displacement, measured in [T] and simulated in three ways."""
+    return _deviations(records, SOURCES)
+
+
+def _deviations(records: Mapping[str, Record], sources: Mapping[str, str]) -> Figure:
+    """Draw the deviations of six displacements, with the endings of the names of variants by their source."""
     moved = [name for name in TABLE_III if name in records]
-    figure = style.new_figure(6.6, "displacements of the head and Table III of [T]")
+    places, published = np.arange(len(moved)), [TABLE_III[name] for name in moved]
+    figure = style.new_figure(7.0, "displacement of the head minus its target, [T] Table III")
     axes = figure.subplots(6, 1, sharex=True)
-    marks = {"kinematic": ("|", "black"), "dynamic": ("D", HEAD), "measured": ("o", GROUND)}
     for i, axis in enumerate(axes):
-        positions, unit = np.arange(len(moved)), "mm" if i < 3 else "mrad"
-        look = {"color": VARIANT_COLOURS[2], "alpha": 0.5, "label": "[T], ± 2 SD"}
-        _bars(axis, moved, positions, i, 1e3, 2.0, width=0.6, **look)
-        for source, (mark, colour) in marks.items():
-            names = [m + SOURCES[source] for m in moved]
-            there = [k for k, name in enumerate(names) if name in records]
-            ours = [1e3 * (displacement(records[names[k]])[i] - TABLE_III[moved[k]].target[i]) for k in there]
-            axis.plot(positions[there], ours, mark, color=colour, ms=5, label=source)
+        off = [1e3 * (p.mean[i] - p.target[i]) for p in published]
+        spread = [2e3 * p.deviation[i] for p in published]
+        look: dict[str, Any] = {"width": 0.7, "color": VARIANT_COLOURS[2], "alpha": 0.5, "capsize": 2}
+        axis.bar(places, off, yerr=spread, label="measured in [T], mean ± 2 SD", **look)
+        for shift, (source, ending) in zip((-0.2, 0.0, 0.2), sources.items(), strict=False):
+            text, mark = MARKS[source]
+            there = [k for k, name in enumerate(moved) if name + ending in records]
+            ours = [1e3 * (displacement(records[moved[k] + ending])[i] - published[k].target[i]) for k in there]
+            axis.plot(places[there] + shift * (len(sources) > 1), ours, ls="", ms=4, label=text, **mark)
         axis.axhline(0.0, color="black", lw=0.6)
-        axis.set_ylabel(f"Δ{SYMBOLS.get(COORDINATES[i], COORDINATES[i])} [{unit}]")
+        axis.margins(y=0.08)
+        axis.set_ylabel(f"{_name(i)} [{'mm' if i < 3 else 'mrad'}]")
     axes[-1].set_xlim(-0.6, len(moved) - 0.4)
-    style.legend_below(figure, [axes[0]], 4)
-    axes[-1].set_xticks(range(len(moved)), [f"moving {SYMBOLS.get(m, m)}" for m in moved])
+    axes[-1].set_xticks(places, [SYMBOLS.get(m, m) for m in moved])
+    axes[-1].set_xlabel("coordinate that was moved")
+    figure.align_ylabels(axes)
+    style.legend_below(figure, [axes[0]], 2)
+    note = "Displacement: mean over the last second minus mean over the first second ([T] V.A)"
+    later = ", in which a head whose pose is fed back still rises from its sag." if len(sources) > 1 else "."
+    figure.note(note + later)
     return figure
+
+
+def _name(i: int) -> str:
+    return COORDINATE_NAMES.get(COORDINATES[i], COORDINATES[i])
 
 
 def sag_and_feedback(records: Mapping[str, Record]) -> Figure:
     """Draw Figs 7(a) and 7(b) of [T]: the head while β changes, with feedforward and with a measured head pose."""
-    figure = style.new_figure(7.2, "head while β changes, as in Fig 7 of [T]")
+    figure = style.new_figure(7.6, "head while its pitch β changes, as in Fig 7 of [T]")
     axes = figure.subplots(6, 2, sharex=True, sharey="row")
-    shown = {"beta": "(a) feedforward", "beta_measured": "(b) measured by motion capture"}
+    shown = {"beta": "(a) feedforward", "beta_measured": "(b) head pose fed back"}
     for column, (name, title) in zip(axes.T, shown.items(), strict=True):
         record = records[name]
         for i, axis in enumerate(column):
@@ -159,9 +155,10 @@ def sag_and_feedback(records: Mapping[str, Record]) -> Figure:
             axis.plot(record.time, record["w_target"][:, i], ":", color="red", lw=1.4, label="target")
             style.at_least(axis, 0.02)
         column[0].set_title(title, fontsize=style.letters(8.0))
-        column[-1].set_xlabel("t [s]")
+        column[-1].set_xlabel("time [s]")
     for i, axis in enumerate(axes[:, 0]):
-        axis.set_ylabel(f"{SYMBOLS.get(COORDINATES[i], COORDINATES[i])}$_h$ [{'m' if i < 3 else 'rad'}]")
+        axis.set_ylabel(f"{_name(i)} [{'m' if i < 3 else 'rad'}]")
+    figure.align_ylabels(axes[:, 0])
     style.legend_below(figure, [axes[0, 0]], 2)
     return figure
 
@@ -169,32 +166,36 @@ def sag_and_feedback(records: Mapping[str, Record]) -> Figure:
 def wheel_loads(records: Mapping[str, Record]) -> Figure:
     """Draw the loads of the wheel pairs over time, for every manoeuvre with feedforward."""
     moved = [name for name in TABLE_III if name in records]
-    figure = style.new_figure(1.25 * len(moved) + 1.2, "loads of the wheel pairs")
-    axes = figure.subplots(len(moved), 1, sharex=True, squeeze=False)[:, 0]
-    for axis, name in zip(axes, moved, strict=True):
+    columns = 1 if style.narrow() else 2
+    rows = -(-len(moved) // columns)
+    figure = style.new_figure(1.3 * rows + 1.3, "loads of the wheel pairs by the coordinate that was moved")
+    axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    for axis, name in zip(axes.ravel(), moved, strict=False):
         record = records[name]
-        names = record.labels["contact_normal_force"]
-        for pair in record.labels["grounded"]:
-            sides = [k for k, wheel in enumerate(names) if wheel[:-1] == pair.replace("pair", "wheel")]
-            load = record["contact_normal_force"][:, sides].sum(axis=1)
-            axis.plot(record.time, load, lw=0.9, label=pair.replace("pair", "pair "))
-        axis.set_ylabel(f"moving {SYMBOLS.get(name, name)} [N]")
+        for pair, load in pair_loads(record).items():
+            axis.plot(record.time, load, lw=0.9, label=pair)
+        axis.set_title(f"moving {SYMBOLS.get(name, name)}", fontsize=style.letters(8.0))
         axis.set_ylim(bottom=0.0)
-    axes[-1].set_xlabel("t [s]")
-    style.legend_below(figure, [axes[0]], len(axes[0].lines))
+    for axis in axes.ravel()[len(moved) :]:
+        axis.set_visible(False)
+    for axis in axes[:, 0]:
+        axis.set_ylabel("load [N]")
+    for k in range(columns):
+        axes[-1, k].set_xlabel("time [s]")
+    style.legend_below(figure, [axes[0, 0]], 7)
     return figure
 
 
 def motion(records: Mapping[str, Record]) -> Figure:
     """Draw Figs 8 and 16 of [T]: top views over time with the costs of eq 19 and eq 20."""
-    shown = {"cyclic": "eq 19\n(Fig 8)", "eq20": "eq 20 printed\n(Fig 16)", "eq20_min": "eq 20, 1/min d\n(Fig 16)"}
+    shown = {"cyclic": "eq 19 (Fig 8)", "eq20": "eq 20 as printed (Fig 16)", "eq20_min": "eq 20, 1/min d (Fig 16)"}
     lines = {}
     for name, label in shown.items():
         record = records[name]
         views = [_view_at(record, t) for t in (0.0, 2.0, 7.0, 12.0, 17.0, np.inf)]
         area = record["support_area"]
         lines[label] = [(v, f"{v.time:.0f} s, mode {v.mode}, {area[v.row]:.3f} m²") for v in views]
-    return posture_grid("eq 19 and eq 20, as in Figs 8 and 16 of [T], with the area of the support polygon", lines)
+    return posture_grid("costs of eq 19 and eq 20, as in Figs 8 and 16 of [T], with the area of support", lines)
 
 
 def _view_at(record: Record, time: float) -> View:
@@ -203,27 +204,34 @@ def _view_at(record: Record, time: float) -> View:
 
 def head_and_cost(record: Record) -> Figure:
     """Draw Fig 9 of [T]: head pose, mode and V over time, and the error stated in the text of [T]."""
-    figure = style.new_figure(6.9, style.title(record, "head, mode and cost, as in Fig 9 of [T]"))
-    axes = figure.subplots(4, 2, sharex=True)
+    columns = 1 if style.narrow() else 2
+    figure = style.new_figure(9.2 / columns + 2.4, style.title(record, "head, mode and cost, as in Fig 9 of [T]"))
+    axes = figure.subplots(8 // columns, columns, sharex=True, squeeze=False)
+    *poses, mode, cost = [*axes[:3].T.ravel(), *axes[3]] if columns == 2 else axes.ravel()
     time = record.time
-    for i, axis in enumerate(axes[:3].T.ravel()):
+    for i, axis in enumerate(poses):
         scale, error, unit = (1e3, HEAD_ERROR[0], "mm") if i < 3 else (1.0, HEAD_ERROR[1], "rad")
         target = scale * record["w_target"][:, i]
         axis.plot(time, scale * record["w"][:, i], color=GROUND, label="simulated")
         axis.plot(time, target, ":", color="red", lw=1.4, label="target")
-        low, high, label = target - scale * error, target + scale * error, "[T]: errors of about 30 mm and 0.1 rad"
+        low, high, label = target - scale * error, target + scale * error, "errors in [T]: about 30 mm, 0.1 rad"
         axis.fill_between(time, low, high, color=VARIANT_COLOURS[4], alpha=0.25, lw=0, label=label)
         style.at_least(axis, 4 * scale * error)
-        axis.set_ylabel(f"{SYMBOLS.get(COORDINATES[i], COORDINATES[i])}$_h$ [{unit}]")
+        axis.set_ylabel(f"{_name(i)} [{unit}]")
         off = scale * np.abs(record["w"][:, i] - record["w_target"][:, i]).max()
-        axis.set_title(f"largest error {off:.1e} {unit}", fontsize=style.letters(7.0))
-    axes[3, 0].step(time, record["mode"], where="post", color=GROUND)
-    axes[3, 0].set(ylabel="σ", ylim=(0.5, record["mode"].max() + 0.5), xlabel="t [s]")
-    axes[3, 0].set_yticks(np.unique(record["mode"]))
-    axes[3, 1].plot(time, record["cost"], color=GROUND)
-    axes[3, 1].set(ylabel="V", xlabel="t [s]")
-    axes[3, 1].set_ylim(bottom=0.0)
-    style.legend_below(figure, [axes[0, 0]], 3)
+        least = 1e-3 * scale * error
+        text = f"below {least:.2g}" if off < least else f"{off:.2g}"
+        axis.set_title(f"largest error {text} {unit}", fontsize=style.letters(7.0))
+    mode.step(time, record["mode"], where="post", color=GROUND)
+    mode.set(ylabel="mode σ", ylim=(0.5, record["mode"].max() + 0.5))
+    mode.set_yticks(np.unique(record["mode"]))
+    cost.plot(time, record["cost"], color=GROUND)
+    cost.set_ylabel("cost V")
+    cost.set_ylim(bottom=0.0)
+    for axis in axes[-1]:
+        axis.set_xlabel("time [s]")
+    figure.align_ylabels(axes)
+    style.legend_below(figure, poses[:1], 3)
     return figure
 
 
@@ -231,9 +239,10 @@ def joint_angles(record: Record) -> Figure:
     """Draw Fig 10 of [T]: every joint angle over time with its limits."""
     geometry, phi = snake_geometry(record), record["phi"]
     names, count = record.labels["phi"], phi.shape[1]
-    lines = -(-count // 3)
-    figure = style.new_figure(1.55 * lines + 0.7, style.title(record, "joint angles, as in Fig 10 of [T]"))
-    axes = figure.subplots(lines, 3, sharex=True)
+    columns = 2 if style.narrow() else 3
+    lines = -(-count // columns)
+    figure = style.new_figure(1.4 * lines + 0.9, style.title(record, "joint angles, as in Fig 10 of [T]"))
+    axes = figure.subplots(lines, columns, sharex=True)
     for axis in axes.ravel()[count:]:
         axis.set_visible(False)
     for j, axis in enumerate(axes.ravel()[:count]):
@@ -247,7 +256,7 @@ def joint_angles(record: Record) -> Figure:
         reach = 1.15 * geometry.upper[j]
         axis.set(ylim=(-reach, reach), ylabel=f"{greek(names[j])} [rad]")
     for axis in axes[-1]:
-        axis.set_xlabel("t [s]")
+        axis.set_xlabel("time [s]")
     style.legend_below(figure, [axes[0, 0]], 4)
     return figure
 
@@ -258,11 +267,11 @@ def policies(records: Mapping[str, Record]) -> Figure:
     axes = figure.subplots(6, 1, sharex=True, height_ratios=[1, 1, 1, 1.2, 1, 1])
     for axis, name in zip(axes, POLICIES, strict=False):
         mode_chart(axis, records[name], f"{name}: mode")
-    overlay_margins(
-        axes[3:], {f"{name}, V at the end {records[name]['cost'][-1]:.2f}": records[name] for name in POLICIES}
-    )
-    axes[3].legend()
-    axes[5].set_xlabel("t [s]      (margin below zero: the robot tips)")
+    shown = {f"{name}, V at the end {records[name]['cost'][-1]:.2f}": records[name] for name in POLICIES}
+    overlay_margins(axes[3:], shown, style.variant_styles(list(shown)))
+    axes[5].set_xlabel("time [s]")
+    figure.align_ylabels(axes)
+    style.legend_below(figure, [axes[3]], 3)
     return figure
 
 
@@ -285,9 +294,8 @@ def door(record: Record) -> Figure:
             view = View(record, max(view.row - 1, 0))  # the sample before the change that ends the stop
         opened = opening(record)[view.row]
         titled.append((view, f"({'abcdefghijklmnop'[k]}) {caption}\n{view.time:.1f} s, {opened:.1f}°"))
-    lines = {" " * start: titled[start : start + 3] for start in range(0, len(titled), 3)}
-    title = style.title(record, "the door and its angle, as in Fig 14 of [T]; green: arc of the knob")
-    return posture_grid(title, lines)
+    title = style.title(record, "the door and its angle, as in Fig 14 of [T]")
+    return posture_grid(title, {"": titled})
 
 
 def picking_up(record: Record) -> Figure:
@@ -297,4 +305,4 @@ def picking_up(record: Record) -> Figure:
     lifted = closed[np.argmax(height > height.max() - 1e-4)]  # the first time; later ones differ only by rounding
     shown = ((closed[0] // 2, "1: reaching"), (closed[0], "2: grasping"), (lifted, "3: after picking up"))
     line = [(View(record, int(row)), f"{caption}, t = {record.time[row]:.1f} s") for row, caption in shown]
-    return posture_strip(style.title(record, "picking up, as in Fig 13 of [T]"), line)
+    return posture_grid(style.title(record, "picking up, as in Fig 13 of [T]"), {"": line}, side=True)
