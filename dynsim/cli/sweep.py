@@ -182,15 +182,18 @@ def _draw(
 ) -> None:
     from dynsim.config.problems import suggest
     from dynsim.draw.figures.sweep import Sweep, draw
+    from dynsim.scenario.quantities import quantity
     from dynsim.studies.sweep import OK, TABLES
 
+    scenario = plan.scenario(next(plan.points()))
     known = dict.fromkeys(key for row in rows for key in row.numbers)
-    for number in plotted:
-        if known and number not in known:
-            raise ScenarioError(
-                f"--plot {number}: no run has that number{suggest(number, known)}; {folder / TABLES[0]} lists all; "
-                "use --resume with another --plot to redraw without simulating"
-            )
+    unknown = [number for number in plotted if known and number not in known]
+    if unknown:
+        raise ScenarioError(
+            f"--plot {', '.join(unknown)}: no run has {'that number' if len(unknown) == 1 else 'these numbers'}"
+            f"{suggest(unknown[0], known) if len(unknown) == 1 else ''}; {folder / TABLES[0]} lists all; "
+            "use --resume with another --plot to redraw without simulating"
+        )
     # The numbers of a run that stopped early must not be plotted like those of a complete run.
     table = Sweep(
         name,
@@ -199,6 +202,7 @@ def _draw(
         plan.sampled,
         plan.file.variants,
         plotted,
+        {key: quantity(key, scenario) for key in [*(axis.key for axis in plan.grid), *plan.sampled]},
     )
     with drawing(folder, quiet):
         draw(table, folder, format_, look)

@@ -29,8 +29,10 @@ import dynsim
 from dynsim.cli import sweep as sweep_command
 from dynsim.draw.figures import style
 from dynsim.draw.figures import sweep as pictures
+from dynsim.draw.figures.look import Look
 from dynsim.errors import DynsimError, ScenarioError
 from dynsim.record import Record
+from dynsim.record.quantities import Quantity
 from dynsim.record.sensitivity import sensitivities, spread
 from dynsim.scenario import SetOptions, read_scenario
 from dynsim.studies import batch
@@ -474,31 +476,30 @@ def test_figures_by_what_was_varied(tmp_path: Path, grid: list[str], sampled: li
 @pytest.mark.parametrize(
     ("key", "label"),
     [
-        ("base.tip_margin_min", "base: tip margin min"),
-        ("elbow_4.normal_force_max_N", "elbow_4: normal force max [N]"),
-        ("joint_1.torque_rms_N_m", "joint_1: torque rms [N m]"),
-        ("position_error_max_m", "position error max [m]"),
-        ("slip_max_m_per_s", "slip max [m/s]"),
+        ("base.tip_margin_min", "tip margin, whole run"),
+        ("elbow_4.normal_force_max_N", "elbow_4: normal force, max [N]"),
+        ("joint_1.torque_rms_N_m", "joint_1: torque, rms [N m]"),
+        ("position_error_max_m", "position error, max [m]"),
+        ("slip_max_m_per_s", "slip, max [m/s]"),
     ],
 )
 def test_any_number_is_drawn_with_its_unit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, key: str, label: str):
     monkeypatch.setattr(style, "save", lambda figure, path: path)  # what is drawn counts, not the pictures
     rows = [{**row, key: row["mass"] - 2.0} for row in ROWS]
-    assert pictures.named(key) == (label, 1.0)
     table = pictures.Sweep("test", rows, ["a"], ["mass"], plotted=[key, "hand_error_rms_m", "not_there"])
-    assert table.metrics == {key: (label, 1.0), "hand_error_rms_m": pictures.ERRORS["hand_error_rms_m"]}
+    assert [drawn.label for drawn in table.metrics.values()] == [label, "hand error, rms [mm]"]
     assert {path.stem for path in pictures.draw(table, tmp_path)} == {"sweep_lines", "sweep_samples", "sweep_tornado"}
-    first, second = (axes.get_ylabel() for axes in pictures.lines(table).axes)
+    first, second = (axes.get_ylabel().replace("\n", " ") for axes in pictures.lines(table).axes)
     assert (first, second[-4:]) == (label, "[mm]")
 
 
 def test_the_tornado_shows_the_effect_of_a_deviation():
     figure = pictures.tornado(pictures.Sweep("test", ROWS, ["a", "b"], ["mass"]))
     assert figure is not None
-    # The draws are three, at each of four places of the grid.
+    # The draws are three, at each of four places of the grid; each panel shows both variants.
     deviation = np.array([1.0, 2.0, 4.0]).std(ddof=1)
-    widths = [axes.patches[0].get_width() for axes in figure.axes]
-    assert widths == pytest.approx([deviation, deviation] * 2)
+    widths = [bar.get_width() for axes in figure.axes for bar in axes.patches]
+    assert widths == pytest.approx([deviation] * 4)
 
 
 def noisy(places: int, draws: int) -> pictures.Sweep:
@@ -522,8 +523,8 @@ def test_more_places_of_the_grid_are_no_more_draws():
     few, many = (pictures.tornado(noisy(places, draws=12)) for places in (1, 50))
     assert few is not None
     assert many is not None
+    assert few.caption == many.caption
     for axis, other in zip(few.axes, many.axes, strict=True):
-        assert axis.get_title() == other.get_title()
         bars = [axes.collections[0].get_segments()[0] for axes in (axis, other)]
         np.testing.assert_allclose(bars[0], bars[1], rtol=1e-9)
 
@@ -533,20 +534,20 @@ def test_distributions_are_those_of_one_place():
     figure = pictures.samples(sweep)
     assert figure is not None
     energies = figure.axes[::2]
-    assert [axes.get_title().split("\n")[0] for axes in energies] == ["a = 0", "a = 1", "a = 2"]
+    assert [axes.get_title().split("\n")[0] for axes in energies] == ["plant.a = 0", "plant.a = 1", "plant.a = 2"]
     for index, axes in enumerate(energies):
         here = spread(np.array([row["electrical_energy_J"] for row in sweep.rows if row["plant.a"] == index]))
         assert axes.lines[0].get_xdata()[0] == pytest.approx(here.mean)
-        assert mentions(axes.get_title(), "20", f"{here.mean:.2f} ± {here.mean - here.mean_low:.2f}")
+        assert mentions(axes.get_title(), f"{here.mean:.2f} ± {here.mean - here.mean_low:.2f}")
         assert sum(bar.get_height() for bar in axes.patches) == 20
 
 
-def test_of_many_places_some_are_shown_and_the_title_says_so():
+def test_of_many_places_some_are_shown_with_a_note():
     figure = pictures.samples(noisy(places=50, draws=3))
     assert figure is not None
     heads = [axes.get_title().split("\n")[0] for axes in figure.axes[::2]]
-    assert heads == [f"a = {k}" for k in (0, 10, 20, 29, 39, 49)]
-    assert mentions(figure.get_suptitle(), "6", "50", "statistics.json")
+    assert heads == [f"plant.a = {k}" for k in (0, 12, 24, 37, 49)]
+    assert mentions(figure.caption, "5", "50", "statistics.json")
 
 
 def test_the_colour_of_a_variant_does_not_depend_on_which_were_run():
@@ -561,11 +562,12 @@ def test_the_colour_of_a_variant_does_not_depend_on_which_were_run():
 def test_runs_at_the_same_place_do_not_hide_each_other():
     figure = pictures.pareto(pictures.Sweep("test", ROWS, ["a", "b"], ["mass"]))
     assert figure is not None
-    axes = figure.axes[0]
-    first, second = (dots.get_sizes()[0] for dots in axes.collections)
-    # Those of the second lie on top.
-    assert first > 2.0 * second
-    assert axes.lines[0].get_zorder() > max(dots.get_zorder() for dots in axes.collections)
+    everything, best = figure.axes[0].collections[::2], figure.axes[0].collections[1::2]
+    assert [len(dots.get_offsets()) for dots in everything] == [12, 12]
+    assert not any(len(dots.get_facecolors()) for dots in everything)
+    # Only the runs on the front are filled: those with the least mass at the first value of a.
+    assert [len(dots.get_offsets()) for dots in best] == [2, 2]
+    assert all(len(dots.get_facecolors()) for dots in best)
 
 
 def test_variants_differ_in_their_markers_and_the_best_runs_have_their_numbers():
@@ -573,18 +575,52 @@ def test_variants_differ_in_their_markers_and_the_best_runs_have_their_numbers()
     figure = pictures.pareto(pictures.Sweep("test", rows, ["a", "b"], ["mass"]))
     assert figure is not None
     axes = figure.axes[0]
-    first, second = (dots.get_paths()[0].vertices for dots in axes.collections)
+    first, second = (dots.get_paths()[0].vertices for dots in axes.collections[::2])
     assert first.shape != second.shape
     # The lightest of the first place, of either variant, is the least in both.
     assert [text.get_text() for text in axes.texts] == ["0"]
 
 
-@pytest.mark.parametrize("failed", [True, False])
-def test_cells_without_numbers_are_explained(failed: bool):
-    rows = [row if not failed or row["a"] or row["b"] == "x" else dict(list(row.items())[:4]) for row in ROWS]
-    figure = pictures.heat_map(pictures.Sweep("test", rows, ["a", "b"], ["mass"]))
+@pytest.mark.parametrize(("status", "text"), [("ok", "number does not exist"), ("failed", "no run succeeded")])
+def test_cells_without_numbers_are_explained(status: str, text: str):
+    rows = [row if row["a"] or row["b"] == "x" else dict(list(row.items())[:4]) | {"status": status} for row in ROWS]
+    figures = [pictures.heat_map(pictures.Sweep("test", table, ["a", "b"], ["mass"])) for table in (rows, ROWS)]
+    texts = [[label.get_text() for legend in figure.legends for label in legend.get_texts()] for figure in figures]
+    assert texts == [[text], []]
+
+
+def test_variant_without_the_number_has_no_map():
+    """A free arm has no force of a brace: its runs did not fail."""
+    rows = [row | ({"elbow.normal_force_mean_N": 1.0 + row["a"]} if row["variant"] == "one" else {}) for row in ROWS]
+    sweep = pictures.Sweep("test", rows, ["a", "b"], ["mass"], plotted=["elbow.normal_force_mean_N"])
+    figure = pictures.heat_map(sweep)
     assert figure is not None
-    assert [bool(text.get_text()) for legend in figure.legends for text in legend.get_texts()] == [True] * failed
+    assert [axes.get_title() for axes in figure.axes] == ["one", ""]
+    assert [text.get_text() for text in figure.axes[0].texts] == ["1.000", "2.000", "1.000", "2.000"]
+    assert not figure.legends
+    assert mentions(figure.caption, "elbow: normal force, mean", "two")
+
+
+def test_axes_of_varied_keys_are_in_words_with_units():
+    rows = [row | {"a": 0.01 + 0.02 * row["a"]} for row in ROWS]
+    keys = {"a": Quantity("height of table", unit="m"), "b": Quantity("coefficient of friction", "μ")}
+    sweep = pictures.Sweep("test", rows, ["a", "b"], ["mass"], keys=keys)
+    figure = pictures.heat_map(sweep)
+    assert figure is not None
+    below = figure.axes[2]
+    assert below.get_xlabel() == "height of table [mm]"
+    assert below.get_ylabel().replace("\n", " ") == "coefficient of friction μ"
+    assert [text.get_text() for text in below.get_xticklabels()] == ["10", "30"]
+    assert sweep.value("a", 0.03) == "height of table = 30 mm"
+    assert sweep.value("b", "x") == "μ = x"
+
+
+def test_single_value_far_beyond_the_others_is_beyond_the_axis():
+    rows = [row | {"tip": -1e12 if k == 0 else float(k)} for k, row in enumerate(ROWS)]
+    figure = pictures.lines(pictures.Sweep("test", rows, ["a"], [], plotted=["tip"]))
+    assert figure is not None
+    assert figure.axes[0].get_ylim()[0] > -10.0
+    assert mentions(figure.caption, "1 of 24", "−1e+12")
 
 
 def test_colour_bars_stand_below_their_column():
@@ -755,12 +791,12 @@ def test_runs_that_failed_are_counted_and_not_drawn(monkeypatch: pytest.MonkeyPa
     rows = [SweepRow(k, None, {"duration_s": k + 1}, state, "", numbers, "") for k, state in enumerate(status)]
     seen: list[pictures.Sweep] = []
     monkeypatch.setattr(pictures, "draw", lambda sweep, *_: seen.append(sweep))
-    sweep_command._draw("tipping", rows, plan(Axis("duration_s", (1, 2, 3))), tmp_path, True, "png")
+    sweep_command._draw("tipping", rows, plan(Axis("duration_s", (1, 2, 3))), tmp_path, True, "png", Look())
     (table,) = seen
     assert [row["duration_s"] for row in table.rows] == [1, 2, 3]
     assert [bool(numbers.keys() & row.keys()) for row in table.rows] == [True, False, True]
-    assert mentions(table.failed, "1", "3")
-    assert replace(table, rows=[table.rows[0], table.rows[2]]).failed == ""
+    assert mentions(table.title("all"), "1", "3")
+    assert replace(table, rows=[table.rows[0], table.rows[2]]).title("all") == "tipping: all"
     # The place stays, without a point.
     drawn = pictures.lines(table)
     assert drawn is not None

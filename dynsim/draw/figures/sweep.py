@@ -6,44 +6,51 @@ The figures require only the table of the sweep.
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import LogNorm, Normalize
+from matplotlib.colors import ListedColormap, LogNorm, Normalize
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 from matplotlib.patches import Patch
+from matplotlib.ticker import LogLocator, MaxNLocator
 
 from dynsim.draw.figures import style
 from dynsim.draw.figures.look import Look
 from dynsim.draw.figures.style import Array
-from dynsim.record.sensitivity import LEVEL, sensitivities, spread
+from dynsim.record.quantities import Quantity, summary_quantity
+from dynsim.record.sensitivity import LEVEL, Sensitivities, sensitivities, spread
 
 ENERGY = "electrical_energy_J"
-# Label of each quantity, and factor to the unit in the label. The first error that the table contains is drawn.
-ENERGIES = {ENERGY: ("electrical energy [J]", 1.0)}
-ERRORS = {
-    "hand_error_rms_m": ("hand error, rms [mm]", 1e3),
-    "final_position_error_m": ("final position error [mm]", 1e3),
-}
-# Words in units at the end of summary keys.
-UNITS = {"m", "s", "rad", "N", "A", "V", "W", "J", "kg", "per"}
-# Maximum number of parameters in a tornado diagram, and of bars in a histogram.
-_BARS, _BINS = 12, 40
-# Values whose ratio exceeds this are drawn on a logarithmic axis or colour scale.
-_WIDE = 8.0
-# Height and width of a panel, and heights of a bar in a tornado diagram, of the margins, and of a colour bar [inch].
-_PANEL, _ACROSS, _BAR, _ROOM = 2.1, 3.5, 0.22, 0.9
-_COLOURS = 0.5
-# Maximum length of an axis label, a panel title, and a part of the figure title [characters].
-_LABEL, _HEAD, _PART = 34, 58, 70
-# Maximum number of rows of distributions.
-_ROWS = 6
-# Markers of variants; maximum number of runs that are labelled with their number.
-_MARKERS, _NUMBERED = "osD^vP*X", 12
+# The first error that the table contains is drawn.
+ERRORS = ("hand_error_rms_m", "final_position_error_m")
+# Maximum number of parameters in a tornado diagram with one or two variants, and with more; of bars in a histogram.
+_PARAMETERS, _FEW, _BINS = 12, 8, 40
+# Values whose ratio exceeds this are drawn on a logarithmic axis or colour scale; values of a grid need a larger ratio.
+_WIDE, _WIDE_GRID = 8.0, 20.0
+# Height of a panel; heights of a bar in a tornado diagram, of the margins, and of a colour bar [inch].
+_PANEL, _BAR, _ROOM, _COLOURS = 2.1, 0.1, 0.9, 0.6
+# Minimum width of panels that are side by side; many panels may be narrower in a narrow figure [inch].
+_ACROSS, _ACROSS_MANY = 2.3, 1.6
+# Maximum number of panels of a narrow figure that are below each other.
+_STACKED = 4
+# Maximum number of distributions below each other, and the height of one [inch].
+_ROWS, _LOW = 5, 1.6
+# Markers of variants; maximum number of runs that are labelled with their number, and size of these numbers [point].
+_MARKERS, _NUMBERED, _DIGITS = "osD^vP*X", 12, 7.0
+# Steps between ticks, as multiples of a power of ten.
+_STEPS = (1, 2, 2.5, 5, 10)
+# Colour of a map where runs lack the number; runs that failed are grey.
+_LACKING = "#E8E8E8"
+# Values farther beyond the middle 80 % than this multiple of their range are beyond the axis.
+_FAR = 30.0
+# Maximum number of rows of a map whose cells contain numbers.
+_CELLS = 12
 
 
 @dataclass(frozen=True)
@@ -55,13 +62,15 @@ class Sweep:
     name : str
         Name of the scenario.
     rows : sequence of mapping
-        Results and varied values by column; a failed run has only its varied values.
+        Results and varied values by column; a failed run has its varied values and a ``status`` other than "ok".
     grid, sampled : sequence of str
         Columns that were varied.
     known : sequence of str
         All variants of the scenario in their order, so that colours do not depend on which variants were run.
     plotted : sequence of str
         Columns to draw; default: energy and error.
+    keys : mapping of str to Quantity
+        Name, symbol and unit of the varied columns; default: the columns themselves.
     """
 
     name: str
@@ -70,17 +79,18 @@ class Sweep:
     sampled: Sequence[str]
     known: Sequence[str] = ()
     plotted: Sequence[str] = ()
+    keys: Mapping[str, Quantity] = field(default_factory=dict)
 
     @property
     def variants(self) -> list[str]:
         """Variants in the order of the table; a single variant without a name if the table lists no variants."""
         return list(dict.fromkeys(str(row.get("variant", "")) for row in self.rows))
 
-    @property
-    def failed(self) -> str:
-        """Text for titles with the number of failed runs; "" if no run failed."""
-        bad = sum(all(row.get(key) is None for key in self.metrics) for row in self.rows)
-        return f"; {bad} of {len(self.rows)} failed" if bad else ""
+    def title(self, subject: str) -> str:
+        """Return a title with the scenario, the variant if there is only one, and the number of failed runs."""
+        variant = f" / {self.variants[0]}" if len(self.variants) == 1 and self.variants[0] else ""
+        bad = sum(map(_failed, self.rows))
+        return f"{self.name}{variant}: {subject}{f'; {bad} of {len(self.rows)} runs failed' if bad else ''}"
 
     @property
     def looks(self) -> dict[str, dict[str, Any]]:
@@ -88,13 +98,26 @@ class Sweep:
         return style.variant_styles(list(dict.fromkeys([*self.known, *self.variants])))
 
     @property
-    def metrics(self) -> dict[str, tuple[str, float]]:
+    def metrics(self) -> dict[str, Quantity]:
         """Columns to draw that are in the table: the requested columns, or energy and error."""
-        if self.plotted:
-            return {key: ENERGIES.get(key) or ERRORS.get(key) or named(key) for key in self.plotted if self._has(key)}
-        energies = {key: look for key, look in ENERGIES.items() if self._has(key)}
-        errors = [key for key in ERRORS if self._has(key)][:1]
-        return energies | {key: ERRORS[key] for key in errors}
+        wanted = self.plotted or [ENERGY, *filter(self._has, ERRORS)][:2]
+        return {key: summary_quantity(key).fitted(_values(self.rows, key).tolist()) for key in wanted if self._has(key)}
+
+    def varied(self, key: str) -> Quantity:
+        """Return the quantity of a varied column; lengths are in millimetres if all are small."""
+        return self.keys.get(key, Quantity(key)).fitted(row[key] for row in self.rows)
+
+    def value(self, key: str, value: Any) -> str:
+        """Return a text with a value of a varied column, e.g. "μ = 0.1"."""
+        varied = self.varied(key)
+        text = style.number(varied.scale * value) if _numeric([value]) else value
+        return f"{varied.symbol or varied.name} = {text}{f' {varied.unit}' if varied.unit else ''}"
+
+    def deviation(self, key: str) -> str:
+        """Return the name of a sampled column with its standard deviation, e.g. "mass of link 2 ± 0.005 kg"."""
+        varied = self.varied(key)
+        size = style.number(varied.scale * float(np.std(_values(self.rows, key), ddof=1)), 2)
+        return f"{varied.name} ± {size}{f' {varied.unit}' if varied.unit else ''}"
 
     def _has(self, key: str) -> bool:
         return any(row.get(key) is not None for row in self.rows)
@@ -102,21 +125,6 @@ class Sweep:
     def of(self, variant: str) -> list[Mapping[str, Any]]:
         """Return the rows of one variant."""
         return [row for row in self.rows if str(row.get("variant", "")) == variant]
-
-
-def named(key: str) -> tuple[str, float]:
-    """Return the label and scale of a result from its key and the unit in it; ``base.tip_margin_min`` has no unit.
-
-    The part before the last dot is unchanged: ``elbow_c: normal force max [N]``.
-    """
-    name, _, number = key.rpartition(".")
-    words = number.split("_")
-    units: list[str] = []
-    while len(words) > 1 and words[-1] in UNITS:
-        units.insert(0, words.pop())
-    per = units.index("per") if "per" in units else len(units)
-    unit = " ".join(units[:per]) + ("/" + " ".join(units[per + 1 :]) if per < len(units) else "")
-    return f"{name}{': ' if name else ''}{' '.join(words)}{f' [{unit}]' if unit else ''}", 1.0
 
 
 def draw(sweep: Sweep, folder: Path, kind: str = "png", look: Look | None = None) -> list[Path]:
@@ -127,15 +135,8 @@ def draw(sweep: Sweep, folder: Path, kind: str = "png", look: Look | None = None
     RecordError
         If a file cannot be written.
     """
-    makers = {
-        "sweep_lines": lines,
-        "sweep_map": heat_map,
-        "sweep_pareto": pareto,
-        "sweep_samples": samples,
-        "sweep_tornado": tornado,
-    }
     with style.look(look):
-        return style.save_all(makers, sweep, folder, kind) if sweep.rows and sweep.metrics else []
+        return style.save_all(FIGURES, sweep, folder, kind) if sweep.rows and sweep.metrics else []
 
 
 def lines(sweep: Sweep) -> Figure | None:
@@ -143,30 +144,58 @@ def lines(sweep: Sweep) -> Figure | None:
     if len(sweep.grid) != 1:
         return None
     (key,) = sweep.grid
-    styles, metrics = sweep.looks, sweep.metrics
-    figure = style.new_figure(_PANEL * len(metrics) + _ROOM, f"{sweep.name}: over {key}{sweep.failed}")
+    styles, metrics, varied = sweep.looks, sweep.metrics, sweep.varied(key)
+    figure = style.new_figure(_PANEL * len(metrics) + _ROOM, sweep.title(f"effect of {varied.name}"))
     panels = figure.subplots(len(metrics), 1, sharex=True, squeeze=False)[:, 0]
     levels = _levels(sweep.rows, key)
-    at = np.array(levels, dtype=float) if _numeric(levels) else np.arange(float(len(levels)))
-    for axes, (metric, (label, scale)) in zip(panels, metrics.items(), strict=True):
-        for variant in sweep.variants:
-            look, name = styles[variant], variant or None
-            groups = [_values(_at(sweep.of(variant), {key: level}), metric) * scale for level in levels]
+    numeric = _numeric(levels)
+    at = varied.scale * np.array(levels, dtype=float) if numeric else np.arange(float(len(levels)))
+    shaded = False
+    for axes, (metric, drawn) in zip(panels, metrics.items(), strict=True):
+        for k, variant in enumerate(sweep.variants):
+            look: dict[str, Any] = dict(styles[variant])
+            if not numeric:
+                # Nothing is between two words.
+                look["linestyle"] = "none"
+            groups = [_values(_at(sweep.of(variant), {key: level}), metric) * drawn.scale for level in levels]
             means = np.array([group.mean() if len(group) else np.nan for group in groups])
-            axes.plot(at, means, marker="o", markersize=3, label=name, clip_on=False, **look)
-            if any(len(group) > 1 for group in groups):
+            if np.isfinite(means).any():
+                mark = {"marker": _MARKERS[k % len(_MARKERS)], "markersize": 3.5}
+                axes.plot(at, means, label=variant or None, **mark, **look)
+            if numeric and any(len(group) > 1 for group in groups):
                 limits = np.array(
                     [np.quantile(group, [0.025, 0.975]) if len(group) else (np.nan,) * 2 for group in groups]
                 )
                 axes.fill_between(at, *limits.T, color=look["color"], alpha=0.15, linewidth=0)
-        axes.set_ylabel(label)
-        _scale(axes, "y", scale * _values(sweep.rows, metric))
-    panels[-1].set_xlabel(key)
-    if not _numeric(levels):
-        panels[-1].set_xticks(at, list(map(str, levels)))
+                shaded = True
+        axes.set_ylabel(style.broken(drawn.label, _PANEL))
+        _scale(axes, "y", drawn.scale * _values(sweep.rows, metric))
+        _clip(figure, axes, drawn, drawn.scale * _values(sweep.rows, metric))
+    panels[-1].set_xlabel(style.broken(_label(varied)))
+    if not numeric:
+        panels[-1].set_xticks(at, [style.broken(str(level), 0.8 * style.width() / len(levels)) for level in levels])
+        panels[-1].margins(x=0.5 / len(levels))
+    elif _is_geometric(at):
+        style.log_axis(panels[-1], "x")
+    elif style.narrow():
+        panels[-1].xaxis.set_major_locator(MaxNLocator(5, steps=_STEPS))
     if len(sweep.variants) > 1:
-        style.legend_above(panels[0], columns=4)
+        _legend_of_all(list(panels))
+    if shaded:
+        figure.note(f"Lines: means over {_listed(sweep, sweep.sampled)}; shaded: 95 % of the runs.")
     return figure
+
+
+def _legend_of_all(panels: Sequence[Axes]) -> None:
+    """Place one legend for all panels above the first, also for variants that only another panel shows."""
+    first = {line.get_label() for line in panels[0].lines}
+    for axes in panels[1:]:
+        for drawn in axes.lines:
+            if drawn.get_label() not in first:
+                first.add(drawn.get_label())
+                look = {key: getattr(drawn, f"get_{key}")() for key in ("color", "linestyle", "linewidth", "marker")}
+                panels[0].plot([], [], label=drawn.get_label(), markersize=3.5, **look)
+    style.legend_above(panels[0], columns=4)
 
 
 def heat_map(sweep: Sweep) -> Figure | None:
@@ -174,88 +203,225 @@ def heat_map(sweep: Sweep) -> Figure | None:
     if len(sweep.grid) < 2:
         return None
     x, y = sweep.grid[:2]
-    metrics, variants = sweep.metrics, sweep.variants
-    others = [*sweep.grid[2:], *sweep.sampled]
-    note = f" (mean over {_short(', '.join(others), _PART)})" if others else ""
-    title = f"{sweep.name}: over {x} and {y}{note}{sweep.failed}"
-    figure = style.new_figure(_PANEL * len(variants) + _ROOM + _COLOURS, title)
-    panels = figure.subplots(len(variants), len(metrics), squeeze=False, sharex=True, sharey=True)
+    metrics = sweep.metrics
+    # A variant without a contact, for example, lacks the force of this contact.
+    variants = {
+        metric: [v for v in sweep.variants if any(_failed(r) or r.get(metric) is not None for r in sweep.of(v))]
+        for metric in metrics
+    }
     xs, ys = _levels(sweep.rows, x), _levels(sweep.rows, y)
-    empty = False
-    for column, (metric, (label, scale)) in zip(panels.T, metrics.items(), strict=True):
-        tables = [np.full((len(ys), len(xs)), np.nan) for _ in variants]
-        for table, variant in zip(tables, variants, strict=True):
+    grid = _Grid([len(drawn) for drawn in variants.values()], _ACROSS)
+    panel = (0.75 if grid.rows > 3 or style.narrow() else 1.0) * _PANEL
+    height = panel * grid.rows + _ROOM + _COLOURS * len(grid.bands)
+    figure = style.new_figure(height, sweep.title(f"effect of {sweep.varied(x).name} and {sweep.varied(y).name}"))
+    panels = grid.subplots(figure)
+    notes: dict[str, str] = {}
+    for m, (row, (metric, drawn)) in enumerate(zip(panels, metrics.items(), strict=True)):
+        tables = np.full((len(variants[metric]), len(ys), len(xs)), np.nan)
+        failed = np.zeros(tables.shape, dtype=bool)
+        for k, variant in enumerate(variants[metric]):
             for j, b in enumerate(ys):
                 for i, a in enumerate(xs):
-                    values = _values(_at(sweep.of(variant), {x: a, y: b}), metric) * scale
-                    table[j, i] = values.mean() if len(values) else np.nan
+                    runs = list(_at(sweep.of(variant), {x: a, y: b}))
+                    values = _values(runs, metric) * drawn.scale
+                    tables[k, j, i] = values.mean() if len(values) else np.nan
+                    failed[k, j, i] = not len(values) and all(map(_failed, runs))
         low, high = np.nanmin(tables), np.nanmax(tables)
-        empty = empty or bool(np.isnan(tables).any())
         norm = LogNorm(low, high) if _is_wide(low, high) else Normalize(low, high)
-        for axes, table, variant in zip(column, tables, variants, strict=True):
+        for k, (axes, table, bad, variant) in enumerate(zip(row, tables, failed, variants[metric], strict=False)):
+            if len(sweep.variants) > 1:
+                axes.set_title(variant)
             image = axes.imshow(table, origin="lower", aspect="auto", cmap="viridis", norm=norm)
             axes.grid(visible=False)
-            axes.set_facecolor(style.GREY)
-            axes.set_title(variant)
-            _name_cells(axes, "y", y, ys)
-            _name_cells(axes, "x", x, xs)
-        # Place the colour bar below its column; next to it, the label would be at the next column.
-        bar = figure.colorbar(image, ax=list(column), label=label, location="bottom", aspect=30, pad=0.02)
+            axes.set_facecolor(_LACKING)
+            if bad.any():
+                axes.imshow(
+                    np.where(bad, 0.0, np.nan), origin="lower", aspect="auto", cmap=ListedColormap([style.GREY])
+                )
+                notes["no run succeeded"] = style.GREY
+            if (np.isnan(table) & ~bad).any():
+                notes["number does not exist"] = _LACKING
+            _write_cells(axes, image, table, grid.width)
+            _name_cells(axes, "y", sweep.varied(y), ys, 8, 0.55 * panel)
+            _name_cells(axes, "x", sweep.varied(x), xs, 8 if grid.width > _ACROSS else 5, 0.8 * grid.width)
+            if k % grid.columns or (m % grid.beside and k < len(variants[next(iter(metrics))])):
+                axes.tick_params(labelleft=False)
+                axes.set_ylabel("")
+            if k + grid.columns < len(tables):
+                axes.tick_params(labelbottom=False)
+                axes.set_xlabel("")
+        # Place the colour bar below its panels; next to them, the label would be at the next column.
+        bar = figure.colorbar(image, ax=row, label=drawn.label, location="bottom", aspect=30, pad=0.02)
         if isinstance(norm, LogNorm):
             style.log_axis(bar.ax, "x")
-    if empty:
-        figure.legend(handles=[Patch(color=style.GREY, label="no run succeeded")], loc="outside lower right")
-    for axes in panels[:, 1:].flat:
-        axes.set_ylabel("")
-    for axes in panels[:-1].flat:
-        axes.set_xlabel("")
+        if lacking := [variant for variant in sweep.variants if variant not in variants[metric]]:
+            figure.note(f"{drawn.name}: does not exist for {', '.join(lacking)}.")
+    if notes:
+        handles = [Patch(facecolor=colour, label=text) for text, colour in notes.items()]
+        figure.legend(handles=handles, loc="outside lower right", ncols=len(handles))
+    if others := [*sweep.grid[2:], *sweep.sampled]:
+        figure.note(f"Mean over {_listed(sweep, others)}.")
     return figure
+
+
+@dataclass(frozen=True)
+class _Grid:
+    """Arrangement of the panels of several metrics: metrics side by side, or below each other in a narrow figure.
+
+    Attributes
+    ----------
+    members : sequence of int
+        Number of panels of each metric.
+    across : float
+        Minimum width of a panel [inch].
+    """
+
+    members: Sequence[int]
+    across: float
+
+    @property
+    def fit(self) -> int:
+        """Number of panels that fit side by side."""
+        few = style.narrow() and sum(self.members) <= _STACKED
+        return 1 if few else max(1, int(style.width() / (_ACROSS_MANY if style.narrow() else self.across)))
+
+    @property
+    def beside(self) -> int:
+        """Number of metrics that are side by side."""
+        return min(len(self.members), self.fit)
+
+    @property
+    def columns(self) -> int:
+        """Number of columns of the panels of a metric, so that its rows are equally long."""
+        most = max(self.members)
+        return -(-most // -(-most // min(most, self.fit // self.beside)))
+
+    @property
+    def bands(self) -> list[int]:
+        """Number of rows of each group of metrics that are side by side."""
+        groups = range(0, len(self.members), self.beside)
+        return [-(-max(self.members[k : k + self.beside]) // self.columns) for k in groups]
+
+    @property
+    def rows(self) -> int:
+        """Number of rows of the figure."""
+        return sum(self.bands)
+
+    @property
+    def width(self) -> float:
+        """Width of a panel [inch]."""
+        return style.width() / (self.beside * self.columns)
+
+    def subplots(self, figure: Figure) -> list[list[Axes]]:
+        """Create the axes and return those of each metric; those beyond its members are at the end and empty."""
+        axes = figure.subplots(self.rows, self.beside * self.columns, squeeze=False)
+        panels = []
+        for m, count in enumerate(self.members):
+            band, left = m // self.beside, m % self.beside * self.columns
+            first = sum(self.bands[:band])
+            block = axes[first : first + self.bands[band], left : left + self.columns].ravel()
+            for empty in block[count:]:
+                empty.set_axis_off()
+            panels.append(list(block))
+        return panels
+
+
+def _write_cells(axes: Axes, image: AxesImage, table: Array, across: float) -> None:
+    """Write the values of a map into its cells if there is space; otherwise draw contours."""
+    size = style.letters(_DIGITS)
+    high = float(np.nanmax(np.abs(table), initial=0.0))
+    # Equal decimals unless the values differ widely.
+    places = (
+        max(3 - math.floor(math.log10(high)), 0) if 1e-3 < high < 1e5 and not isinstance(image.norm, LogNorm) else None
+    )
+    texts = {
+        at: f"{float(f'{value:.3g}'):g}" if places is None else f"{value:.{places}f}".replace("-", "−")
+        for at, value in np.ndenumerate(table)
+        if np.isfinite(value)
+    }
+    longest = max(map(len, texts.values()), default=0)
+    # Margins with tick labels take up about a fifth of a panel's width.
+    if 0.8 * 72.0 * across / table.shape[1] < 1.15 * longest * style.LETTER * size + 4.0 or table.shape[0] > _CELLS:
+        if min(table.shape) > 1 and np.nanmax(table) > np.nanmin(table):
+            locator = LogLocator(subs=(1.0, 2.0, 5.0)) if isinstance(image.norm, LogNorm) else MaxNLocator(6)
+            levels = locator.tick_values(*map(float, image.get_clim()))
+            axes.contour(table, levels=levels, colors="white", linewidths=0.6)
+        return
+    for (row, column), text in texts.items():
+        shade = image.cmap(image.norm(table[row, column]))[:3]
+        colour = "black" if np.dot(shade, (0.3, 0.6, 0.1)) > 0.5 else "white"
+        axes.text(column, row, text, ha="center", va="center", fontsize=size, color=colour)
 
 
 def pareto(sweep: Sweep) -> Figure | None:
     """Draw energy versus error of all runs, and number the runs on the Pareto front; return None if one is missing."""
     if sweep.plotted or len(sweep.metrics) < 2:
         return None
-    (energy, (energy_label, _)), (error, (error_label, scale)) = sweep.metrics.items()
-    figure = style.new_figure(3.6, f"{sweep.name}: energy versus error, {len(sweep.rows)} runs{sweep.failed}")
-    axes = figure.subplots()
-    styles, last = sweep.looks, max(len(sweep.variants) - 1, 1)
-    for k, variant in enumerate(sweep.variants):
-        points = [
-            (row[error], row[energy]) for row in sweep.of(variant) if None not in (row.get(error), row.get(energy))
-        ]
-        xs, ys = np.array(points, dtype=float).reshape(-1, 2).T
-        # Earlier variants are larger, so that equal runs appear as concentric rings.
-        larger = 1.0 + 1.8 * (len(sweep.variants) - 1 - k) / last
-        size = (18 if len(sweep.rows) < 500 else 4) * larger**2
-        mark = {"color": styles[variant]["color"], "marker": _MARKERS[k % len(_MARKERS)]}
-        axes.scatter(scale * xs, ys, s=size, label=variant or None, linewidths=0, zorder=3, **mark)
+    (energy, up), (error, right) = sweep.metrics.items()
     rows = [row for row in sweep.rows if None not in (row.get(error), row.get(energy))]
-    front = best([(scale * row[error], row[energy]) for row in rows])
-    numbered = len(front) <= _NUMBERED and all("run" in row for row in rows)
-    for x, y in front if numbered else ():
-        run = next(row["run"] for row in rows if (scale * row[error], row[energy]) == (x, y))
-        axes.annotate(
-            f"{run}", (x, y), xytext=(5.0, 4.0), textcoords="offset points", fontsize=style.letters(7.0), zorder=5
-        )
-    axes.plot(
-        *front.T,
-        color=style.BLACK,
-        linewidth=0.7,
-        # No run is both to the left of the steps and below them.
-        drawstyle="steps-post",
-        marker="o",
-        markersize=5,
-        markerfacecolor="none",
-        label=f"no run is better in both{', numbered as in the table' if numbered else ''}",
-        zorder=4,
-    )
-    axes.margins(0.05)
-    axes.set(xlabel=error_label, ylabel=energy_label)
-    _scale(axes, "x", np.array([scale * row[error] for row in rows]))
-    _scale(axes, "y", np.array([row[energy] for row in rows]))
+    figure = style.new_figure(3.6, sweep.title("energy versus error"))
+    axes = figure.subplots()
+    styles = sweep.looks
+    points = np.array([(right.scale * row[error], up.scale * row[energy]) for row in rows], dtype=float).reshape(-1, 2)
+    front = best(list(map(tuple, points)))
+    on_front = (points[:, None] == front).all(axis=2).any(axis=1)
+    for k, variant in enumerate(sweep.variants):
+        mine = np.array([str(row.get("variant", "")) == variant for row in rows], dtype=bool)
+        look: dict[str, Any] = {
+            "marker": _MARKERS[k % len(_MARKERS)],
+            "s": 24 if len(rows) < 500 else 6,
+            "linewidths": 0.9,
+        }
+        colour = styles[variant]["color"]
+        # Empty markers of equal runs remain visible.
+        axes.scatter(*points[mine].T, facecolors="none", edgecolors=colour, label=variant or None, zorder=3, **look)
+        axes.scatter(*points[mine & on_front].T, color=colour, zorder=4, **look)
+    # No run is both to the left of the steps and below them.
+    steps: dict[str, Any] = {"color": style.GREY, "linewidth": 0.8, "drawstyle": "steps-post", "zorder": 2}
+    axes.plot(*front.T, **steps)
+    filled: dict[str, Any] = {"marker": "o", "markersize": 5, "color": style.GREY, "linewidth": 0.8}
+    axes.plot([], [], label="Pareto front", **filled)
+    axes.margins(0.1)
+    axes.set(xlabel=right.label, ylabel=up.label)
+    _scale(axes, "x", points[:, 0])
+    _scale(axes, "y", points[:, 1])
     style.legend_above(axes, columns=len(sweep.variants) + 1)
+    front_note = f"{len(rows)} runs. Pareto front: no run is better in both."
+    if len(front) <= _NUMBERED and all("run" in row for row in rows):
+        figure.note(f"{front_note} Numbers: runs as in the table, the first of equal runs.")
+        firsts = [(points == at).all(axis=1).argmax() for at in front]
+        _number_runs(figure, axes, front, [str(rows[k]["run"]) for k in firsts])
+    else:
+        figure.note(front_note)
     return figure
+
+
+def _number_runs(figure: Figure, axes: Axes, front: Array, texts: Sequence[str]) -> None:
+    """Write the numbers of runs below the front, where no other runs are; runs close to each other share a text."""
+    figure.draw_without_rendering()
+    size, gap = style.letters(_DIGITS), 4.0
+    at = axes.transData.transform(front) * 72.0 / figure.dpi
+    box = axes.get_window_extent()
+    left, bottom = box.x0 * 72.0 / figure.dpi, box.y0 * 72.0 / figure.dpi
+    groups: list[list[int]] = []
+    for k, point in enumerate(at):
+        if groups and (np.abs(point - at[groups[-1][-1]]) < (4.0 * size, 1.5 * size)).all():
+            groups[-1].append(k)
+        else:
+            groups.append([k])
+    for group in groups:
+        k, align, text = group[0], "right", ", ".join(texts[i] for i in group)
+        if at[k, 0] - style.LETTER * size * len(text) - gap < left:
+            # The lower right is empty as well, up to the next run on the front.
+            k, align = group[-1], "left"
+            if k + 1 < len(at):
+                count = max(int((at[k + 1, 0] - at[k, 0] - 3.0 * gap) / (style.LETTER * size)), 2)
+                text = textwrap.fill(text, count, break_long_words=False)
+        below = at[k, 1] - 1.2 * size * (text.count("\n") + 1) - gap > bottom
+        axes.annotate(
+            text, front[k], xytext=(gap if align == "left" else -gap, -gap if below else gap),
+            textcoords="offset points", fontsize=size, ha=align, va="top" if below else "bottom", zorder=5,
+        )  # fmt: skip
 
 
 def best(points: Sequence[tuple[float, float]]) -> Array:
@@ -270,101 +436,116 @@ def best(points: Sequence[tuple[float, float]]) -> Array:
 def samples(sweep: Sweep) -> Figure | None:
     """Draw the distribution of energy and error over the samples; return None without samples.
 
-    The figure has one row per variant and grid point, because variation due to the grid is not part of the distribution
-    and all grid points have the same draws. If there are many grid points, only some, evenly spaced, are shown.
+    The figure has one panel per variant and grid point, because variation due to the grid is not part of the
+    distribution and all grid points have the same draws. If there are many grid points, only some, evenly spaced, are
+    shown.
     """
     if not sweep.sampled:
         return None
     metrics, variants = sweep.metrics, sweep.variants
     # Each combination of grid values once, in the order of the table.
     firsts = [sweep.rows[rows[0]] for rows in _grouped(sweep.rows, sweep.grid).values()]
-    places = [{key: row[key] for key in sweep.grid} for row in firsts]
+    points = [{key: row[key] for key in sweep.grid} for row in firsts]
     room = max(_ROWS // len(variants), 1)
-    shown = [places[k] for k in np.linspace(0, len(places) - 1, min(room, len(places))).round().astype(int)]
-    note = f"; {len(shown)} of {len(places)} grid points, all in statistics.json" if len(shown) < len(places) else ""
+    shown = [points[k] for k in np.linspace(0, len(points) - 1, min(room, len(points))).round().astype(int)]
+    members = [(variant, point) for variant in variants for point in shown]
+    grid = _Grid([len(members)] * len(metrics), _ACROSS)
     figure = style.new_figure(
-        _PANEL * len(variants) * len(shown) + _ROOM,
-        f"{sweep.name}: {len(sweep.rows)} runs with random parameters{sweep.failed}{note}",
-        # A panel must be as wide as a title with two numbers and their intervals.
-        page=max(style.WIDTH, _ACROSS * len(metrics)),
+        (_LOW if grid.rows > 1 else _PANEL) * grid.rows + _ROOM,
+        sweep.title(f"distribution over {len(sweep.rows)} random runs"),
     )
-    rows = [(variant, grid_place) for variant in variants for grid_place in shown]
-    ends = [key.split(".")[-1] for key in sweep.grid]
-    names = {key: end if ends.count(end) == 1 else key for key, end in zip(sweep.grid, ends, strict=True)}
-    panels = figure.subplots(len(rows), len(metrics), squeeze=False)
-    for row, (variant, grid_place) in zip(panels, rows, strict=True):
-        here = list(_at(sweep.of(variant), grid_place))
-        # If there is only one grid point, the title does not name it.
-        values = {key: style.number(value) if _numeric([value]) else value for key, value in grid_place.items()}
-        where = [f"{names[key]} = {value}" for key, value in values.items()] if len(places) > 1 else []
-        texts = [variant] * bool(variant) + [_short(", ".join(where), _HEAD - len(variant))] * bool(where)
-        head = f"{', '.join(texts)}\n" if texts else ""
-        for axes, (metric, (label, scale)) in zip(row, metrics.items(), strict=True):
-            _distribution(axes, _values(here, metric) * scale, head, sweep.looks[variant]["color"])
-            axes.set_xlabel(label)
-            axes.set_ylabel("runs")
+    for m, (row, (metric, drawn)) in enumerate(zip(grid.subplots(figure), metrics.items(), strict=True)):
+        for k, (axes, (variant, point)) in enumerate(zip(row, members, strict=False)):
+            values = _values(_at(sweep.of(variant), point), metric) * drawn.scale
+            heads = [variant] * (len(variants) > 1) + [sweep.value(key, at) for key, at in point.items()]
+            head = ", ".join(heads) if len(members) > 1 else ""
+            title = "\n".join(filter(None, [head, _distribution(axes, values, sweep.looks[variant]["color"])]))
+            axes.set_title(style.broken(title, 0.85 * grid.width, style.letters(7.5)), fontsize=style.letters(7.5))
+            if k >= len(members) - grid.columns:
+                axes.set_xlabel(style.broken(drawn.label, 0.8 * grid.width))
+            if k % grid.columns == 0 and m % grid.beside == 0:
+                axes.set_ylabel("runs")
+    figure.note(
+        f"Random: {_listed(sweep, sweep.sampled)}. Line: mean; after ±: its {100 * LEVEL:g} % interval; dashed: limits "
+        f"of {100 * LEVEL:g} % of the runs."
+    )
+    if len(shown) < len(points):
+        figure.note(f"{len(shown)} of {len(points)} grid points; statistics.json contains all.")
     return figure
 
 
-def _distribution(axes: Axes, values: Array, head: str, colour: str) -> None:
-    """Draw the histogram of the draws at one grid point, with the mean, its interval, and the interval of the draws."""
-    if len(values) < 2:
-        axes.set_title(f"{head}too few runs with numbers: {len(values)}", fontsize=style.letters(7.5))
-        return
-    if np.ptp(values) == 0.0:
-        axes.set_title(f"{head}{len(values)} runs, all {style.number(values[0])}", fontsize=style.letters(7.5))
-        return
+def _distribution(axes: Axes, values: Array, colour: str) -> str:
+    """Draw the histogram of the draws at one grid point with their mean and interval; return these as text."""
+    if len(values) < 2 or np.ptp(values) == 0.0:
+        axes.set_axis_off()
+        few = f"too few runs with numbers: {len(values)}"
+        return few if len(values) < 2 else f"{len(values)} runs, all {style.number(values[0])}"
     # Bin width by the rule of Freedman and Diaconis, or of Sturges for few samples.
     bins = min(_BINS, len(np.histogram_bin_edges(values, "auto")) - 1)
     axes.hist(values, bins=bins, color=colour, alpha=0.7)
+    axes.yaxis.set_major_locator(MaxNLocator(4, integer=True))
+    axes.xaxis.set_major_locator(MaxNLocator(4, steps=_STEPS))
     statistics = spread(values)
     axes.axvline(statistics.mean, color=style.BLACK, linewidth=1.0)
     for limit in (statistics.low, statistics.high):
         axes.axvline(limit, color=style.BLACK, linewidth=0.8, linestyle=(0, (4, 2)))
-    of_all = (
-        f"{statistics.count} runs: mean {_with_interval(statistics.mean, statistics.mean_high - statistics.mean)}, "
+    axes.margins(x=0.03)
+    separator = ",\n" if style.narrow() else ", "
+    return (
+        f"mean {_with_interval(statistics.mean, statistics.mean_high - statistics.mean)}{separator}"
         f"{100 * LEVEL:g} % in {style.number(statistics.low)} … {style.number(statistics.high)}"
     )
-    axes.set_title(f"{head}{of_all}", fontsize=style.letters(7.5))
-    axes.margins(x=0.03)
 
 
 def tornado(sweep: Sweep) -> Figure | None:
     """Draw the effect of one standard deviation of each sampled key; return None if no linear model can be fitted."""
-    effects = {
-        (variant, metric): fit
-        for variant in sweep.variants
-        for metric in sweep.metrics
-        if (fit := _fit(sweep, variant, metric)) is not None
-    }
+    metrics = sweep.metrics
+    effects = {metric: {v: fit for v in sweep.variants if (fit := _fit(sweep, v, metric))} for metric in metrics}
+    effects = {metric: fits for metric, fits in effects.items() if fits}
     if not effects:
         return None
-    variants, metrics = sweep.variants, sweep.metrics
-    bars = min(len(sweep.sampled), _BARS)
-    title = f"{sweep.name}: effect of one standard deviation of each parameter{sweep.failed}"
-    figure = style.new_figure((_BAR * bars + _ROOM) * len(variants) + 0.5, title)
-    panels = figure.subplots(len(variants), len(metrics), squeeze=False)
-    for row, variant in zip(panels, variants, strict=True):
-        for axes, (metric, (label, scale)) in zip(row, metrics.items(), strict=True):
-            axes.set_xlabel(f"change of {label}")
-            fit = effects.get((variant, metric))
-            if fit is None:
-                axes.set_title(f"{variant}: no linear fit")
+    variants = [v for v in sweep.variants if any(v in fits for fits in effects.values())]
+    bars = min(len(sweep.sampled), _PARAMETERS if len(variants) < 3 else _FEW)
+    grid = _Grid([1] * len(effects), 0.4 * style.WIDTH)
+    small = style.letters(7.0)
+    labels = [style.broken(sweep.deviation(key), 0.48 * grid.width, small) for key in sweep.sampled]
+    lines = max(label.count("\n") + 1 for label in labels)
+    figure = style.new_figure(
+        (max(_BAR * (len(variants) + 1), 1.3 / 72.0 * small * lines) * bars + _ROOM) * grid.rows + 0.5,
+        sweep.title("effect of one standard deviation of each parameter"),
+    )
+    panels = [row[0] for row in grid.subplots(figure)]
+    explained: list[str] = []
+    for axes, (metric, fits) in zip(panels, effects.items(), strict=True):
+        drawn = metrics[metric]
+        largest = np.max([np.abs(fit.effect) for fit in fits.values()], axis=0)
+        order = np.argsort(-largest, kind="stable")[:bars][::-1]
+        thick = 0.8 / len(variants)
+        for k, variant in enumerate(variants):
+            if variant not in fits:
                 continue
-            order = np.argsort(-np.abs(fit.effect), kind="stable")[:bars][::-1]
-            effect, half = scale * fit.effect[order], scale * fit.half_width[order]
-            colours = [style.BLUE if value > 0.0 else style.ORANGE for value in effect]
-            axes.barh(range(len(order)), effect, xerr=half, color=colours, height=0.7, error_kw={"elinewidth": 0.8})
-            axes.set_yticks(range(len(order)), [_short(sweep.sampled[k]) for k in order])
-            axes.axvline(0.0, color=style.BLACK, linewidth=0.6)
-            axes.grid(visible=False, axis="y")
-            axes.margins(x=0.05)
-            explained = f"linear fit explains {100.0 * fit.explained:.3g} % of the variance"
-            axes.set_title("\n".join([variant] * bool(variant) + [explained]), fontsize=style.letters(7.5))
+            effect, half = (drawn.scale * values[order] for values in (fits[variant].effect, fits[variant].half_width))
+            at = np.arange(len(order)) + (0.5 * (len(variants) - 1) - k) * thick
+            look = {"color": sweep.looks[variant]["color"], "error_kw": {"elinewidth": 0.8}}
+            axes.barh(at, effect, xerr=half, height=thick, label=variant or None, **look)
+        axes.set_yticks(range(len(order)), [labels[k] for k in order], fontsize=small)
+        axes.axvline(0.0, color=style.BLACK, linewidth=0.6)
+        axes.grid(visible=False, axis="y")
+        axes.margins(x=0.05)
+        axes.set_title(style.broken(drawn.name, 0.6 * grid.width))
+        axes.set_xlabel(f"change{f' [{drawn.unit}]' if drawn.unit else ''}")
+        shares = sorted({f"{100.0 * fit.explained:.4g}" for fit in fits.values()}, key=float)
+        explained.append(f"{' … '.join(dict.fromkeys([shares[0], shares[-1]]))} % ({drawn.name})")
+    if len(variants) > 1:
+        style.legend_below(figure, panels, 4)
+    figure.note(f"Error bars: {100 * LEVEL:g} % intervals. ± values: one standard deviation.")
+    figure.note(f"Variance that linear fits explain: {', '.join(explained)}.")
+    if bars < len(sweep.sampled):
+        figure.note(f"The {bars} largest of {len(sweep.sampled)} effects; statistics.json contains all.")
     return figure
 
 
-def _fit(sweep: Sweep, variant: str, metric: str) -> Any:
+def _fit(sweep: Sweep, variant: str, metric: str) -> Sensitivities | None:
     rows = [row for row in sweep.of(variant) if row.get(metric) is not None]
     if not rows or not sweep.sampled:
         return None
@@ -376,6 +557,31 @@ def _fit(sweep: Sweep, variant: str, metric: str) -> Any:
     draws = list(_grouped(rows, sweep.sampled).values())
     parameters = np.array([[rows[draw[0]][key] for key in sweep.sampled] for draw in draws], dtype=float)
     return sensitivities(parameters, np.array([values[draw].mean() for draw in draws]))
+
+
+FIGURES = {
+    "sweep_lines": lines,
+    "sweep_map": heat_map,
+    "sweep_pareto": pareto,
+    "sweep_samples": samples,
+    "sweep_tornado": tornado,
+}
+
+
+def _failed(row: Mapping[str, Any]) -> bool:
+    return bool(row.get("status", "ok") != "ok")
+
+
+def _label(quantity: Quantity) -> str:
+    """Return the label of an axis, with the symbol of the quantity if it is a letter."""
+    symbol = f" {quantity.symbol}" if len(quantity.symbol) == 1 else ""
+    return f"{quantity.name}{symbol}{f' [{quantity.unit}]' if quantity.unit else ''}"
+
+
+def _listed(sweep: Sweep, keys: Sequence[str]) -> str:
+    """Return the names of varied columns, or their number if there are many."""
+    names = [sweep.varied(key).name for key in keys]
+    return " and ".join(names) if len(names) < 3 else f"{names[0]}, … ({len(names)} parameters)"
 
 
 def _grouped(rows: Sequence[Mapping[str, Any]], keys: Sequence[str]) -> dict[tuple[str, ...], list[int]]:
@@ -396,11 +602,19 @@ def _numeric(levels: Sequence[Any]) -> bool:
     return all(isinstance(level, (int, float)) and not isinstance(level, bool) for level in levels)
 
 
-def _name_cells(axes: Axes, which: str, key: str, levels: Sequence[Any]) -> None:
-    """Label the rows or columns of an image, at most about eight of them."""
-    shown = range(0, len(levels), -(-len(levels) // 8))
-    texts = [f"{levels[k]:.3g}" if _numeric(levels) else str(levels[k]) for k in shown]
-    axes.set(**{f"{which}ticks": list(shown), f"{which}ticklabels": texts, f"{which}label": _short(key)})
+def _is_geometric(levels: Array) -> bool:
+    """Return whether ascending levels are positive, differ widely and are not evenly spaced."""
+    if len(levels) < 3 or levels[0] <= 0.0 or levels[-1] < _WIDE_GRID * levels[0]:
+        return False
+    return bool(np.ptp(np.diff(levels)) > 1e-6 * levels[-1])
+
+
+def _name_cells(axes: Axes, which: str, varied: Quantity, levels: Sequence[Any], count: int, room: float) -> None:
+    """Label the rows or columns of an image, at most about ``count`` of them; the axis is ``room`` long [inch]."""
+    shown = range(0, len(levels), -(-len(levels) // count))
+    texts = [f"{varied.scale * levels[k]:.3g}" if _numeric(levels) else str(levels[k]) for k in shown]
+    label = style.broken(_label(varied), room)
+    axes.set(**{f"{which}ticks": list(shown), f"{which}ticklabels": texts, f"{which}label": label})
 
 
 def _at(rows: Sequence[Mapping[str, Any]], values: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
@@ -417,8 +631,19 @@ def _scale(axes: Axes, which: str, values: Array) -> None:
     low, high = values.min(initial=np.inf), values.max(initial=-np.inf)
     if _is_wide(low, high):
         style.log_axis(axes, which)
-    elif 0.0 <= low < 0.7 * high:
+    elif 0.0 <= low < 0.5 * high:
         axes.set(**{f"{which}lim": (0.0, 1.05 * high)})
+
+
+def _clip(figure: style.Drawing, axes: Axes, drawn: Quantity, values: Array) -> None:
+    """Limit a linear axis to most of its values if a few are far beyond, with a note."""
+    low, high = np.quantile(values, [0.1, 0.9])
+    span = high - low
+    far = (values > high + _FAR * span) | (values < low - _FAR * span)
+    if far.any() and span > 0.0 and axes.get_yscale() == "linear":
+        axes.set_ylim(min(values[~far].min(), low) - 0.1 * span, max(values[~far].max(), high) + 0.1 * span)
+        extreme = style.number(values[far][np.abs(values[far]).argmax()], 3)
+        figure.note(f"{drawn.name}: {far.sum()} of {len(values)} values, up to {extreme}, are beyond the axis.")
 
 
 def _with_interval(value: float, half: float) -> str:
@@ -430,7 +655,3 @@ def _with_interval(value: float, half: float) -> str:
 def _is_wide(low: float, high: float) -> bool:
     """Return whether values between these limits are positive and differ widely in magnitude."""
     return bool(low > 0.0 and high > _WIDE * low)
-
-
-def _short(text: str, long: int = _LABEL) -> str:
-    return text if len(text) <= long else f"…{text[1 - long :]}"
