@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -133,6 +133,8 @@ class BracePlan:
     ranked : dict of int to list
         Brace sets that were solved along the whole path, with their heat [W], by number of braces, starting with the
         chosen set.
+    tolerances : Tolerances
+        Errors and limits of the verification.
 
     Examples
     --------
@@ -150,6 +152,7 @@ class BracePlan:
     tally: Tally
     singles: dict[str, float]
     ranked: dict[int, list[tuple[str, float]]]
+    tolerances: Tolerances = field(default_factory=Tolerances)
 
     def __repr__(self) -> str:
         best = self.best
@@ -521,7 +524,7 @@ def plan_braces(
     known = search.single_heats
     singles = {brace.label: known[brace,] for brace in problem.candidates if (brace,) in known}
     heats = {size.count: _ranked(size, ranked[size.count]) for size in sizes}
-    return BracePlan(problem, tuple(sizes), search.tally, singles, heats)
+    return BracePlan(problem, tuple(sizes), search.tally, singles, heats, tolerances)
 
 
 def _ranked(size: Size, planned: Sequence[Planned]) -> list[tuple[str, float]]:

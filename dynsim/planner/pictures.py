@@ -7,27 +7,35 @@ from pathlib import Path
 import numpy as np
 
 from dynsim.draw.figures.look import Look
-from dynsim.draw.figures.plan import PlanPicture, Pose, draw_plan_figures
-from dynsim.draw.geometry.projection import UP, Projection
+from dynsim.draw.figures.plan import Corner, PlanPicture, Pose, draw_plan_figures
+from dynsim.draw.geometry.meshes import Meshes
+from dynsim.draw.geometry.projection import UP, Array, Projection
+from dynsim.draw.geometry.robot import placed
+from dynsim.draw.geometry.shapes import corners_of, drawn_shape, solid
 from dynsim.errors import SimulationStopped
+from dynsim.planner import verify
 from dynsim.planner.answer import BracePlan, Size
 from dynsim.planner.arm import axis_lines
 from dynsim.planner.problem import Task
+from dynsim.planner.verify import Tolerances
 from dynsim.record import Record
 from dynsim.scenario import build
 
 # Number of instants of the first pass at which the arm is drawn.
-POSES = 4
+POSES = 3
 # Number of grid points per axis for drawing surfaces, and margin of the grid around the arm [m].
 GRID, BEYOND = 160, 0.15
+# Depth below the braces at which surfaces are cut for the view from above, and distance of ends of a closed path [m].
+INSIDE, CLOSED = 1e-3, 1e-6
 
 
 def draw_plan(plan: BracePlan, folder: Path, kind: str, look: Look | None = None) -> None:
     """Draw the figures to ``figures/``, and write ``view.html``."""
-    draw_plan_figures(picture(plan), folder / "figures", kind, look)
+    shown = _records(plan)
+    best = plan.best
+    draw_plan_figures(picture(plan, shown.get(best.variant) if best else None), folder / "figures", kind, look)
     from dynsim.draw.page import content
 
-    shown = _records(plan)
     if shown:
         content.write(shown, folder / "view.html")
 
@@ -47,36 +55,71 @@ def _records(plan: BracePlan) -> dict[str, Record]:
     return shown
 
 
-def picture(plan: BracePlan) -> PlanPicture:
-    """Return the data for the figures of a plan."""
+def picture(plan: BracePlan, record: Record | None = None) -> PlanPicture:
+    """Return the data for the figures of a plan; the record of the best plan shows its base."""
     task, best = plan.task, plan.best
     assert best is not None
     view = _view(task)
     poses = _poses(task, best, view)
     path = view.project(task.targets(np.linspace(0.0, task.duration, 200)))
-    points = np.vstack([path, *(line for pose in poses for line in pose.lines)])[:, [0, 2]]
+    base = _base(record, view)
+    points = np.vstack([path, *(line for pose in poses for line in pose.lines), *base])
     low, high = points.min(axis=0) - BEYOND, points.max(axis=0) + BEYOND
-    along, up = np.linspace(low[0], high[0], GRID), np.linspace(low[1], high[1], GRID)
-    ahead, height = np.meshgrid(along, up)
-    grid = view.world(np.stack([ahead, 0.0 * ahead, height], axis=-1)).reshape(-1, 3)
-    gaps = [surface.gaps(grid) for surface in build.surfaces(task.scenario).values()]
-    ground = np.min(gaps, axis=0).reshape(GRID, GRID) if gaps else np.ones((GRID, GRID))
+    along, left, up = np.linspace(low, high, GRID).T
+    touched = np.vstack([pose.points for pose in poses])
+    depth = float(touched[:, 2].mean()) - INSIDE if len(touched) else 0.0
     answered = {size.count: size for size in plan.answered}
     return PlanPicture(
         title=task.scenario.title,
         poses=poses,
         path=path,
         braces=[brace.label for brace in best.braces],
-        ground=(along, up, ground),
+        ground=(along, up, _gaps(task, view, *np.meshgrid(along, 0.0, up, indexing="ij"))),
+        tops=(along, left, _gaps(task, view, *np.meshgrid(along, left, depth, indexing="ij")))
+        if len(touched)
+        else None,
+        base=base,
         sets={count: plan.ranked[count] for count in answered},
         survives={count: size.survives for count, size in answered.items()},
         singles=plan.singles,
         corners={
-            count: (size.heat, [(c.label, c.heat_W, 1e3 * c.hand_rms_m) for c in size.verdict.corners])
+            count: [_corner(c, size.heat, plan.tolerances) for c in size.verdict.corners]
             for count, size in answered.items()
             if size.verdict is not None
         },
     )
+
+
+def _gaps(task: Task, view: Projection, along: Array, left: Array, up: Array) -> Array:
+    """Return the distance from the nearest surface on a plane grid, transposed for contours, (GRID, GRID) [m]."""
+    grid = view.world(np.stack([along, left, up], axis=-1)).reshape(-1, 3)
+    gaps = [surface.gaps(grid) for surface in build.surfaces(task.scenario).values()]
+    return np.min(gaps, axis=0).reshape(GRID, GRID).T
+
+
+def _base(record: Record | None, view: Projection) -> list[Array]:
+    """Return the corners of the solids of a fixed or mobile base at the start, in the coordinates of a view."""
+    scene = None if record is None else placed(record)[0]
+    if record is None or scene is None:
+        return []
+    meshes = Meshes()
+    meshes.of_robot(scene)
+    fixed = [shape for part in scene.fixed if (shape := drawn_shape(part, meshes)) is not None]
+    solids = [solid(shape, meshes.unique) for shape in fixed]
+    solids += [part for body in scene.base for part in corners_of(record, scene, body, 0)]
+    return [view.project(corners) for corners, _ in solids]
+
+
+def _corner(corner: verify.Corner, planned: float, tolerances: Tolerances) -> Corner:
+    """Return a run with the limits that it must meet."""
+    errors = {
+        f"friction × {corner.friction_factor:g}": corner.friction_factor != 1.0,
+        f"surfaces {1e3 * corner.surface_shift_m:+g} mm".replace("-", "−"): corner.surface_shift_m != 0.0,
+    }
+    label = ", ".join(text for text, differs in errors.items() if differs) or "as planned"
+    most = tolerances.heat if any(errors.values()) else 1.0 + tolerances.nominal
+    allowed = 1e3 * (abs(corner.surface_shift_m) + tolerances.hand_m)
+    return Corner(label, corner.heat_W / planned, most, 1e3 * corner.hand_rms_m, allowed, bool(corner.reason))
 
 
 def _view(task: Task) -> Projection:
@@ -94,14 +137,17 @@ def _poses(task: Task, size: Size, view: Projection) -> list[Pose]:
     surfaces = build.surfaces(task.scenario)
     poses = []
     last = int(np.searchsorted(dense.times, task.span))
-    for t in np.linspace(0, min(last, len(dense.times) - 1), POSES).astype(int):
+    # The last posture on a closed path is the first.
+    open_path = not np.ptp(task.targets(np.array([0.0, task.span])), axis=0).max() < CLOSED
+    for t in np.linspace(0, min(last, len(dense.times) - 1), POSES, endpoint=open_path).astype(int):
         q = arm.coordinates(dense.q[t : t + 1])[0]
         lines = list(view.project(axis_lines(arm, dense.q[t])))
-        points, forces = np.zeros((len(size.braces), 3)), np.zeros((len(size.braces), 3))
+        centres, points, forces = np.zeros((3, len(size.braces), 3))
         now = min(round(dense.times[t] / dense.fine[1]), len(dense.fine) - 1)
         for k, brace in enumerate(size.braces):
-            centre = model.point_position(brace.body, np.array(brace.point_m), q)
-            normal = surfaces[brace.surface].normal(centre)
-            points[k], forces[k] = centre - brace.radius * normal, dense.forces[now, k] * normal
-        poses.append(Pose(float(dense.times[t]), lines, view.project(points), view.project(forces)))
+            centres[k] = model.point_position(brace.body, np.array(brace.point_m), q)
+            normal = surfaces[brace.surface].normal(centres[k])
+            points[k], forces[k] = centres[k] - brace.radius * normal, dense.forces[now, k] * normal
+        projected = (view.project(part) for part in (points, forces, centres))
+        poses.append(Pose(float(dense.times[t]), lines, *projected))
     return poses

@@ -8,20 +8,21 @@ import numpy as np
 import pytest
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from support.messages import mentions, says
+from matplotlib.patches import Circle, Polygon
+from support.messages import mentions
 
-from dynsim.draw.figures.plan import PlanPicture, Pose, heat_by_set, posture, robustness, single_braces
+from dynsim.draw.figures.plan import Corner, PlanPicture, Pose, heat_by_set, posture, robustness, single_braces
 
 
 def picture(aside: float) -> PlanPicture:
     """An arm of two links whose elbow leans on the floor and goes so far aside [m]."""
     bend = np.array([1.0, aside, 0.0])
     lines = [np.array([[0.0, 0.0, 0.5], bend]), np.array([bend, [2.0, 0.0, 0.4]])]
-    pose = Pose(0.0, lines, bend[None], np.array([[0.0, 0.0, 4.0]]))
+    pose = Pose(0.0, lines, bend[None], np.array([[0.0, 0.0, 4.0]]), bend[None] + [0.0, 0.0, 0.05])
     along, up = np.linspace(-0.2, 2.2, 5), np.linspace(-0.2, 0.7, 4)
     return PlanPicture(
         "arm", [pose, pose], np.array([[2.0, 0.0, 0.4], [2.1, 0.0, 0.4]]), ["elbow on floor"],
-        (along, up, np.repeat(up[:, None], len(along), axis=1)), {}, {}, {}, {},
+        (along, up, np.repeat(up[:, None], len(along), axis=1)), None, [], {}, {}, {}, {},
     )  # fmt: skip
 
 
@@ -33,18 +34,18 @@ def figure_of(shown: PlanPicture) -> Figure:
 
 
 def names_of(axes: Axes) -> list[str]:
-    """Texts of the legend."""
-    legend = axes.get_legend()
-    assert legend is not None
-    return [text.get_text() for text in legend.get_texts()]
+    """Texts of the legend of the figure or of the axes."""
+    assert axes.figure is not None
+    legends = [*axes.figure.get_figure(root=True).legends, *filter(None, [axes.get_legend()])]
+    return [text.get_text() for legend in legends for text in legend.get_texts()]
 
 
 @pytest.mark.parametrize(("aside", "views"), [(0.0, 1), (0.3, 2)])
 def test_an_arm_that_leaves_its_plane_is_drawn_from_above_too(aside: float, views: int) -> None:
     figure = figure_of(picture(aside))
-    assert [axes.get_ylabel() for axes in figure.axes] == ["up [m]", "left [m]"][:views]
-    for axes in figure.axes:
-        assert [text.get_text() for text in axes.texts if text.get_text()] == ["1"]
+    assert [axes.get_ylabel() for axes in figure.axes] == ["height [m]", "left [m]"][:views]
+    for axes, texts in zip(figure.axes, (["1", "2 N"], ["1"]), strict=False):
+        assert [text.get_text() for text in axes.texts if text.get_text()] == texts
     assert "elbow on floor" in names_of(figure.axes[0])
     assert bool(figure.axes[0].get_xlabel()) is (views == 1)
 
@@ -53,15 +54,18 @@ def test_arrows_of_forces_end_at_the_braces_and_stay_in_the_picture() -> None:
     figure = figure_of(picture(0.3))
     low = figure.axes[0].get_ylim()[0]
     arrows = [text for text in figure.axes[0].texts if not text.get_text()]
-    assert len(arrows) == 2
-    for arrow in arrows:
+    # Two postures with the same force of 4 N, and a scale of 2 N.
+    assert len(arrows) == 3
+    lengths = [np.linalg.norm(np.subtract(arrow.xy, arrow.xyann)) for arrow in arrows]
+    assert lengths[:2] == pytest.approx([2.0 * lengths[2]] * 2)
+    for arrow in arrows[:2]:
         np.testing.assert_allclose(arrow.xy, [1.0, 0.0])
         assert low <= arrow.xyann[1] < 0.0
 
 
 def test_an_arm_without_braces_has_no_names() -> None:
     shown = picture(0.0)
-    bare = Pose(0.0, shown.poses[0].lines, np.zeros((0, 3)), np.zeros((0, 3)))
+    bare = Pose(0.0, shown.poses[0].lines, *np.zeros((3, 0, 3)))
     figure = figure_of(PlanPicture(**{**vars(shown), "poses": [bare], "braces": []}))
     assert not figure.axes[0].texts
 
@@ -69,8 +73,8 @@ def test_an_arm_without_braces_has_no_names() -> None:
 def compared() -> PlanPicture:
     """Plans of no brace and of one that does not survive, with two corners."""
     corners = {
-        0: (50.0, [("as planned", 50.0, 0.1), ("up", 50.0, 0.1)]),
-        1: (0.5, [("as planned", 0.4, 0.2), ("up", 9.0, 5.0)]),
+        0: [Corner("as planned", 1.0, 1.05, 0.1, 5.0, False), Corner("up", 1.0, 1.5, 0.1, 10.0, False)],
+        1: [Corner("as planned", 0.8, 1.05, 0.2, 5.0, False), Corner("up", 18.0, 1.5, 12.0, 10.0, True)],
     }
     return replace(
         picture(0.0),
@@ -83,25 +87,56 @@ def compared() -> PlanPicture:
 
 def test_heat_is_dots_with_the_simulated_heat_of_the_answers() -> None:
     """Bars on a logarithmic axis begin anywhere: the least would hardly be seen."""
-    for make, names in (
-        (heat_by_set, [("50 W",), ("0.5 W", "0.4 W"), ("2 W",)]),
-        (single_braces, [("0.3 W",), ("9 W",)]),
+    for make, heats, labels, runs in (
+        (heat_by_set, [50.0, 0.5, 2.0], ["none", "a", "b"], [50.0, 0.4]),
+        (single_braces, [0.3, 9.0], ["a", "b"], []),
     ):
         figure = make(compared())
         assert figure is not None
         (axes,) = figure.axes
         assert axes.get_xscale() == "log"
         assert not axes.patches
-        texts = [text.get_text() for text in axes.texts]
-        assert all(mentions(text, *some) for text, some in zip(texts, names, strict=True))
-        assert [says(text, "fails") for text in texts] == [some == ("0.5 W", "0.4 W") for some in names]
-        assert len(axes.lines) == len(texts)
+        assert mentions(figure.get_suptitle(), "on floor")
+        assert [text.get_text() for text in axes.get_yticklabels()] == labels
+        assert [text.get_text() for text in axes.texts] == [f"{heat:g} W" for heat in heats]
+        drawn = [(line.get_marker(), line.get_xdata()[0]) for line in axes.lines if line.get_label()[0] != "_"]
+        assert [x for marker, x in drawn if marker != "|"] == pytest.approx(heats)
+        assert [x for marker, x in drawn if marker == "|"] == pytest.approx(runs)
+        assert ("X" in dict(drawn)) is bool(runs)
 
 
-def test_the_legend_of_robustness_stands_above_the_bars() -> None:
+def test_limits_and_rejected_runs_of_robustness_are_drawn() -> None:
     figure = robustness(compared())
     assert figure is not None
-    figure.draw_without_rendering()
-    upper = figure.axes[0]
-    assert names_of(upper) == ["0 braces", "1 brace"]
-    assert upper.get_legend().get_window_extent().y0 >= upper.get_window_extent().y1  # type: ignore[union-attr]
+    heats, errors = figure.axes
+    assert names_of(heats) == ["0 braces: survives", "1 brace: rejected", "limit", "rejects the plan"]
+    for axes, limits, rejected in ((heats, [1.05, 1.5], 18.0), (errors, [5.0, 10.0], 12.0)):
+        (dashed,) = axes.collections
+        assert [segment[0, 0] for segment in dashed.get_segments()] == pytest.approx(limits)
+        crosses = [x for line in axes.lines if line.get_marker() == "x" for x in line.get_xdata()]
+        assert crosses == [rejected]
+        assert axes.get_xlim()[1] > max(rejected, *limits)
+    assert [text.get_text() for text in heats.get_yticklabels()] == ["as planned", "up"]
+    assert mentions(figure.caption, "survives", "limit")
+
+
+def test_run_that_ended_early_is_a_cross_at_the_edge() -> None:
+    shown = compared()
+    lost = replace(shown.corners[1][1], heat=np.nan, error=np.nan)
+    figure = robustness(replace(shown, corners={**shown.corners, 1: [shown.corners[1][0], lost], 2: [lost]}))
+    assert figure is not None
+    for axes in figure.axes:
+        (cross,) = [x for line in axes.lines if line.get_marker() == "x" for x in line.get_xdata()]
+        assert cross == axes.get_xlim()[1]
+    assert mentions(figure.caption, "ended early", "2: rejected as planned")
+
+
+def test_base_and_spheres_of_braces_are_drawn() -> None:
+    box = np.array([[x, y, z] for x in (-0.1, 0.1) for y in (-0.1, 0.1) for z in (0.0, 0.2)])
+    views = figure_of(replace(picture(0.3), base=[box])).axes
+    for axes in views:
+        (base,) = [patch for patch in axes.patches if isinstance(patch, Polygon)]
+        assert np.ptp(base.get_xy(), axis=0) == pytest.approx([0.2, 0.2])
+        assert [patch.radius for patch in axes.patches if isinstance(patch, Circle)] == pytest.approx([0.05, 0.05])
+    # The column from the base to the first joint, 0.5 m high.
+    assert any(np.allclose(line.get_xydata(), [[0.0, 0.2], [0.0, 0.5]]) for line in views[0].lines)
