@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dynsim.compile.references.splines import coordinates, quintic_coefficients, rolled
 from dynsim.compile.references.teleop import TeleopOptions
+from dynsim.config.base import StrictConfig, Vector3, default
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.tables import ReferenceArrays
 from dynsim.errors import ModelError
@@ -45,6 +46,27 @@ class HandPath(Protocol):
 
     def position(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return positions at times t [s], shape (T,) → (T, 3) [m]."""
+
+
+class HandPathConfig(StrictConfig):
+    """Keys of all kinds of hand paths: the origin of their coordinates, whose axes are always the axes of the world."""
+
+    frame: Literal["world", "start"] = default(
+        "world", "origin of the coordinates: the origin of the `world`, or the hand at the `start` of the run"
+    )
+    origin_m: Vector3 = default([0.0, 0.0, 0.0], "offset that is added to all coordinates of the path")
+
+
+@dataclass(frozen=True)
+class MovedPath:
+    """A path of the hand whose coordinates count from ``origin``, (3,) [m], in axes of the world."""
+
+    path: HandPath
+    origin: NDArray[np.float64]
+
+    def position(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return positions in the world at times t [s], shape (T,) → (T, 3) [m]."""
+        return self.origin + self.path.position(t)
 
 
 @runtime_checkable

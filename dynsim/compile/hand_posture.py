@@ -36,13 +36,17 @@ def turn_error(R: Array, wanted: Array) -> Array:
     return np.asarray(Rotation.from_matrix(wanted @ R.T).as_rotvec())
 
 
+def hand_turn(model: Kinematics, q: Array) -> Array:
+    """Return the axes of the hand's body or frame in the world as columns, (3, 3)."""
+    return model.body_pose(model.robot.attach(*model.robot.hand)[0], q)[0] @ model.robot.hand_axes
+
+
 def hand_turns(model: Kinematics, q: Array, orientation: Array) -> Array:
     """Return the angles between the hand's orientation and a target orientation, postures (T, nq) → (T,) [rad]."""
     from scipy.spatial.transform import Rotation  # imported here because it takes a third of a second
 
-    body, axes = model.robot.attach(*model.robot.hand)[0], model.robot.hand_axes
-    R = np.array([model.body_pose(body, row)[0] for row in q]).reshape(-1, 3, 3)
-    return np.asarray(Rotation.from_matrix(orientation.T @ R @ axes).magnitude())
+    R = np.array([hand_turn(model, row) for row in q]).reshape(-1, 3, 3)
+    return np.asarray(Rotation.from_matrix(orientation.T @ R).magnitude())
 
 
 def hand_posture(

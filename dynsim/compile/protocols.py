@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 from dynsim.compile.model import Model
 from dynsim.config.base import StrictConfig
 from dynsim.errors import ModelError
-from dynsim.model.description import Contact
+from dynsim.model.description import Array, Contact
 
 if TYPE_CHECKING:
     from dynsim.snake.description import SnakeDescription
@@ -39,6 +39,8 @@ class BuildContext:
         Names of the enabled points.
     disabled : sequence of str
         Names of the disabled points, which a path may still follow along a surface.
+    start : (nq,) ndarray or None
+        Planned start of the model, if it differs from the simulated start [rad or m].
     """
 
     duration: float
@@ -48,6 +50,12 @@ class BuildContext:
     contacts: Mapping[str, Contact] = field(default_factory=dict)
     declared: Sequence[str] = ()
     disabled: Sequence[str] = ()
+    start: Array | None = None
+
+    @property
+    def planned_start(self) -> Array:
+        """Coordinates at the planned start, (nq,) [rad or m]."""
+        return self.model.robot.initial if self.start is None else self.start
 
     def at_joint(self, joint: str) -> BuildContext:
         """Return the context for a motor on this joint."""

@@ -7,9 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from dynsim.compile.control import MovedPath
 from dynsim.model.description import Array
 from dynsim.planner.dense import Dense
 from dynsim.planner.problem import Candidate, Task
+from dynsim.record.urdf_text import roll_pitch_yaw
 from dynsim.scenario import Scenario
 from dynsim.scenario.reading import scenario_from_resolved
 
@@ -74,6 +76,10 @@ def shared_sections(task: Task) -> dict[str, Any]:
     data["name"] = f"{task.scenario.name}_plan"
     data.pop("variant", None)
     hand = {key: value for key, value in data["controller"]["hand"].items() if key in ("path", "orientation")}
+    if hand["path"].get("frame") == "start" and isinstance(task.path, MovedPath):  # the plan has another start
+        hand["path"] = hand["path"] | {"frame": "world", "origin_m": task.path.origin.tolist()}
+        if task.turn is not None:
+            hand["orientation"] = {"rpy_deg": np.rad2deg(roll_pitch_yaw(task.turn)).tolist()}
     controller = {key: value for key, value in data["controller"].items() if key not in REPLACED}
     data["controller"] = controller | {"hand": hand | {"joints": []}}
     contacts = {key: value for key, value in data["contacts"].items() if key not in DROPPED}

@@ -14,7 +14,6 @@ from dynsim.compile.model import Model
 from dynsim.compile.protocols import BuildContext
 from dynsim.errors import ModelError
 from dynsim.jit.kernel import integers, reals
-from dynsim.library import families
 from dynsim.model.description import Array
 from dynsim.model.surfaces import Quadric
 from dynsim.planner.arm import MovingArm, Problem, axis_points, moving_arm, workspace
@@ -159,12 +158,13 @@ class Options:
 
 @dataclass(frozen=True)
 class Task:
-    """Planning problem of a scenario."""
+    """Planning problem of a scenario; ``turn`` is the target rotation of the hand in the world, or None."""
 
     scenario: Scenario
     options: Options
     arm: MovingArm
     path: HandPath
+    turn: Array | None
     kind: Kind
     candidates: tuple[Candidate, ...]
     friction: float
@@ -199,11 +199,10 @@ class Task:
 
     def hand_targets(self, times: Array) -> Array:
         """Return the targets of the hand, shape (T, 3) [m]; with an orientation also its z and x axis, (T, 9)."""
-        targets, hand = self.targets(times), self.scenario.controller.hand
-        if hand.orientation is None:
+        targets, turn = self.targets(times), self.turn
+        if turn is None:
             return targets
-        robot = self.arm.model.robot
-        axes = (hand.orientation.matrix() @ robot.hand_axes.T)[:, [2, 0]].T
+        axes = (turn @ self.arm.model.robot.hand_axes.T)[:, [2, 0]].T
         return np.hstack([targets, np.tile(axes.ravel(), (len(targets), 1))])
 
     @property
@@ -324,7 +323,8 @@ def task(scenario: Scenario, options: Options) -> Task:
     hand = getattr(scenario.controller, "hand", None)
     if hand is None:
         raise ModelError("plan: the scenario has no controller.hand.path; add a path for the hand")
-    path = families.build("path", hand.path, BuildContext(scenario.duration_s), HandPath)
+    context = BuildContext(scenario.duration_s, model)
+    path = hand.path_in_world(context)
     arm = moving_arm(model, surfaces)
     unknown = [name for name in options.surfaces if name not in surfaces]
     if unknown:
@@ -339,7 +339,8 @@ def task(scenario: Scenario, options: Options) -> Task:
             f"plan: {options.count[0]} braces are requested, but there are only {points} candidates; lower --count"
         )
     kind = _kind(path, scenario.duration_s)
-    return Task(scenario, options, arm, path, kind, tuple(candidates), scenario.config.contacts.friction)
+    friction = scenario.config.contacts.friction
+    return Task(scenario, options, arm, path, hand.turn_in_world(context), kind, tuple(candidates), friction)
 
 
 def _kind(path: HandPath, duration: float) -> Kind:

@@ -292,11 +292,11 @@ def controller(
     UnreachableReference
         If the hand cannot follow its path.
     """
-    config, nominal = _fitting_controller(scenario), scenario
+    config, nominal, start = _fitting_controller(scenario), scenario, None
     if scenario.config.surface_error is not None:
         # The controller plans with the nominal surfaces, not with the simulated ones.
         nominal = replace(scenario, config=scenario.config.model_copy(update={"surface_error": None}))
-        touching = None
+        touching, start = None, robot_and_contacts(nominal)[0].initial
     touching = contacts(nominal, machine.robot) if touching is None else touching
     points = {contact.name: contact for contact in touching}
     declared = [
@@ -304,9 +304,7 @@ def controller(
     ]
     unused = {contact.name: contact for contact in disabled_points(nominal, machine.robot)}
     tracked, disabled = _TrackedContacts(points | unused), list(unused)
-    context = BuildContext(
-        scenario.duration_s, machine, progress=progress, contacts=tracked, declared=declared, disabled=disabled
-    )
+    context = BuildContext(scenario.duration_s, machine, "", progress, tracked, declared, disabled, start)
     made: list[JointControl] = []
 
     def independent_of_contacts() -> JointControl | None:
@@ -314,7 +312,7 @@ def controller(
         made.append(families.build("controller", config, context, JointControl))
         return None if tracked.accessed else made[0]
 
-    known = config, scenario.duration_s, machine, [*points], declared, disabled
+    known = config, scenario.duration_s, machine, [*points], declared, disabled, start
     control = recall("controller", independent_of_contacts, *known)
     if control is None:
         control = made[0] if made else families.build("controller", config, context, JointControl)

@@ -157,15 +157,20 @@ def _path(random: Generator, robot: Plant, followed: Sequence[Joint], model: Mod
     """Return a line that the joints can follow: it ends at the hand position after small turns of the joints.
 
     They may leave it in between, and more if the start moves joints that are not among them, and the hand with them.
+    Every second line is relative to the start.
     """
     q = np.array(model.robot.initial)
     start = model.point_position(*robot.hand, q)
     index = {link.joint: int(k) for link, k in zip(model.robot.links, model.robot.position_index, strict=True)}
+    share = 1.0
     # The joints turn in alternate directions, so that a planar arm stays bent.
     for k, joint in enumerate(followed):
-        q[index[joint.name]] += (0.02 if not joint.turns else 0.08) * (-1.0) ** k * float(random.uniform(0.5, 1.0))
+        share = float(random.uniform(0.5, 1.0))
+        q[index[joint.name]] += (0.02 if not joint.turns else 0.08) * (-1.0) ** k * share
     end = model.point_position(*robot.hand, q)
     path = {"type": "line", "from_m": start.tolist(), "to_m": end.tolist(), "duration_s": duration}
+    if share < 0.75:  # without another draw, which would change the other scenes
+        path |= {"frame": "start", "from_m": [0.0, 0.0, 0.0], "to_m": (end - start).tolist()}
     return {"path": path, "tolerance_m": 0.05}
 
 

@@ -232,6 +232,7 @@ CHANGES: dict[tuple[str, str], dict[str, Any]] = {
         "plant.chain.4.motor.limit_N_m": 0.01,
         "controller.sample_time_s": 0.002,
         "controller.knot_spacing_s": 0.05,
+        "controller.hand.path.origin_m": [0.5, 0, 0.245],
         "controller.hand.orientation.rpy_deg": [0, 95, 0],
         "controller.hand.path.type": {
             "type": "line",
@@ -241,11 +242,11 @@ CHANGES: dict[tuple[str, str], dict[str, Any]] = {
         },
         "controller.hand.path.times_s": [0.1, 0.6, 1.0, 1.4, 1.8],
         "controller.hand.path.points_m": [
-            [0.5, 0, 0.3],
-            [0.5, 0.1, 0.24],
-            [0.5, 0, 0.18],
-            [0.5, -0.06, 0.24],
-            [0.5, 0, 0.3],
+            [0, 0, 0.06],
+            [0, 0.1, 0],
+            [0, 0, -0.06],
+            [0, -0.06, 0],
+            [0, 0, 0.06],
         ],
         "controller.torques.joint_5.times_s": [0.0, 0.6],
         "controller.torques.joint_5.torques_N_m": [0, -0.04],
@@ -465,6 +466,7 @@ LIMITS: dict[tuple[str, str], dict[str, tuple[Any, str]]] = {
     ("corrected_arm", "fixed"): {"plant.inertia": ("strict", "plant.inertia: nearest")},
     ("sampled_arm", "encoders"): {
         "controller.hand.tolerance_m": (1e-17, "out of reach"),
+        "controller.hand.path.frame": ("start", "out of reach"),
         "integrator.wall_limit_s": (1e-4, "integrator.wall_limit_s"),
         "record.size_limit_GB": (1e-6, "record.size_limit_GB"),
     },

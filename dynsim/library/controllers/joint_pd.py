@@ -10,7 +10,8 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from dynsim.compile.bracing import MIN_N
-from dynsim.compile.control import PLANNED, BasePath, HandPath, JointControl, targets_on
+from dynsim.compile.control import PLANNED, BasePath, HandPath, JointControl, MovedPath, targets_on
+from dynsim.compile.hand_posture import hand_turn
 from dynsim.compile.model import Model
 from dynsim.compile.protocols import BuildContext
 from dynsim.compile.references.inverse_kinematics import follow, planned_voltages
@@ -62,6 +63,25 @@ class HandReference(StrictConfig):
     )
     braces: list[str] = default([], "contact points that the joints keep on their surfaces")
     tolerance_m: Positive = default(1e-6, "maximum position error; a larger error means that the path is out of reach")
+
+    @property
+    def from_start(self) -> bool:
+        """Whether path and orientation are relative to the hand in the start posture."""
+        return getattr(self.path, "frame", "world") == "start"
+
+    def path_in_world(self, context: BuildContext) -> HandPath:
+        """Build the path, and move it to its origin in the world."""
+        path = families.build("path", self.path, context, HandPath)
+        origin = np.array(getattr(self.path, "origin_m", np.zeros(3)))
+        if self.from_start:
+            origin = origin + context.model.point_position(*context.model.robot.hand, context.planned_start)
+        return MovedPath(path, origin) if self.from_start or origin.any() else path
+
+    def turn_in_world(self, context: BuildContext) -> Array | None:
+        """Return the target axes of the hand in the world as columns, shape (3, 3); None without an orientation."""
+        if self.orientation is None or not self.from_start:
+            return None if self.orientation is None else self.orientation.matrix()
+        return np.asarray(self.orientation.matrix() @ hand_turn(context.model, context.planned_start))
 
 
 class BaseReference(StrictConfig):
@@ -194,10 +214,9 @@ def build(config: Config, context: BuildContext) -> JointControl:
     _check_names(config, model)
     path = None
     if config.hand is not None:
-        path_config = config.hand.path
-        path = recall(
-            "path", lambda: families.build("path", path_config, context, HandPath), path_config, context.duration
-        )
+        hand_config = config.hand
+        known = hand_config.path, context.duration, *([model, context.start] if hand_config.from_start else ())
+        path = recall("path", lambda: hand_config.path_in_world(context), *known)
     base_path = None
     if config.base is not None:
         with errors_at("controller", "base", "path"):
@@ -217,9 +236,9 @@ def build(config: Config, context: BuildContext) -> JointControl:
             base = _base_coordinates(robot, positions, times)
             braces = [_contact(context, name, "hand.braces") for name in hand.braces]
             start, tolerance = robot.initial, hand.tolerance_m
-            turned = None if hand.orientation is None else hand.orientation.matrix()
+            turn = hand.turn_in_world(context)
             followed = follow(
-                model, times, targets, hand.joints, start, tolerance, context.progress, base, braces, turned
+                model, times, targets, hand.joints, start, tolerance, context.progress, base, braces, turn
             )
             positions |= dict(zip(hand.joints, followed.T, strict=True))
     control = JointControl.following(
@@ -232,8 +251,8 @@ def build(config: Config, context: BuildContext) -> JointControl:
         sample_time=config.sample_time_s,
         voltages=_planned(config, context, times, positions) if planned else None,
     )
-    if config.hand is not None and config.hand.orientation is not None:
-        control = replace(control, orientation=config.hand.orientation.matrix())
+    if config.hand is not None:
+        control = replace(control, orientation=config.hand.turn_in_world(context))
     return control if config.operator is None else replace(control, teleop=_teleop(config.operator, context))
 
 

@@ -7,17 +7,17 @@ from typing import Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from dynsim.compile.control import HandPath
+from dynsim.compile.control import HandPath, HandPathConfig
 from dynsim.compile.protocols import BuildContext
-from dynsim.config.base import Positive, StrictConfig, Vector3, default, unit_vector
+from dynsim.config.base import Positive, Vector3, default, unit_vector
 from dynsim.model.description import Array
 
 
-class Config(StrictConfig):
+class Config(HandPathConfig):
     """Circle about `center_m`, counter-clockwise about `normal`; `start` points from the centre to the first point."""
 
     type: Literal["circle"]
-    center_m: Vector3 = Field(description="centre in the world")
+    center_m: Vector3 = Field(description="centre")
     radius_m: Positive = Field(description="radius")
     normal: Vector3 = default([0.0, 0.0, 1.0], "normal of the plane")
     start: Vector3 = default([1.0, 0.0, 0.0], "direction from the centre to the first point, projected onto the plane")

@@ -8,16 +8,15 @@ import numpy as np
 from pydantic import Field, PrivateAttr, model_validator
 from scipy.interpolate import PchipInterpolator
 
-from dynsim.compile.control import HandPath
+from dynsim.compile.control import HandPath, HandPathConfig
 from dynsim.compile.protocols import BuildContext
-from dynsim.config.base import StrictConfig
 from dynsim.model.description import Array
 from dynsim.record.csv_rows import read_rows
 
 COLUMNS = ("t_s", "x_m", "y_m", "z_m")
 
 
-class Config(StrictConfig):
+class Config(HandPathConfig):
     """Shape-preserving cubic through the rows of `file`, constant before the first and after the last row."""
 
     type: Literal["csv"]

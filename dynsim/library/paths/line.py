@@ -7,19 +7,19 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from dynsim.compile.control import HandPath
+from dynsim.compile.control import HandPath, HandPathConfig
 from dynsim.compile.protocols import BuildContext
 from dynsim.compile.references.splines import minimum_jerk
-from dynsim.config.base import NonNegative, Positive, StrictConfig, Vector3, default
+from dynsim.config.base import NonNegative, Positive, Vector3, default
 from dynsim.model.description import Array
 
 
-class Config(StrictConfig):
+class Config(HandPathConfig):
     """Line from `from_m` to `to_m` within `duration_s`: a quintic with zero velocity and acceleration at the ends."""
 
     type: Literal["line"]
-    from_m: Vector3 = Field(description="first point in the world")
-    to_m: Vector3 = Field(description="last point in the world")
+    from_m: Vector3 = Field(description="first point")
+    to_m: Vector3 = Field(description="last point")
     start_s: NonNegative = default(0.0, "start time of the motion")
     duration_s: Positive = Field(description="duration of the motion")
 

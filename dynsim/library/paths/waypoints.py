@@ -7,19 +7,19 @@ from typing import Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from dynsim.compile.control import HandPath
+from dynsim.compile.control import HandPath, HandPathConfig
 from dynsim.compile.protocols import BuildContext
 from dynsim.compile.references.splines import clamped_cubic
-from dynsim.config.base import StrictConfig, Vector3, check_waypoints
+from dynsim.config.base import Vector3, check_waypoints
 from dynsim.model.description import Array
 
 
-class Config(StrictConfig):
+class Config(HandPathConfig):
     """Cubic spline through `points_m` at `times_s`, at rest at both ends and constant beyond them."""
 
     type: Literal["waypoints"]
     times_s: list[float] = Field(min_length=2, description="times of the points, increasing")
-    points_m: list[Vector3] = Field(min_length=2, description="points in the world")
+    points_m: list[Vector3] = Field(min_length=2, description="points")
 
     @model_validator(mode="after")
     def _check(self) -> Self:
