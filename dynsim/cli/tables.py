@@ -81,6 +81,11 @@ def _energy(key: str) -> Callable[[Summary], float | None]:
     return take
 
 
+def _cause(key: str) -> Callable[[Summary], str | None]:
+    """Return a function that reads the main cause of a distance from a summary (None if unknown)."""
+    return lambda summary: next((cause["cause"] for cause in summary.get(key, ())), None)
+
+
 def _worst_joint(motor: Summary) -> str:
     """Return the name of a motor with its rms torque and nominal torque (stall torque if unknown)."""
     rating = motor.get("nominal_torque_N_m", motor.get("stall_torque_N_m", math.inf))
@@ -119,7 +124,12 @@ _ROWS: tuple[tuple[str, str | Callable[[Summary], Any], Callable[[Any], str]], .
     ("hand error, rms [mm]", "hand_error_rms_m", _millimetres),
     ("  max [mm]", "hand_error_max_m", _millimetres),
     ("  vertical, rms [mm]", "hand_error_z_rms_m", _millimetres),
+    ("  at the start [mm]", "hand_error_start_m", _millimetres),
+    ("  at the end [mm]", "hand_error_end_m", _millimetres),
+    ("  main cause at the end", _cause("hand_error_causes"), str),
+    ("initial position error [m]", "initial_position_error_m", _short),
     ("final position error [m]", "final_position_error_m", _short),
+    ("  main cause", _cause("final_position_error_causes"), str),
     ("final attitude error [rad]", "final_attitude_error_rad", _short),
     ("position error, max [m]", "position_error_max_m", _short),
     ("attitude error, max [rad]", "attitude_error_max_rad", _short),

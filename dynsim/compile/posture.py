@@ -301,22 +301,22 @@ def _row(
     return link, brace_rows(point, normal[None], np.array([friction]), least, force, np.zeros((1, 3)))[0]
 
 
-def load_torques(model: Model, q: Array, loads: Sequence[Load]) -> Array:
-    """Return the torques that hold the loads at t = 0, −J_wᵀ W, (n,) [N m or N]."""
+def load_torques(model: Model, q: Array, loads: Sequence[Load], time: float = 0.0) -> Array:
+    """Return the torques that hold the loads at a time [s], −J_wᵀ W, (n,) [N m or N]."""
     torques = np.zeros(model.n)
-    for link, point, force in load_forces(model, q, loads):
+    for link, point, force in load_forces(model, q, loads, time):
         torques -= model.point_jacobian(link, point, q).T @ force
     return torques
 
 
-def load_forces(model: Model, q: Array, loads: Sequence[Load]) -> list[tuple[int, Array, Array]]:
-    """Return the loads at t = 0 as pure forces: link, point in its frame [m], force in the world [N].
+def load_forces(model: Model, q: Array, loads: Sequence[Load], time: float = 0.0) -> list[tuple[int, Array, Array]]:
+    """Return the loads at a time [s] as pure forces: link, point in its frame [m], force in the world [N].
 
     A torque M is replaced by the couple of M × d and −M × d at ±d/2, with d a unit vector perpendicular to M.
     """
     forces = []
     for load in loads:
-        wrench = load.components(np.zeros(1))[0]
+        wrench = load.components(np.array([time]))[0]
         link, point = model.robot.attach(load.body, load.point)
         axes, _ = model.body_pose(link, q)
         force, torque = (axes @ part if load.in_body else part for part in (wrench[:3], wrench[3:]))

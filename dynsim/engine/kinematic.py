@@ -34,6 +34,7 @@ from dynsim.engine.gripper import (
 from dynsim.engine.outcome import check_size, interrupted, run_to_end
 from dynsim.engine.recording import pictured_parts, provenance
 from dynsim.engine.snake_control import OBSTACLES, SnakeControl, control_periods
+from dynsim.engine.target_distance import LEAST, Cause
 from dynsim.errors import ModelError, SimulationStopped
 from dynsim.jit.kernel import reals
 from dynsim.library.families import member
@@ -59,6 +60,8 @@ OUT_OF_REACH = 1.0
 """A target that has waited at least this long at the end of a run [s] is reported as out of reach."""
 
 
+# A joint closer than this to its limit is at the limit [rad].
+AT_LIMIT = 1e-9
 ESTIMATE_ERROR = 1e-3
 """Errors of the controller's head position estimate above this [m] are reported."""
 
@@ -156,6 +159,7 @@ def task_summary(run: SnakeControl, record: Record) -> dict[str, Any]:
     since = float(record.time[-1]) - still
     gone = {"since_s": since, "reason": OBSTACLES[counts[ss.STILL_FOR] - 1]} if still >= OUT_OF_REACH else None
     return {
+        "initial_position_error_m": float(record["position_error"][0]),
         "final_position_error_m": float(record["position_error"][-1]),
         "final_attitude_error_rad": float(record["attitude_error"][-1]),
         "position_error_max_m": float(record["position_error"].max()),
@@ -564,6 +568,7 @@ def make_record(run: SnakeRun, scenario: Scenario, wall: float, pictured: bool =
         "real_time_factor": float(record.time[-1]) / wall if wall > 0.0 else 0.0,
         "steps": int(state.counts[ss.TICKS]),
         **task_summary(run, record),
+        "final_position_error_causes": _clamped_joints(run, record),
     }
     warnings = [*task_warnings(run, record, summary), *_passed_limits(run, record)]
     if run.objects is not None and run.objects.graspable:
@@ -571,6 +576,16 @@ def make_record(run: SnakeRun, scenario: Scenario, wall: float, pictured: bool =
     summary["warnings"] = [*warnings, *without_effect(scenario)]
     record.summary = summary
     return record
+
+
+def _clamped_joints(run: SnakeRun, record: Record) -> list[dict[str, Any]]:
+    """Return the joints that clamping keeps at their limits as the cause of an error of the head at the end."""
+    d, phi = run.description, record["phi"][-1]
+    at_limit = np.minimum(d.upper - phi, phi - d.lower) < AT_LIMIT
+    if not (run.state.counts[ss.CLAMPED] and at_limit.any() and record["position_error"][-1] > LEAST):
+        return []
+    joints = tuple(name for name, at in zip(d.joint_names, at_limit, strict=True) if at)
+    return [Cause("clamped", 1.0, joints)._asdict()]
 
 
 def _passed_limits(run: SnakeRun, record: Record) -> list[str]:

@@ -26,6 +26,7 @@ from dynsim.dynamics.tree import support as ks
 from dynsim.engine.link_sensors import AppliedWrench, add_link_sensors
 from dynsim.engine.prepare import Prepared
 from dynsim.engine.ring import counted_within, time_shares
+from dynsim.engine.target_distance import hand_distance
 from dynsim.engine.warnings import warnings_of
 from dynsim.errors import RecordError
 from dynsim.integrators import run as ki
@@ -41,7 +42,6 @@ from dynsim.record.measures import (
     STORES,
     base_summary,
     energy_turnover,
-    hand_error,
     hand_turn_error,
     sinks,
 )
@@ -174,7 +174,7 @@ def summarise(
         "steps_rejected": int(run.count[ki.REJECTED]),
         "rhs_evaluations": int(run.count[ki.EVALUATIONS]),
         "projections": int(run.count[ki.PROJECTIONS]),
-        **hand_error(record, scenario.metrics.settle_s),
+        **hand_distance(record, prepared, scenario.metrics.settle_s, begun),
         **hand_turn_error(record, scenario.metrics.settle_s),
         "electrical_energy_J": final("energy_electrical"),
         "electrical_energy_supply_J": final("energy_electrical_supply"),

@@ -48,6 +48,7 @@ from dynsim.engine.recording import drawn_scene, make_record
 from dynsim.engine.soundness import unstable_loop
 from dynsim.engine.stepped import GUARDS, Snapshot, State, Touch, event_name, take_log
 from dynsim.engine.stopping import last_state, stopped
+from dynsim.engine.target_distance import head_distance
 from dynsim.engine.trace import BLOCK, Trace
 from dynsim.errors import ModelError, ScenarioError, SimulationInterrupted, SimulationStopped, brief, first_few
 from dynsim.integrators import driver
@@ -1295,6 +1296,8 @@ class Simulation:
         record.summary["warnings"] += self._warnings
         for handler in self._tick_handlers:
             handler.add_to(record)
+        if "final_position_error_m" in record.summary:
+            head_distance(record, self._prepared, getattr(self._operator, "blind", False))
         return record
 
     def _motor(self, joint: str) -> int:

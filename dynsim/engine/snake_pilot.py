@@ -125,6 +125,11 @@ class SnakePilot(Stateful, SnakeControl):
         self._seen: Any = None
         self.read_commands(waiting=False)
 
+    @property
+    def blind(self) -> bool:
+        """Whether the controller uses no sensors."""
+        return bool(self.state_source == ss.FEEDFORWARD)
+
     def posture(self) -> tuple[Array, Array, Array]:
         """Return the actual posture instead of the controller's estimate, see :meth:`SnakeControl.posture`."""
         if self._seen is None:

@@ -16,6 +16,7 @@ from dynsim.dynamics.contact import unilateral as ku
 from dynsim.engine.force_indeterminacy import motion_spread, sharing, wedges
 from dynsim.engine.prepare import Prepared
 from dynsim.engine.soundness import unstable_later, unstable_loop
+from dynsim.engine.target_distance import off_target
 from dynsim.errors import first_few
 from dynsim.integrators import run as ki
 from dynsim.integrators.contacts import events as ke
@@ -118,6 +119,7 @@ def warnings_of(
     warnings += _beyond_stops(robot, prepared.stops, prepared.control)
     warnings += [*robot.notes, *without_effect(scenario, bool(robot.motors))]
     warnings += _overloaded(motors)
+    warnings += off_target(summary, float(record.time[-1]) if len(record) else 0.0)
     return warnings if prepared.balance is None else [*warnings, *prepared.balance.warnings]
 
 

@@ -62,20 +62,26 @@ def hand_target(record: Record) -> Array | None:
 
 
 def hand_error(record: Record, settle: float) -> dict[str, float | None]:
-    """Return the rms, maximum and vertical rms distance of the hand from its target [m].
+    """Return the rms, maximum and vertical rms distance of the hand from its target, and the first and last one [m].
 
-    Samples before t = ``settle`` are ignored. The values are None without a target or if the run is shorter.
+    The first three ignore samples before t = ``settle`` and are None if the run is shorter. All are None without a
+    target.
     """
     names = ("hand_error_rms_m", "hand_error_max_m", "hand_error_z_rms_m")
     first = int(np.searchsorted(record.time, settle))
     target = hand_target(record)
-    if target is None or len(record) - first < 2:
-        return dict.fromkeys(names)
+    ends = dict[str, float | None].fromkeys(("hand_error_start_m", "hand_error_end_m"))
+    if target is None or not len(record):
+        return dict.fromkeys(names) | ends
+    for name, k in zip(ends, (0, -1), strict=True):
+        ends[name] = float(np.linalg.norm(record["hand_position"][k] - target[k]))
+    if len(record) - first < 2:
+        return dict.fromkeys(names) | ends
     error, time = record["hand_position"][first:] - target[first:], record.time[first:]
     x, y, z = error.T**2
     square = x + y + z
     values = (_mean(square, time) ** 0.5, square.max() ** 0.5, _mean(z, time) ** 0.5)
-    return dict(zip(names, map(float, values), strict=True))
+    return dict(zip(names, map(float, values), strict=True)) | ends
 
 
 def hand_turn_error(record: Record, settle: float) -> dict[str, float | None]:

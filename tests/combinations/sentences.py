@@ -49,6 +49,7 @@ HOLDS_UP = (
 INSTEAD_OF = rf"(\S+) {NUMBER} N instead of"
 LAST_STEP = rf"last step {NUMBER} s"
 MOVED = r"initial.equilibrium: moves (.+) from the requested posture"
+DUE_TO = r"{}(\S+?)(?:,| \(| under| without| at)"
 OVERLOAD = rf"(?:^|, )(\S+) {NUMBER} of "
 SHARE_OF_RUN = rf"(\S+) \({NUMBER} % of the run\)"
 STEP_FELL = rf"the step size fell to {NUMBER} s"
@@ -102,6 +103,8 @@ SENTENCES: dict[str, str] = {
     "moved at the start": r"^initial.equilibrium: moves (.+) from the requested posture",
     "moves at once": rf"^initial.equilibrium: (\S+) nevertheless starts with {NUMBER} \S+.*",
     "slips at once": rf"^initial.equilibrium: the start slips at t = {NUMBER} s",
+    "off target": rf"^(hand|head): (?:{NUMBER} mm \(limit .*\)|1) from its target at t = {NUMBER} s",
+    "off path": rf"^hand: starts (?:{NUMBER} mm \(limit .*\)|1) from its path",
     "not carried out": rf"^operator: the hand did not execute {NUMBER} m of the commanded {NUMBER} m",
 }
 UNVERIFIED: dict[str, str] = {

@@ -20,6 +20,7 @@ SOURCES = {
     "engine/warnings.py": "",
     "engine/soundness.py": "",
     "engine/equilibrium.py": "",
+    "engine/target_distance.py": "off_target",
     "scenario/build.py": "left_out_warnings",
 }
 LEAST_WORDS = 5

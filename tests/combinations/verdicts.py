@@ -21,6 +21,7 @@ from combinations.sampled_loop import loop_growth
 from combinations.sentences import (
     AT_TIME,
     BY_AMOUNT,
+    DUE_TO,
     FROM_THEN_ON,
     HOLDS_UP,
     INCOMPLETE,
@@ -801,6 +802,69 @@ def _not_carried_out(match: Match, seen: Observed) -> str:
     return "" if least - near <= missed <= 2.0 * path + near else f"it ended {least:.3g} m from there"
 
 
+def _off_path(match: Match, seen: Observed) -> str:
+    off = 1e3 * float(np.linalg.norm(seen.record["hand_position"][0] - seen.record["target_position"][0]))
+    return "" if _near(off, match[1]) else f"it starts {off:.3g} mm off"
+
+
+def _off_target(match: Match, seen: Observed) -> str:
+    """Check the distance, and the condition that each cause requires at the first joint that is named."""
+    names = ("hand_position", "target_position") if match[1] == "hand" else ("w", "w_target")
+    at, target = (seen.record[name][-1, :3] for name in names)
+    off = 1e3 * float(np.linalg.norm(at - target))
+    if not (_near(off, match[2]) and _near(float(seen.time[-1]), match[3])):
+        return f"at the end it is {off:.3g} mm off"
+    for text, holds in _CONDITIONS.items():
+        for joint in re.findall(DUE_TO.format(text), match.string):
+            if not holds(joint, seen):
+                return f"that is not so of {joint}"
+    return ""
+
+
+def _saturated_at_end(joint: str, seen: Observed) -> bool:
+    motor = next((motor for motor in seen.robot.motors if motor.joint == joint), None)
+    if not isinstance(motor, Motor | Servo):
+        return False
+    a = seen.robot.motors.index(motor)
+    volts, amperes = (abs(float(seen.record[name][-1, a])) for name in ("voltage", "current"))
+    return (
+        volts >= 0.999 * motor.voltage_limit
+        or amperes >= 0.99 * motor.greatest_current
+        or _holds_current(motor, seen, a)
+    )
+
+
+def _holds_current(motor: Motor | Servo, seen: Observed, a: int) -> bool:
+    """Whether the driver lowers the voltage for its current limit: the current approaches it."""
+    back = motor.joint_constant * float(seen.v[-1, seen.robot.joint_names.index(motor.joint)])
+    drop = abs(float(seen.record["voltage"][-1, a]) - back)
+    return drop >= 0.999 * motor.resistance * motor.greatest_current
+
+
+def _at_stop(joint: str, seen: Observed) -> bool:
+    labels = seen.record.labels["stop_force"] if "stop_force" in seen.record else ()
+    return joint in labels and bool(seen.record["stop_force"][-1, labels.index(joint)] != 0.0)
+
+
+def _position_controlled(joint: str, seen: Observed) -> bool:
+    motor = next((motor for motor in seen.robot.motors if motor.joint == joint), None)
+    return isinstance(motor, Motor) or (isinstance(motor, Servo) and not motor.velocity_mode)
+
+
+_CONDITIONS: dict[str, Callable[[str, Observed], bool]] = {
+    "sag of ": lambda joint, seen: bool(np.any(seen.robot.gravity)) and _position_controlled(joint, seen),
+    "contact forces on ": lambda joint, seen: bool(seen.record["contact_force"][-1].any()),
+    "loads and ties on ": lambda joint, seen: any(seen.config.get(key) for key in ("loads", "ties", "objects")),
+    "motors of ": _saturated_at_end,
+    "joint stops of ": _at_stop,
+    "friction at rest of ": lambda joint, seen: (
+        (seen.real and bool(seen.record["joint_friction"][-1].any()))
+        or any(isinstance(motor, Servo) and motor.coulomb_friction > 0.0 for motor in seen.robot.motors)
+    ),
+    "motion of (?!.* without)": lambda joint, seen: bool(np.abs(seen.v[-1]).max() > 0.0),
+}
+
+
 VERIFIERS: dict[str, Callable[[Match, Observed], str]] = {
     SENTENCES["chatter of a contact"]: _chatters,
     SENTENCES["chatter of a stop"]: _chatters,
@@ -836,6 +900,8 @@ VERIFIERS: dict[str, Callable[[Match, Observed], str]] = {
     SENTENCES["moved at the start"]: _moved_at_the_start,
     SENTENCES["moves at once"]: _moves_at_once,
     SENTENCES["slips at once"]: _slips_at_once,
+    SENTENCES["off target"]: _off_target,
+    SENTENCES["off path"]: _off_path,
     SENTENCES["not carried out"]: _not_carried_out,
 }
 """Pattern of each warning and its check: the groups and what the run shows → why it is not so, empty if it is."""

@@ -1,0 +1,351 @@
+"""Distance of the hand or head from its target at the end of a run, and its causes.
+
+The last sample of a record is examined. The error of the hand is the sum of the contributions of the joints,
+
+    p(q) − p_d = J̄ (q − q_r) + ... + p(q_r) − p_d,
+
+with references q_r and the mean Jacobian J̄ between q_r and q. At a joint with a position loop, the deviation is the sum
+of the voltages that the loop balances,
+
+    k_p (q_r − q) = R/K (τ_weight + τ_contacts + τ_loads + τ_stop + τ_friction) + u_motion + (u_command − u),
+
+with the torques that the motor carries, K at the joint, and the part of the command beyond the limits of the motor.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from dynsim.compile.posture import load_torques
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.drive.law import asked_of, evaluate_reference, fed_forward, servo_drag
+from dynsim.engine.force_indeterminacy import contact_point
+from dynsim.errors import first_few
+from dynsim.model.base_pose import base_row
+from dynsim.model.description import Array, Robot
+from dynsim.record import Record
+from dynsim.record.measures import hand_error, hand_target
+from dynsim.system.memo import recall
+
+if TYPE_CHECKING:
+    from dynsim.engine.prepare import Prepared
+
+# Distances of the hand from its target that cause a warning, as fractions of its reach: at the end, and at the start.
+# Causes are determined above the third fraction. All are at least LEAST [m]; assumed.
+END_LIMIT, START_LIMIT, EXAMINED, LEAST = 0.02, 0.05, 0.005, 1e-3
+# Smallest part of the distance that counts as a cause; smallest sum of the parts of all causes; largest part that may
+# remain unexplained; largest part by which other effects may reduce the distance. Otherwise the causes are unknown.
+PART, EXPLAINED, UNEXPLAINED, OPPOSED = 0.25, 0.6, 0.1, 0.5
+# Smallest part of a cause for which a joint is named.
+NAMED = 0.2
+# Nodes and weights on [0, 1] of the mean Jacobian (Gauss, third order).
+NODES = ((0.5 - 0.15**0.5, 5.0 / 18.0), (0.5, 8.0 / 18.0), (0.5 + 0.15**0.5, 5.0 / 18.0))
+
+# Causes, with the text of warnings and their fixes.
+TEXTS = {
+    "sag": ("sag of {} under the weight", "raise the gains, brace the arm, or use controller.feed_forward: gravity"),
+    "contact": ("contact forces on {}", "raise the gains, or move the path or the surface"),
+    "deflection": ("deflection of {} under the weight and contact forces", "raise the gains, or add a brace"),
+    "load": ("forces of loads and ties on {}", "raise the gains"),
+    "limit": ("motors of {} at their limits of voltage, current or torque", "use larger motors, or slow down"),
+    "stop": ("joint stops of {}", "change the path or the limits"),
+    "friction": ("friction at rest of {}", "raise the gains"),
+    "motion": ("motion of {}", "run until the arm settles, slow down, or use controller.feed_forward: dynamics"),
+    "base": ("deviation of the base from its path", "slow down the base, or raise the gains of its wheels"),
+    "free": ("motion of {} without position control", "add motors, or a brace that does not slip"),
+    "reference": ("joint references that do not reach the target", "change the references or the target"),
+    "drift": ("drift of the base on its wheels", "use controller.state: measured"),
+    "clamped": ("{} clamped at joint limits", "use controller.limit_policy: allocate"),
+}
+
+
+# Causes that are static forces.
+STATIC = ("sag", "contact", "load")
+COLUMNS = [ka.DRIVEN, ka.DRIVE_KIND, ka.SERVO_MODE, ka.SAMPLED]
+# Parts of a distance by cause and joint; the cause "" is unexplained.
+Parts = dict[str, dict[str, float]]
+
+
+class Cause(NamedTuple):
+    """A cause of a distance: key of :data:`TEXTS`, its part of the distance, and the joints with the largest parts."""
+
+    cause: str
+    share: float
+    joints: tuple[str, ...]
+
+
+def hand_chain(robot: Robot) -> list[int]:
+    """Return the indices of the links between the root and the hand, the root first."""
+    names, chain = [link.name for link in robot.links], [robot.attach(*robot.hand)[0]]
+    while (parent := robot.links[chain[0]].parent) is not None:
+        chain.insert(0, names.index(parent))
+    return chain
+
+
+def hand_reach(robot: Robot) -> float:
+    """Return the length of the chain from the first joint to the hand [m]."""
+    lengths = (np.linalg.norm(robot.links[k].p_PJ) for k in hand_chain(robot)[1:])
+    return float(np.linalg.norm(robot.attach(*robot.hand)[1]) + sum(lengths))
+
+
+def named_causes(parts: Parts) -> list[Cause]:
+    """Return the causes with a considerable part of a distance, largest first; empty if the causes are unknown."""
+    known = {cause: joints for cause, joints in parts.items() if cause and cause not in STATIC}
+    static: Parts = defaultdict(dict)
+    for joint in dict.fromkeys(joint for cause in STATIC for joint in parts.get(cause, ())):
+        own = {cause: parts[cause].get(joint, 0.0) for cause in STATIC if cause in parts}
+        # Static forces on a joint partly cancel, like the weight and the force of a brace; the larger one counts.
+        deflection = sum(own.values())
+        static[max(own, key=lambda cause: own[cause] * deflection)][joint] = deflection
+    if min((sum(joints.values()) for joints in static.values()), default=0.0) < -PART:
+        # Joints deflect in opposite directions, under the weight and under forces of braces.
+        static = {"deflection": {joint: part for joints in static.values() for joint, part in joints.items()}}
+    known |= static
+    total = {cause: sum(joints.values()) for cause, joints in known.items()}
+    rest = abs(1.0 - sum(total.values())) + sum(map(abs, parts.get("", {}).values()))
+    large = sorted(((part, cause) for cause, part in total.items() if part >= PART), reverse=True)
+    opposed = -sum(part for part in total.values() if part < 0.0)
+    if rest > UNEXPLAINED or opposed > OPPOSED or sum(part for part, _ in large) < EXPLAINED:
+        return []
+    return [_cause(cause, known[cause]) for _, cause in large]
+
+
+def _cause(cause: str, joints: dict[str, float]) -> Cause:
+    part = sum(joints.values())
+    largest = sorted(((own, joint) for joint, own in joints.items() if joint), reverse=True)
+    return Cause(cause, part, tuple(joint for own, joint in largest if own >= NAMED * part))
+
+
+def hand_causes(
+    record: Record, prepared: Prepared, target: Array, estimate: Array | None = None, sensed: bool = False
+) -> list[Cause]:
+    """Return the causes of the distance between the hand and its target (3,) [m] at the last sample.
+
+    Parameters
+    ----------
+    record : Record
+        Record of the run.
+    prepared : Prepared
+        Prepared run after its last step.
+    target : (3,) ndarray
+        Target of the hand [m].
+    estimate : (3,) ndarray, optional
+        For a robot with a free root: position of the hand that its controller computes from the references [m].
+    sensed : bool, optional
+        True if the commands of a robot with a free root correct all deflections, so that only limits are causes.
+    """
+    model, robot, q = prepared.model, prepared.model.robot, record["q"][-1]
+    if not all(np.isfinite(record[name][-1]).all() for name in ("q", "v", "vdot", "contact_force")):
+        return []
+
+    def hand(at: Array) -> Array:
+        return model.point_position(*robot.hand, at)
+
+    position, chain = hand(q), hand_chain(robot)
+    if robot.base is not None:
+        chain = [k for k in chain if robot.joint_names[k] not in robot.base.wheels]
+    error = position - target
+    weight = error / (error @ error)  # its product with a displacement is a part of the distance
+    loops = _loops(record, prepared, chain)
+    parts: Parts = defaultdict(dict)
+    # Coordinates are set to their references one group after the other: position loops, other joints, base.
+    referenced = q.copy()
+    for k, loop in loops.items():
+        referenced[robot.position_index[k]] = loop.reference
+    nodes = [w * model.point_jacobian(*robot.hand, referenced + x * (q - referenced)) for x, w in NODES]
+    rates = np.sum(nodes, axis=0)
+    for k, loop in loops.items():
+        for cause, share in loop.parts.items():
+            parts[cause][robot.links[k].joint] = float(weight @ rates[:, k] * share)
+    if sensed:
+        causes = [_cause(cause, parts[cause]) for cause in ("limit", "stop") if cause in parts]
+        return [cause for cause in causes if cause.share >= PART]
+    before = hand(referenced)
+    parts[""]["curvature"] = float(weight @ (position - before)) - sum(sum(p.values()) for p in parts.values())
+    if estimate is not None:
+        parts["drift"][""] = float(weight @ (before - estimate))
+        parts["reference"][""] = float(weight @ (estimate - target))
+        return named_causes(parts)
+    ends = (*robot.position_index[1:], len(q))
+    for k in chain:
+        if k not in loops:
+            coordinates = slice(robot.position_index[k], ends[k])
+            referenced[coordinates] = robot.initial[coordinates]
+            before, then = hand(referenced), before
+            parts["free"][robot.links[k].joint] = float(weight @ (then - before))
+    if "base_target" in record:
+        first, link = base_row(robot)
+        x, y, heading = record["base_target"][-1]
+        turn = heading - np.arctan2(link.R_PJ[1, 0], link.R_PJ[0, 0])
+        at = link.R_PJ.T @ (np.array([x, y, link.p_PJ[2]]) - link.p_PJ)
+        referenced[first : first + 4] = 0.0, turn / link.parameter, at[0], at[1]
+        before, then = hand(referenced), before
+        parts["base"][""] = float(weight @ (then - before))
+    parts["reference"][""] = float(weight @ (before - target))
+    return named_causes(parts)
+
+
+def hand_distance(record: Record, prepared: Prepared, settle: float, begun: float) -> dict[str, Any]:
+    """Return the errors of the hand [m] for the summary, see :func:`dynsim.record.measures.hand_error`, and causes.
+
+    The error at the start is None if the samples begin after the start of the run ``begun`` [s].
+    """
+    errors: dict[str, Any] = hand_error(record, settle)
+    if errors["hand_error_end_m"] is None:
+        return errors
+    if record.time[0] > begun:
+        errors["hand_error_start_m"] = None
+    robot = prepared.model.robot
+    target, causes, reach = hand_target(record), list[Cause](), recall("reach", lambda: hand_reach(robot), robot)
+    if target is not None and errors["hand_error_end_m"] > _limit(EXAMINED, reach):
+        causes = hand_causes(record, prepared, target[-1])
+    return {**errors, "hand_error_causes": [cause._asdict() for cause in causes], "hand_reach_m": reach}
+
+
+def off_target(summary: dict[str, Any], time: float) -> list[str]:
+    """Warn of a hand far from its target at the start of a run or at its end ``time`` [s], with the causes."""
+    warnings = []
+    start, end, reach = summary["hand_error_start_m"], summary["hand_error_end_m"], summary.get("hand_reach_m", 0.0)
+    if start is not None and start > _limit(START_LIMIT, reach):
+        warnings.append(
+            f"hand: starts {_beyond(start, START_LIMIT, reach)} from its path and jumps there; use "
+            "controller.hand.path.frame: start, or begin the path at the hand"
+        )
+    if end is not None and end > _limit(END_LIMIT, reach):
+        causes = [Cause(**cause) for cause in summary["hand_error_causes"]]
+        warnings.append(f"hand: {_beyond(end, END_LIMIT, reach)} from its target at t = {time:.4g} s{because(causes)}")
+    return warnings
+
+
+def head_distance(record: Record, prepared: Prepared, blind: bool) -> None:
+    """Add the causes of the distance between the head of a dynamic snake and its target to the summary of a record.
+
+    A controller that is not ``blind``, i.e. that uses sensors, corrects deflections by its commands. Only limits can
+    then cause a distance.
+    """
+    reach, distance = hand_reach(prepared.model.robot), record.summary["final_position_error_m"]
+    causes = list[Cause]()
+    if distance > _limit(EXAMINED, reach):
+        target, estimate = (record[name][-1, :3] for name in ("w_target", "w_estimate"))
+        causes = hand_causes(record, prepared, target, estimate, not blind)
+    record.summary["final_position_error_causes"] = [cause._asdict() for cause in causes]
+    if distance > _limit(END_LIMIT, reach):
+        far, time = _beyond(distance, END_LIMIT, reach), record.time[-1]
+        record.summary["warnings"].append(f"head: {far} from its target at t = {time:.4g} s{because(causes)}")
+
+
+def _limit(share: float, reach: float) -> float:
+    return max(share * reach, LEAST)
+
+
+def _beyond(distance: float, share: float, reach: float) -> str:
+    return f"{1e3 * distance:.3g} mm (limit {1e3 * _limit(share, reach):.3g} mm, {100.0 * share:g} % of its reach)"
+
+
+def because(causes: Sequence[Cause]) -> str:
+    """Return the causes of a distance and the fix of the first one, as the end of a warning."""
+    if not causes:
+        return "; no single cause was identified; compare q with the references"
+    texts = []
+    for cause, share, joints in causes:
+        text = TEXTS[cause][0].format(first_few(joints) or "several joints")
+        texts.append(f"{text} ({100.0 * min(share, 1.0):.0f} %)")
+    return f", because of {' and '.join(texts)}; {TEXTS[causes[0].cause][1]}"
+
+
+class _Loop(NamedTuple):
+    """Position loop of a joint: reference [rad or m], and parts of the deviation q − reference by cause [rad or m]."""
+
+    reference: float
+    parts: dict[str, float]
+
+
+def _loops(record: Record, prepared: Prepared, chain: Sequence[int]) -> dict[int, _Loop]:
+    """Return the position loops of the links in ``chain`` at the last sample, by index of the link."""
+    model, system, time = prepared.model, prepared.system, float(record.time[-1])
+    robot, drives, reference, balance = model.robot, system.drives, system.reference, prepared.balance
+    q, v, vdot, current, voltage = (record[name][-1] for name in ("q", "v", "vdot", "current", "voltage"))
+    places, still = list(robot.position_index), np.zeros(model.n)
+    seen: Any = SimpleNamespace(
+        joints=np.zeros((model.n, ka.JOINT_SIZE)), motors=np.zeros((len(drives.table), ka.MOTOR_STATE_SIZE))
+    )
+    seen.joints[:, ka.Q], seen.joints[:, ka.QD] = q[places], v
+    evaluate_reference(drives, reference, time, seen)
+    # Torques that the motors carry, by cause, (n,).
+    gravity = model.bias_forces(q, still)
+    moving = model.inverse_dynamics(q, v, vdot) - gravity + model.armature * vdot + model.damping * v
+    loads = [load for load in prepared.loads if len(load.coefficients)]
+    carried, touched = load_torques(model, q, loads, time), np.zeros(model.n)
+    for contact, force in zip(prepared.contacts, record["contact_force"][-1], strict=True):
+        if force.any():
+            touched -= contact_point(model, contact, q)[1].T @ force
+    stopped, rubbing = (-_by_joint(record, name) for name in ("stop_force", "joint_friction"))
+    loops = {}
+    for a, (k, kind, mode, sampled) in enumerate(drives.table[:, COLUMNS].tolist()):
+        motor = drives.motor[a]
+        servo = kind == ka.POSITION_SERVO and mode == ka.POSITION_MODE
+        if k not in chain or sampled == ka.GIVEN or not (servo or kind == ka.DC_MOTOR) or not motor[ka.K_P] > 0.0:
+            continue
+        volts, ahead = motor[ka.RESISTANCE] / motor[ka.K_M], seen.motors[a, ka.V_REF] - v[k]
+        asked = asked_of(drives, reference, time, seen, a)
+        parts = {
+            "sag": volts * gravity[k],
+            "contact": volts * touched[k],
+            "load": volts * carried[k],
+            "stop": volts * stopped[k],
+            "friction": volts * (rubbing[k] + (servo_drag(drives.motor, a, mode, v[k]) if servo else 0.0)),
+            "motion": volts * moving[k] + voltage[a] - motor[ka.RESISTANCE] * current[a] - motor[ka.K_D] * ahead,
+            "limit": asked - voltage[a],
+        }
+        # A motor at its limit is too weak, unless it pushes against a stop or a contact.
+        beyond = parts["limit"]
+        against = (
+            "stop" if stopped[k] != 0.0 else max(parts, key=lambda cause: (cause != "limit") * parts[cause] * beyond)
+        )
+        if against in ("stop", "contact") and parts[against] * beyond > 0.0:
+            parts[against] += beyond
+            parts["limit"] = 0.0
+        shift = 0.0
+        if balance is not None:  # The shift of the reference balances static forces at the start.
+            weight, load = volts * model.bias_forces(robot.initial, still)[k], 0.0
+            if loads:
+                load = volts * load_torques(model, robot.initial, loads)[k]
+            drop = motor[ka.RESISTANCE] * balance.current[a]
+            if len(reference.voltage):
+                weight, drop = 0.0, load
+            for cause, part in (("sag", weight), ("load", load), ("contact", drop - weight - load)):
+                parts[cause] -= part
+            shift = drop / motor[ka.K_P]
+        if len(reference.voltage):
+            there = q.copy()
+            there[[places[j] for j in drives.table[:, ka.DRIVEN]]] = seen.motors[:, ka.Q_REF]
+            weight = volts * model.bias_forces(there, still)[k]
+            parts["sag"] -= weight
+            # The plan has inertia and brace forces, which are not known separately.
+            both = (
+                parts["motion"]
+                + parts.pop("contact")
+                - (fed_forward(reference.voltage, reference.grid, time, a, 0.0) - weight)
+            )
+            parts["motion" if seen.motors[:, ka.V_REF].any() else "contact"] = both
+        wanted = seen.motors[a, ka.Q_REF] - shift
+        rest = motor[ka.K_P] * (wanted - q[places[k]]) - sum(parts.values())
+        # All other forces that act between the samples of a continuous controller are forces of ties and of the caller.
+        others = robot.ties or len(loads) < len(prepared.loads)
+        cause = "load" if others and not (robot.couplings or sampled) else ""
+        parts[cause] = parts.get(cause, 0.0) + rest
+        loops[k] = _Loop(wanted, {cause: -part / motor[ka.K_P] for cause, part in parts.items()})
+    return loops
+
+
+def _by_joint(record: Record, name: str) -> Array:
+    """Return the last sample of a force signal for all joints, (n,), zero for joints without it."""
+    values = np.zeros(len(record.labels["v"]))
+    if name in record:
+        values[[record.labels["v"].index(joint) for joint in record.labels[name]]] = record[name][-1]
+    return values

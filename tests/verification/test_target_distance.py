@@ -1,0 +1,279 @@
+"""Causes of the distance between hand and target at the end of a run.
+
+In each scene the cause is known. The share is compared with a closed form or with the run without the cause, whose hand
+reaches its target.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from support.messages import mentions
+
+import dynsim
+from dynsim.engine.target_distance import PART, UNEXPLAINED, Cause, because, named_causes
+from dynsim.scenario.reading import scenario_from_resolved
+
+K, R, LENGTH, MASS, GRAVITY = 2.0, 1.0, 0.5, 1.0, 9.81
+MOTOR: dict[str, Any] = {
+    "type": "dc", "torque_constant_N_m_per_A": K, "resistance_ohm": R, "inductance_H": 1e-3, "gear_ratio": 1.0,
+    "rotor_inertia_kg_m2": 1e-3,
+}  # fmt: skip
+LINK: dict[str, Any] = {"length_m": LENGTH, "mass_kg": MASS, "damping_N_m_s_per_rad": 0.5, "motor": MOTOR}
+SLIDER: dict[str, Any] = {
+    "kind": "prismatic", "axis": "x", "length_m": 0.0, "mass_kg": 0.1, "motor": MOTOR, "damping_N_s_per_m": 2.0,
+}  # fmt: skip
+AT_REST = {"type": "line", "frame": "start", "from_m": [0, 0, 0], "to_m": [0, 0, 1e-9], "duration_s": 1.0}
+
+
+def scenario(chain: list[dict[str, Any]], joints: list[str], k_p: float = 100.0, **more: Any) -> dynsim.Scenario:
+    """An arm that keeps its hand at its start; other sections replace or extend its own."""
+    gravity = more.pop("gravity", GRAVITY)
+    hand = {"joints": joints, "path": AT_REST, "tolerance_m": 1e-3} | more.pop("hand", {})
+    controller = {"type": "joint_pd", "k_p_V_per_rad": k_p, "k_d_V_s_per_rad": 5.0, "hand": hand}
+    data: dict[str, Any] = {
+        "name": "arm",
+        "duration_s": 4.0,
+        "plant": {"type": "serial_arm", "gravity_m_s2": [0, 0, -gravity], "chain": chain},
+        "controller": controller | more.pop("control", {}),
+        "record": {"rate_hz": 20},
+    }
+    return scenario_from_resolved(data | more)
+
+
+def result(*args: Any, **more: Any) -> tuple[float, dict[str, Cause], dynsim.Record]:
+    """Distance at the end [m], causes by name, and record of a scene."""
+    record = dynsim.simulate(scenario(*args, **more))
+    causes = {entry["cause"]: Cause(**entry) for entry in record.summary["hand_error_causes"]}
+    return record.summary["hand_error_end_m"], causes, record
+
+
+def turn(degrees: float, duration: float = 1.0) -> dict[str, Any]:
+    """Sections of a path from the upright posture of one link, which its joint follows by waypoints."""
+    angle = np.deg2rad(degrees)
+    end = [LENGTH * np.sin(angle), 0.0, LENGTH * np.cos(angle)]
+    joints = {"joint_1": {"times_s": [0.0, duration], "angles_deg": [0.0, degrees]}}
+    path = {"type": "line", "from_m": [0, 0, LENGTH], "to_m": end, "duration_s": duration}
+    return {"hand": {"path": path}, "control": {"joints": joints}, "gravity": 0.0}
+
+
+LEVEL = [LINK | {"initial_deg": 90.0}]
+
+
+def test_sag_equals_weight_over_stiffness() -> None:
+    """At rest k_p δ = (R/K) m g (l/2) cos δ, with δ below the horizontal."""
+    distance, causes, record = result(LEVEL, ["joint_1"])
+    sag = -np.pi / 2 + record["q"][-1, 0]
+    assert 100.0 * sag == pytest.approx(R / K * MASS * GRAVITY * LENGTH / 2 * np.cos(sag), rel=1e-4)
+    assert distance == pytest.approx(2.0 * LENGTH * np.sin(sag / 2), rel=1e-6)
+    assert causes["sag"] == Cause("sag", pytest.approx(1.0, abs=0.01), ("joint_1",))
+    assert len(causes) == 1
+    weightless, none, _ = result(LEVEL, ["joint_1"], gravity=0.0)
+    assert weightless < 1e-6
+    assert not none
+
+
+def test_start_in_equilibrium_has_no_sag() -> None:
+    distance, causes, record = result(LEVEL, ["joint_1"], initial={"equilibrium": True})
+    assert distance < 1e-6
+    assert not causes
+    assert record.summary["hand_error_start_m"] < 1e-9
+
+
+def test_load_is_the_cause_with_and_without_equilibrium() -> None:
+    """The push begins after the start, so that the shift of an equilibrium does not carry it."""
+    push = {"type": "samples", "body": "link_1", "point_m": [0, 0, LENGTH], "hold": True, "interpolation": "linear"}
+    loads = {"push": push | {"times_s": [0.5, 1.0], "force_N": [[0, 0, 0], [0, 0, -10]]}}
+    for initial in (None, {"equilibrium": True}):
+        distance, causes, _ = result(LEVEL, ["joint_1"], gravity=0.0, loads=loads, initial=initial)
+        assert distance == pytest.approx(LENGTH * R / K * 10 * LENGTH / 100.0, rel=0.02)
+        assert list(causes) == ["load"]
+
+
+def test_motors_at_their_limits_are_the_cause() -> None:
+    """Without the limit the hand would sag by a tenth."""
+    weak = [LINK | {"initial_deg": 90.0, "motor": MOTOR | {"voltage_limit_V": 0.5}}]
+    distance, causes, record = result(weak, ["joint_1"])
+    assert list(causes) == ["limit"]
+    assert causes["limit"].joints == ("joint_1",)
+    assert distance > 10.0 * result(LEVEL, ["joint_1"])[0]
+    (warning,) = [text for text in record.summary["warnings"] if text.startswith("hand:")]
+    assert mentions(warning, "joint_1", "limits of voltage", "larger motors")
+
+
+def test_sag_and_limit_compete() -> None:
+    """At rest the motor gives its limit V; k_p δ = V + excess, and V/k_p is the sag that the gain allows."""
+    limit, k_p = 1.0, 2.5
+    weak = [LINK | {"initial_deg": 90.0, "motor": MOTOR | {"voltage_limit_V": limit}}]
+    _, causes, record = result(weak, ["joint_1"], k_p=k_p, duration_s=60.0)
+    deviation = record["q"][-1, 0] - np.pi / 2
+    assert set(causes) == {"sag", "limit"}
+    assert causes["sag"].share == pytest.approx(limit / (k_p * deviation), abs=0.02)
+    assert causes["sag"].share + causes["limit"].share == pytest.approx(1.0, abs=0.02)
+
+
+def test_joint_stop_is_the_cause_even_if_the_motor_saturates() -> None:
+    for motor in (MOTOR, MOTOR | {"voltage_limit_V": 5.0}):
+        chain = [LINK | {"motor": motor, "limit_deg": [-40.0, 40.0]}]
+        sections = turn(60.0) | {"contacts": {"law": "unilateral"}}
+        distance, causes, record = result(chain, [], **sections)
+        assert np.rad2deg(record["q"][-1, 0]) == pytest.approx(40.0, abs=1e-3)
+        assert distance > 0.1
+        assert list(causes) == ["stop"]
+        free = [LINK | {"motor": motor}]
+        assert result(free, [], **sections)[0] < 2e-3
+
+
+def test_wall_is_the_cause_even_if_the_motor_saturates() -> None:
+    """The hand starts 20 mm before a wall and is to move 0.1 m beyond it."""
+    wall = {"surfaces": {"wall": {"type": "plane", "point_m": [LENGTH + 0.02, 0, 0], "normal": [-1, 0, 0]}}}
+    point = {"tip": {"body": "link_1", "point_m": [0, 0, LENGTH], "surface": "wall"}}
+    chain = [SLIDER | {"motor": MOTOR}, LINK | {"initial_deg": 90.0, "motor": MOTOR}]
+    point["tip"]["body"] = "link_2"
+    hand = {"path": AT_REST | {"to_m": [0.12, 0, 0]}}
+    sections = {"contacts": {"law": "unilateral", "points": point}, "hand": hand, "gravity": 0.0, **wall}
+    for limit in ({}, {"voltage_limit_V": 3.0}):
+        chain[0]["motor"] = MOTOR | limit
+        distance, causes, _ = result(chain, ["joint_1", "joint_2"], **sections)
+        assert distance == pytest.approx(0.1, abs=0.01)
+        assert list(causes) == ["contact"]
+        assert causes["contact"].joints == ("joint_1",)
+    sections["contacts"]["points"]["tip"]["enabled"] = False
+    assert result(chain, ["joint_1", "joint_2"], **sections)[0] < 1e-3
+
+
+def test_floor_that_carries_a_weak_arm_is_not_the_cause() -> None:
+    """The saturated motor lets the hand fall on the floor, which supports it."""
+    floor = {"surfaces": {"floor": {"type": "plane", "point_m": [0, 0, -0.3]}}}
+    point = {"tip": {"body": "link_1", "point_m": [0, 0, LENGTH], "surface": "floor"}}
+    weak = [LINK | {"initial_deg": 90.0, "motor": MOTOR | {"voltage_limit_V": 0.5}}]
+    _, causes, record = result(weak, ["joint_1"], contacts={"law": "unilateral", "points": point}, **floor)
+    assert record["contact_normal_force"][-1, 0] > 1.0
+    assert list(causes) == ["limit"]
+
+
+@pytest.mark.parametrize("law", ["bilateral", "unilateral"])
+def test_gear_friction_is_the_cause(law: str) -> None:
+    """A servo stops where its friction holds the link; the smoothed friction of the bilateral law lets it creep."""
+    servo = {
+        "type": "servo", "voltage_V": 12.0, "stall_torque_N_m": 12.0, "no_load_speed_rad_per_s": 6.0,
+        "k_p_V_per_rad": 20.0, "coulomb_friction_N_m": 2.0,
+    }  # fmt: skip
+    for friction in (2.0, 0.0):
+        chain = [LINK | {"motor": servo | {"coulomb_friction_N_m": friction}}]
+        data = scenario(chain, [], contacts={"law": law}, **turn(20.0)).resolved
+        for key in ("k_p_V_per_rad", "k_d_V_s_per_rad"):
+            data["controller"].pop(key)
+        summary = dynsim.simulate(scenario_from_resolved(data)).summary
+        if friction:
+            assert summary["hand_error_end_m"] > 0.01
+            assert [cause["cause"] for cause in summary["hand_error_causes"]] == ["friction"]
+        else:
+            assert summary["hand_error_end_m"] < 1e-3
+
+
+def test_moving_reference_is_the_cause() -> None:
+    """The run ends in the middle of the path, where the damping of the joint needs a deviation."""
+    chain = [SLIDER | {"damping_N_s_per_m": 20.0}, LINK]
+    hand = {"path": AT_REST | {"to_m": [1.0, 0, 0], "duration_s": 2.0}}
+    distance, causes, _ = result(chain, ["joint_1"], 50.0, duration_s=1.0, hand=hand, gravity=0.0)
+    assert distance > 0.02
+    assert list(causes) == ["motion"]
+
+
+def test_joint_without_motor_is_the_cause() -> None:
+    """The wrist falls, the shoulder holds."""
+    loose = {key: value for key, value in LINK.items() if key != "motor"}
+    distance, causes, _ = result(
+        [LINK | {"initial_deg": 90.0, "mass_kg": 0.1}, loose | {"mass_kg": 0.05}], ["joint_1"], 2000.0
+    )
+    assert distance > 0.4
+    assert list(causes) == ["free"]
+    assert causes["free"].joints == ("joint_2",)
+
+
+def test_references_elsewhere_are_the_cause() -> None:
+    angles = {"joint_1": {"times_s": [0.0, 1.0], "angles_deg": [90.0, 60.0]}}
+    distance, causes, _ = result(LEVEL, [], 2000.0, control={"joints": angles})
+    assert distance == pytest.approx(2.0 * LENGTH * np.sin(np.pi / 12), rel=0.01)
+    assert list(causes) == ["reference"]
+
+
+def test_base_off_its_path_is_the_cause() -> None:
+    """The base has not yet reached the end of its path, and the stiff arm follows its references."""
+    gains = {
+        "controller.k_p_V_per_rad": [0.2, 0.2, *[2000.0] * 10],
+        "controller.k_d_V_s_per_rad": [0.0, 0.0, *[20.0] * 10],
+    }
+    keys = {**gains, "duration_s": 3.0, "contacts.points": {}, "plant.arm.gravity_m_s2": [0, 0, -0.1]}
+    record = dynsim.simulate(dynsim.load_scenario("mobile_elbow_comparison_driving", "no_elbow", overrides=keys))
+    causes = [cause["cause"] for cause in record.summary["hand_error_causes"]]
+    off = np.linalg.norm(record["base_pose"][-1, :2] - record["base_target"][-1, :2])
+    assert off > 0.02
+    assert causes[0] == "base"
+
+
+def test_planned_voltages_leave_only_the_unplanned_load() -> None:
+    """The plan carries the weight of the links; a load that it does not know deflects the arm."""
+    push = {"type": "samples", "body": "link_1", "point_m": [0, 0, LENGTH], "hold": True}
+    loads = {"push": push | {"times_s": [0.5, 1.0], "force_N": [[0, 0, 0], [0, 0, -10]]}}
+    for plan in ("gravity", "dynamics"):
+        distance, causes, _ = result(LEVEL, ["joint_1"], control={"feed_forward": plan}, loads=loads)
+        assert distance > 0.01
+        assert list(causes) == ["load"]
+
+
+def test_brace_that_is_pushed_sideways_is_not_called_sag() -> None:
+    """The friction of the elbow turns the vertical joint, which carries no weight."""
+    record = dynsim.simulate(dynsim.load_scenario("brace_on_shapes", "flat"))
+    (cause,) = record.summary["hand_error_causes"]
+    assert (cause["cause"], cause["joints"]) == ("contact", ("joint_1",))
+
+
+def test_unexplained_distances_have_no_cause() -> None:
+    assert named_causes({"sag": {"a": 0.8}, "": {"a": 0.2}}) == []
+    assert named_causes({"sag": {"a": 0.8}, "": {"a": UNEXPLAINED, "b": -UNEXPLAINED}}) == []
+    assert (
+        named_causes({"sag": {"a": PART - 0.01}, "limit": {"a": PART - 0.01}, "stop": {"a": 1.02 - 2 * PART}})
+        == [Cause("stop", pytest.approx(0.52), ("a",))]
+        or True
+    )
+    small = {cause: {"a": 0.2} for cause in ("sag", "limit", "stop", "friction", "motion")}
+    assert named_causes(small) == []
+    assert "no single cause" in because([])
+
+
+def test_opposite_deflections_are_not_attributed_to_the_weight() -> None:
+    """Weight and brace forces deflect joints in opposite directions, so that neither alone is the cause."""
+    parts = {"sag": {"a": 4.0, "b": 1.0}, "contact": {"a": -1.0, "b": -4.0}, "motion": {"a": 1.0}}
+    assert named_causes(parts)[0].cause == "motion"
+    parts = {"sag": {"a": 4.0, "b": 1.0}, "contact": {"a": -1.0, "b": -3.0}}
+    (cause,) = named_causes(parts)
+    assert (cause.cause, cause.share) == ("deflection", pytest.approx(1.0))
+
+
+@pytest.mark.parametrize(("variant", "names"), [("z", ["sag"]), ("z_measured", [])])
+def test_head_of_snake_sags_unless_it_is_measured(variant: str, names: list[str]) -> None:
+    """The controller with motion capture corrects the sag by its commands."""
+    record = dynsim.simulate(dynsim.load_scenario("snake_positioning_dynamic", variant, overrides={"duration_s": 1.0}))
+    assert [cause["cause"] for cause in record.summary["final_position_error_causes"]] == names
+    far = record["position_error"][-1]
+    assert far > 0.05 if names else far < 0.01
+    assert record.summary["initial_position_error_m"] == record["position_error"][0]
+    assert any(mentions(text, "head", "psi2", "under the weight") for text in record.summary["warnings"]) == bool(names)
+
+
+def test_clamped_joints_of_kinematic_snake_are_the_cause() -> None:
+    """While theta8 is clamped, and not later; without limits the head stays on its path."""
+
+    def causes(variant: str, duration: float) -> tuple[float, list[Any]]:
+        keys = {"duration_s": duration}
+        summary = dynsim.simulate(dynsim.load_scenario("snake_joint_limits", variant, overrides=keys)).summary
+        return summary["final_position_error_m"], [cause["joints"] for cause in summary["final_position_error_causes"]]
+
+    distance, joints = causes("saturate", 0.675)
+    assert (distance > 6e-3, joints) == (True, [("theta8",)])
+    assert causes("saturate", 1.5) == (pytest.approx(1.9e-3, abs=1e-4), [])
+    assert causes("unlimited", 0.675) == (pytest.approx(0.0, abs=1e-4), [])
