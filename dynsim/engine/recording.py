@@ -46,8 +46,9 @@ from dynsim.record.measures import (
     sinks,
 )
 from dynsim.record.poses import TOUCHING, add_body_poses, point_positions
-from dynsim.record.scene import Point, Scene, SoftGripper, vector3
+from dynsim.record.scene import CarriedMass, Point, Scene, SoftGripper, vector3
 from dynsim.scenario import Scenario, build, to_yaml
+from dynsim.scenario.schema import Payload
 from dynsim.system.files import discard, json_text, replace_together, write_text
 from dynsim.system.memo import recall
 
@@ -470,7 +471,14 @@ def pictured_parts(scene: Scene, scenario: Scenario) -> Scene:
 def drawn_scene(scenario: Scenario, robot: Robot, contacts: Sequence[Contact]) -> Scene | None:
     """Return the scene of a robot for pictures; None if it cannot be drawn."""
     scene = robot_scene(robot, contacts, build.surfaces(scenario))
-    return None if scene is None else pictured_parts(scene, scenario)
+    if scene is None:
+        return None
+    payloads = []
+    for name, load in scenario.config.loads.items():
+        if isinstance(load, Payload) and load.mass_kg > 0.0:
+            body, point = robot.attach(load.body, np.array(load.point_m))
+            payloads.append(CarriedMass(name, body, vector3(point), load.mass_kg, load.radius_m))
+    return pictured_parts(replace(scene, payloads=tuple(payloads)), scenario)
 
 
 def make_record(

@@ -271,6 +271,10 @@ class Point(_Finite):
         Name of the surface that a contact point touches.
     friction : float
         Friction coefficient that defines the friction cone of a contact point; 0 if unknown.
+    radius : float
+        Radius of the sphere or capsule about a contact point [m].
+    tip : tuple of float or None
+        Other end of a capsule's axis in the frame of the body [m].
     """
 
     name: str
@@ -279,6 +283,19 @@ class Point(_Finite):
     position: Vector3
     surface: str = ""
     friction: float = 0.0
+    radius: float = 0.0
+    tip: Vector3 | None = None
+
+
+@dataclass(frozen=True)
+class CarriedMass(_Finite):
+    """Payload on a body (index ``body``): centre of mass in its frame [m], mass [kg], and radius [m], 0 for a point."""
+
+    name: str
+    body: int
+    position: Vector3
+    mass: float
+    radius: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -337,6 +354,8 @@ class Scene(_Finite):
         Distance by which the tip of a snake's gripper is ahead of the controlled point [m].
     frames : tuple of FixedFrame
         Frames of the robot file that are fixed to bodies or to the world.
+    payloads : tuple of CarriedMass
+        Payloads of the robot.
 
     Raises
     ------
@@ -356,12 +375,14 @@ class Scene(_Finite):
     grip: SoftGripper | None = None
     tip: float = 0.0
     frames: tuple[FixedFrame, ...] = ()
+    payloads: tuple[CarriedMass, ...] = ()
 
     def __post_init__(self) -> None:
         for k, body in enumerate(self.bodies):
             if not WORLD <= body.parent < k:
                 raise RecordError(f"body {body.name!r} ({k}) must come after its parent ({body.parent})")
-        points: tuple[Point | FixedFrame, ...] = (*self.points, *self.supports, *self.frames)
+        points: tuple[Point | FixedFrame | CarriedMass, ...]
+        points = (*self.points, *self.supports, *self.frames, *self.payloads)
         for point in points:
             if not WORLD <= point.body < len(self.bodies):
                 raise RecordError(f"point {point.name!r} is on body {point.body}, but only {len(self.bodies)} exist")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,8 @@ Array = NDArray[np.float64]
 POSE_ERROR = 4e-5
 # Maximum number of frames in a page; longer runs have fewer frames than POSE_ERROR requires.
 FRAMES = 20_000
+# Longest interval between frames, in samples; it limits the time for choosing them.
+LONGEST = 256
 WORLD_AXES = np.eye(3)
 HERE_POINT: Vector3 = (0.0, 0.0, 0.0)
 
@@ -76,35 +79,58 @@ def robot_of(record: Record) -> DrawnRobot | None:
     ends = [position[0], *(point_positions(record, p, 0)[None] for p in scene.points)]
     known = np.concatenate(ends)
     reach = float(np.ptp(known[np.isfinite(known).all(axis=1)], axis=0).max(initial=0.0)) or 0.5
-    return DrawnRobot(record, scene, _frames(record, reach), reach)
+    return DrawnRobot(record, scene, _frames(record, scene), reach)
 
 
-def _frames(record: Record, reach: float) -> NDArray[np.intp]:
-    """Return every 2^n-th sample and the last, so that interpolation of the others is accurate to ``POSE_ERROR``."""
-    count = len(record)
-    position, turn = record[POSITION].reshape(count, -1), record[ORIENTATION].reshape(count, -1)
-    stride, arm = 1, min(reach, 1.0)
-    while 4 * stride < count:
-        rows = _every(count, 2 * stride)
-        # Compare the omitted samples with the ends of their intervals.
-        between = np.delete(np.arange(count), rows)
-        left = np.searchsorted(rows, between) - 1
-        a, b = rows[left], rows[left + 1]
-        t = record.time
-        share = ((t[between] - t[a]) / np.maximum(t[b] - t[a], 1e-12))[:, None].astype(np.float32)
-        with np.errstate(all="ignore"):
-            off = [
-                np.abs(x[between] - (x[a] + share * (x[b] - x[a]))).max(initial=0.0) * weight
-                for x, weight in ((position, 1.0), (turn, 2.0 * arm))
-            ]
-        if not max(off) <= POSE_ERROR and count // stride <= FRAMES:
-            break
-        stride *= 2
-    return _every(count, stride)
+def _frames(record: Record, scene: Scene) -> NDArray[np.intp]:
+    """Return the samples whose interpolation shows all bodies to ``POSE_ERROR``, and their rotation to 0.1 mrad."""
+    arms = np.array([_arm(scene, k) for k in range(len(scene.bodies))], dtype=np.float32)
+    turns = 2.0 * arms[:, None] * record[ORIENTATION]
+    data = np.concatenate([record[POSITION], turns], axis=2).reshape(len(record), -1) / np.float32(POSE_ERROR)
+    return knots(record.time, data, FRAMES)
 
 
-def _every(count: int, stride: int) -> NDArray[np.intp]:
-    return np.unique(np.append(np.arange(0, count, stride), count - 1))
+def _arm(scene: Scene, k: int) -> float:
+    """Return the distance from the origin of a body to its drawn parts [m], from 0.2 to 1 m."""
+    ends = [point.position for point in scene.points if point.body == k]
+    ends += [load.position for load in scene.payloads if load.body == k]
+    ends += [body.joint.position for body in scene.bodies if body.parent == k]
+    far = [math.hypot(*end) for end in ends]
+    for shape in scene.bodies[k].shapes:
+        far.append(math.hypot(*shape.position) + max(shape.size) if shape.kind != "mesh" else 1.0)
+    return min(max(0.2, *far, 0.0), 1.0)
+
+
+def knots(time: Array, data: NDArray[Any], most: int | None = None) -> NDArray[np.intp]:
+    """Return rows from which linear interpolation reproduces all rows to within 1 (Ramer, Douglas and Peucker).
+
+    Parameters
+    ----------
+    time : (T,) ndarray
+        Times of the rows [s].
+    data : (T, n) ndarray
+        Values relative to their tolerances.
+    most : int, optional
+        Maximum number of rows, beyond which the tolerance is doubled.
+    """
+    count, data = len(time), np.nan_to_num(data, nan=1e6, posinf=1e6, neginf=-1e6)
+    error = 1.0
+    while True:
+        rows = np.unique([*range(0, count, max(LONGEST, 4 * count // (most or count))), count - 1])
+        kept, spans = set(rows.tolist()), list(zip(rows[:-1].tolist(), rows[1:].tolist(), strict=True))
+        while spans and (most is None or len(kept) <= most):
+            a, b = spans.pop()
+            if b - a < 2:
+                continue
+            share = ((time[a + 1 : b] - time[a]) / (time[b] - time[a]))[:, None].astype(data.dtype)
+            off = np.abs(data[a + 1 : b] - (data[a] + share * (data[b] - data[a]))).max(axis=1, initial=0.0)
+            k = int(off.argmax())
+            if off[k] > error:
+                kept.add(middle := a + 1 + k)
+                spans += [(a, middle), (middle, b)]
+        if not spans:
+            return np.array(sorted(kept))
+        error *= 2.0
 
 
 def bounds(robots: Sequence[DrawnRobot], axes: Array = WORLD_AXES) -> tuple[Array, Array]:
@@ -156,8 +182,11 @@ def azimuth(robots: Sequence[DrawnRobot]) -> float:
 
     The viewing direction of the page is perpendicular to this direction.
     """
-    clouds = [robot.record[POSITION][robot.rows][..., :2].reshape(-1, 2).astype(np.float64) for robot in robots]
-    clouds += [path[robot.rows, :2] for robot in robots for _, path in paths(robot.record, robot.scene)]
+    clouds = []
+    for robot in robots:
+        some = slice(None, None, max(1, len(robot.record) // 2000))
+        clouds.append(robot.record[POSITION][some, :, :2].reshape(-1, 2).astype(np.float64))
+        clouds += [path[some, :2] for _, path in paths(robot.record, robot.scene)]
     points = np.concatenate(clouds)
     points = points[np.isfinite(points).all(axis=1)]
     spread = points - points.mean(axis=0)

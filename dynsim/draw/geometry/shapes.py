@@ -13,7 +13,7 @@ from dynsim.draw.geometry.meshes import Mesh, Meshes
 from dynsim.record import Record
 from dynsim.record.poses import ORIENTATION, POSITION
 from dynsim.record.quaternion import of_turn, rotated
-from dynsim.record.scene import HERE, WORLD, Body, Scene, SceneSurface, Shape
+from dynsim.record.scene import HERE, WORLD, Body, Scene, SceneSurface, Shape, quaternion
 
 # Number of points along each side of the drawn part of a curved surface, and along each side of a box face.
 PATCH, FACE = 41, 13
@@ -159,7 +159,9 @@ ENDS = 3
 # Radius of a rod drawn for a body without shapes, relative to the reach of the robot.
 ROD = 0.008
 # A spherical or cylindrical surface is drawn only near the robot if it is larger than this multiple of the view.
-LARGE = 4.0
+LARGE = 1.0
+# Density of the ball that represents a payload without a radius [kg/m³] (steel), and colour of payloads.
+DENSITY, BRASS = 7850.0, [0.72, 0.53, 0.2, 1.0]
 
 
 def drawn_shape(shape: Shape, meshes: Meshes) -> dict[str, Any] | None:
@@ -182,7 +184,7 @@ def drawn_shape(shape: Shape, meshes: Meshes) -> dict[str, Any] | None:
 
 def body_shapes(scene: Scene, reach: float, meshes: Meshes) -> list[list[dict[str, Any]]]:
     """Return the shapes of every body; a body without shapes gets rods to its children, and joints get hubs."""
-    tubes = [shape.size[0] for body in scene.bodies if _is_tube(body) for shape in body.shapes[:1]]
+    tubes = [b.shapes[0].size[0] for k, b in enumerate(scene.bodies) if _is_tube(b) and not _of_object(scene, k)]
     radius = float(np.median(tubes)) if tubes else ROD * reach
     base = set(scene.base)
     drawn = []
@@ -197,14 +199,57 @@ def body_shapes(scene: Scene, reach: float, meshes: Meshes) -> list[list[dict[st
             shapes = [_rod(end, radius) for end in ends if np.linalg.norm(end) > 2.0 * radius]
         elif _is_tube(body):
             shapes += _stems(scene, k)
+        pads = _pads(scene, k)
+        # A hub would hide a pad about the joint.
+        bare = bare and not any(np.linalg.norm(pad["p"]) < radius <= pad["size"][0] for pad in pads)
         if body.joint.kind == "revolute" and not body.joint.part_of and k not in base and bare:
             shapes.append(_hub(body, 1.45 * radius))
-        drawn.append(shapes)
+        drawn.append([*shapes, *pads, *_payloads(scene, k)])
     if not any(drawn):
         hands = {point.body for point in scene.points if point.body != WORLD} or {len(scene.bodies) - 1}
         for k in hands & set(range(len(scene.bodies))):
             drawn[k] = [{"kind": "box", "size": 3 * [0.06 * reach], "p": [0.0, 0.0, 0.03 * reach], "q": list(HERE)}]
     return drawn
+
+
+def _of_object(scene: Scene, k: int) -> bool:
+    """Return whether a body belongs to an object, not to the robot."""
+    while k != WORLD:
+        if scene.bodies[k].name in scene.objects:
+            return True
+        k = scene.bodies[k].parent
+    return False
+
+
+def _pads(scene: Scene, k: int) -> list[dict[str, Any]]:
+    """Return the spheres and capsules with which a body touches surfaces, except those that its shapes show."""
+    pads = []
+    for point in scene.contacts:
+        start, tip = np.array(point.position), np.array(point.tip or point.position)
+        shown = (
+            np.linalg.norm(0.5 * (start + tip) - shape.position) < 1e-6 and shape.size[0] > 0.99 * point.radius
+            for shape in scene.bodies[k].shapes
+            if shape.kind in ("cylinder", "capsule", "sphere")
+        )
+        if point.body != k or not point.radius > 0.0 or any(shown):
+            continue
+        ball = {"kind": "sphere", "size": [point.radius], "p": start.tolist(), "q": list(HERE)}
+        if point.tip is not None:
+            rod = _rod(tip - start, point.radius)
+            ball = rod | {"p": (0.5 * (start + tip)).tolist()}
+        pads.append(ball | {"role": "pad", "text": f"{point.name}: radius {1e3 * point.radius:.3g} mm"})
+    return pads
+
+
+def _payloads(scene: Scene, k: int) -> list[dict[str, Any]]:
+    """Return the payloads of a body as balls; a point mass is drawn as a ball of steel."""
+    balls = []
+    for load in scene.payloads:
+        if load.body == k:
+            radius = load.radius or (0.75 * load.mass / (np.pi * DENSITY)) ** (1.0 / 3.0)
+            ball = {"kind": "sphere", "size": [radius], "p": list(load.position), "q": list(HERE), "colour": BRASS}
+            balls.append(ball | {"role": "load", "text": f"{load.name}: {load.mass:.3g} kg"})
+    return balls
 
 
 def _stems(scene: Scene, k: int) -> list[dict[str, Any]]:
@@ -216,9 +261,12 @@ def _stems(scene: Scene, k: int) -> list[dict[str, Any]]:
 
 
 def thinnest(shapes: list[list[dict[str, Any]]]) -> float:
-    """Return the smallest radius of the round shapes [m], except stems; 0 without round shapes."""
+    """Return the smallest radius of the rods [m], except stems and pads; 0 without rods."""
     round_ones = (
-        s for shape in shapes for s in shape if s["kind"] in ("cylinder", "capsule") and s.get("role") != "stem"
+        s
+        for shape in shapes
+        for s in shape
+        if s["kind"] in ("cylinder", "capsule") and s.get("role") not in ("stem", "pad")
     )
     return min((shape["size"][0] for shape in round_ones), default=0.0)
 
@@ -273,12 +321,17 @@ def drawn_surface(surface: SceneSurface, low: Array, high: Array) -> dict[str, A
     span = float((high - low).max())
     near = abs(surface.radius or 0.0) <= LARGE * span
     if surface.kind == "plane" and surface.direction is not None:
-        centre = 0.5 * (low + high)
-        normal = np.array(surface.direction)
+        # The part of the plane below the box; its first axis is horizontal, and the second one points up.
+        centre, normal = 0.5 * (low + high), np.array(surface.direction)
+        first = np.cross([0.0, 0.0, 1.0], normal)
+        first = first / np.linalg.norm(first) if np.linalg.norm(first) > 1e-6 else np.array([1.0, 0.0, 0.0])
+        axes = np.array([first, np.cross(normal, first)])
+        ends = (box_corners(low, high) - centre) @ axes.T
+        start, end = ends.min(axis=0) - 0.1 * span, ends.max(axis=0) + 0.1 * span
         return drawn | {
-            "p": (centre - surface.gap(centre) * normal).tolist(),
-            "q": from_z(normal).tolist(),
-            "half": 1.1 * float(np.linalg.norm(high - low)),
+            "p": (centre - surface.gap(centre) * normal + 0.5 * (start + end) @ axes).tolist(),
+            "q": list(quaternion(np.array([*axes, normal]).T)),
+            "size": (end - start).tolist(),
         }
     if surface.kind == "sphere" and near:
         return drawn | {"p": list(surface.position or ()), "radius": surface.radius}

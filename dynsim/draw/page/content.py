@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import base64
 import gzip
+import hashlib
 import html
 import json
 import math
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -22,12 +23,15 @@ from dynsim._version import __version__
 from dynsim.draw.geometry.meshes import Mesh, Meshes, simplified
 from dynsim.draw.geometry.projection import view_axes
 from dynsim.draw.geometry.robot import (
+    FRAMES,
     POSE_ERROR,
     DrawnRobot,
     azimuth,
     bounds,
     contacts,
     gripping,
+    knots,
+    largest_force,
     paths,
     penetrations,
     robot_of,
@@ -46,8 +50,8 @@ from dynsim.draw.geometry.shapes import (
 from dynsim.errors import RecordError
 from dynsim.record import TIME, Record, Signal
 from dynsim.record.measures import GRIPPER_STATES, hand_target
-from dynsim.record.poses import ORIENTATION, POSITION
-from dynsim.record.scene import Scene
+from dynsim.record.poses import ORIENTATION, POSITION, TOUCHING, point_positions
+from dynsim.record.scene import WORLD, Scene
 from dynsim.system.arguments import names_wrong_types
 from dynsim.system.files import replacing
 
@@ -64,9 +68,14 @@ class Blocks:
 
     def __init__(self) -> None:
         self._parts: list[bytes] = []
+        self._known: dict[bytes, int] = {}
+        self._size = 0
 
-    def add(self, columns: ArrayLike, error: float = np.inf) -> dict[str, Any]:
-        """Add columns, (T,) or (T, …), quantised to 16 bits of their range, or to 32 bits if ``error`` requires it."""
+    def add(self, columns: ArrayLike, error: float = np.inf, step: float = 0.0) -> dict[str, Any]:
+        """Add columns, (T,) or (T, …), quantised to 16 bits of their range, or to 32 bits if ``error`` requires it.
+
+        A quantisation step of at least ``step`` makes noise compressible.
+        """
         data = np.asarray(columns, dtype=np.float64)
         data = data.reshape(len(data), -1) if len(data) else data.reshape(0, 1)
         known = np.isfinite(data)
@@ -75,7 +84,7 @@ class Blocks:
         some = np.isfinite(low)
         low, span = np.where(some, low, 0.0), np.where(some, high - low, 0.0)
         bits = 16 if 0.5 * span.max(initial=0.0) / _CODES[16] <= error else 32
-        scale = span / _CODES[bits]
+        scale = np.where(span > 0.0, np.maximum(span / _CODES[bits], step), 0.0)
         with np.errstate(all="ignore"):
             codes = np.rint((np.where(known, data, low) - low) / np.where(scale > 0.0, scale, 1.0))
         kind = _TYPES[bits]
@@ -84,7 +93,8 @@ class Blocks:
         planes = np.ascontiguousarray(steps).view(np.uint8).reshape(-1, bits // 8).T
         start = self._append(np.ascontiguousarray(planes).tobytes())
         header = {"at": start, "rows": len(data), "columns": int(codes.shape[1]), "bits": bits}
-        return header | {"offset": low.tolist(), "scale": scale.tolist()}
+        # Ten digits are more than the quantisation keeps.
+        return header | {name: [float(f"{x:.10g}") for x in v] for name, v in (("offset", low), ("scale", scale))}
 
     def raw(self, data: NDArray[Any]) -> dict[str, Any]:
         """Add an array of integers ≥ 0 unchanged (for meshes), little-endian, in 16 bits, or in 32 if necessary."""
@@ -92,9 +102,13 @@ class Blocks:
         return {"at": self._append(data.astype(_TYPES[bits]).tobytes()), "count": int(data.size), "bits": bits}
 
     def _append(self, content: bytes) -> int:
-        """Append a block; return its position."""
-        self._parts.append(content)
-        return sum(map(len, self._parts[:-1]))
+        """Return the position of a block, and append it unless an equal block exists."""
+        key = hashlib.sha256(content).digest()
+        if key not in self._known:
+            self._known[key] = self._size
+            self._parts.append(content)
+            self._size += len(content)
+        return self._known[key]
 
     def packed(self, head: dict[str, Any]) -> str:
         """Return the length of the head in 4 bytes, the head as JSON, and the blocks; compressed and in base64."""
@@ -126,11 +140,62 @@ def packed_mesh(mesh: Mesh, blocks: Blocks) -> dict[str, Any]:
 Array = NDArray[np.float64]
 # Maximum number of samples of a plotted signal; for longer signals the minimum and maximum of each bin are kept.
 PLOTTED = 8000
+# Number of plotted values of a page; with more, signals have fewer samples, but at least FEWEST.
+VALUES, FEWEST = 3_000_000, 400
+# Relative error of contact forces between the instants of a page, and error of centres of pressure [m].
+FORCE_ERROR, CENTRE_ERROR = 5e-4, 5e-5
+# Lengths of at most this size are plotted in millimetres [m].
+SMALL = 0.1
 # Maximum relative difference between the recorded heat and the heat by the trapezoidal rule; currents may jump between
 # samples.
 HEAT_ERROR = 0.05
 # Signals that are shown in the 3D view but not in plots.
-_SHOWN = {POSITION, ORIENTATION, "posture"}
+_SHOWN = {POSITION, ORIENTATION, TOUCHING, "posture"}
+# Names of signals; the others are their keys in words.
+_NAMES = {
+    "q": "joint position",
+    "v": "joint rate",
+    "vdot": "joint acceleration",
+    "phi": "joint angle",
+    "phi_dot": "joint rate",
+    "phi_command": "commanded joint angle",
+    "phi_dot_command": "commanded joint rate",
+    "rho": "wheel angle",
+    "rho_dot": "wheel rate",
+    "rho_dot_command": "commanded wheel rate",
+    "w": "pose of the controlled point",
+    "w_target": "target pose",
+    "w_estimate": "estimated pose",
+    "torque": "motor torque",
+    "current": "motor current",
+    "voltage": "motor voltage",
+    "power": "electrical power",
+    "contact_normal_force": "normal force of contacts",
+    "contact_force": "force of contacts",
+    "contact_gap": "gap of contacts",
+    "contact_slip_velocity": "slip velocity of contacts",
+    "contact_impulse": "impulse of contacts",
+    "contact_mode": "mode of contacts",
+    "contact_slip_distance": "slip distance of contacts",
+    "hand_error": "distance of the hand from its target",
+    "hand_turn_error": "angle of the hand from its target",
+    "position_error": "distance of the head from its target",
+    "attitude_error": "angle of the head from its target",
+    "energy_electrical": "electrical energy, net",
+    "energy_electrical_drawn": "electrical energy drawn",
+    "energy_electrical_supply": "electrical energy, common supply",
+    "energy_residual": "residual of the energy balance",
+    "heat_joule": "heat of the windings",
+    "heat_friction": "heat of friction",
+    "loss_gear": "loss in gears",
+    "loss_joint": "loss in joints",
+    "loss_impact": "loss in impacts",
+    "loss_stop": "loss at joint stops",
+    "loss_damper": "loss in dampers",
+    "loss_scheme": "loss of time stepping",
+    "tip_margin": "margin against tipping",
+    "support_margin": "support margin",
+}
 
 
 def packed(records: Mapping[str, Record], *, ghost: bool = False) -> str:
@@ -146,7 +211,10 @@ def packed(records: Mapping[str, Record], *, ghost: bool = False) -> str:
     turn, (low, high) = azimuth(every), bounds(every)
     blocks = Blocks()
     meshes = Meshes()
+    layout = _Layout(records[name] for name in shown)
     parts = [_record(name, robot, blocks, meshes, low, high) for name, robot in shown.items()]
+    for part, robot in zip(parts, every, strict=True):
+        part["signals"], part["axes"] = _signals(robot.record, blocks, layout)
     head = {
         "version": 1,
         "by": f"dynsim {__version__}",
@@ -184,6 +252,7 @@ def viewable(record: Record) -> bool:
 
 def _record(name: str, robot: DrawnRobot, blocks: Blocks, meshes: Meshes, low: Array, high: Array) -> dict[str, Any]:
     record, scene, rows = robot.record, robot.scene, robot.rows
+    instants, touching = _contacts(robot, blocks)
     meshes.of_robot(record.scene)
     position, turn = record[POSITION][rows], record[ORIENTATION][rows]
     shapes = body_shapes(scene, robot.reach, meshes)
@@ -204,57 +273,78 @@ def _record(name: str, robot: DrawnRobot, blocks: Blocks, meshes: Meshes, low: A
         "reach": robot.reach,
         "bodies": bodies,
         "fixed": [shape_drawn for shape in scene.fixed if (shape_drawn := drawn_shape(shape, meshes)) is not None],
+        "stands": _stands(scene),
         "surfaces": [drawn_surface(surface, low, high) for surface in scene.surfaces],
         "frames": blocks.add(record.time[rows], 1e-9),
         "position": blocks.add(position, 0.5 * POSE_ERROR),
-        "orientation": blocks.add(turn, 1e-5),
+        "orientation": blocks.add(turn, 2e-5),
         "paths": {key: blocks.add(path[rows], 1e-5) for key, path in paths(record, scene)},
-        "contacts": _contacts(robot, blocks),
+        "instants": blocks.add(record.time[instants], 1e-9),
+        "contacts": touching,
         "sunk": [
             {"name": point.name, "surface": point.surface, "body": point.body, "p": list(point.position)}
             | {"least": point.least, "depth": blocks.add(point.depth, 1e-5)}
             for point in penetrations(record, scene, rows)
         ],
-        "wheels": None if groups.down is None else {"names": groups.names, "down": blocks.add(groups.down[rows])},
+        "wheels": None if groups.down is None else {"names": groups.names, "down": blocks.add(groups.down[instants])},
         "supports": supports(scene, groups),
         "motors": _motors(record, scene),
+        "limits": _torque_limits(record),
         "names": scene.wheel_names,
         "limit": scene.voltage_limit,
         "resistance": resistance(record),
         "events": [[event.time, event.kind, event.name, _finite(event.value)] for event in record.events],
     }
     if (pressure := cop_of(record)) is not None:
-        part["pressure"] = {"name": pressure[0], "at": blocks.add(pressure[1][rows], 1e-4)}
+        part["pressure"] = {"name": pressure[0], "at": blocks.add(pressure[1][instants], 1e-4)}
     if (grip := gripping(record)) is not None and scene.hand is not None:
-        part["gripper"] = blocks.add(grip[rows])
+        part["gripper"] = blocks.add(grip[instants])
         part["fingers"] = gripper(shapes, robot.reach)
         if "gripper_state" in record:
             part["states"] = list(GRIPPER_STATES)
     if scene.hand is not None:
         part["hand"] = {"body": scene.hand.body, "p": list(scene.hand.position), "name": scene.hand.name}
-    part["signals"], part["axes"] = _signals(record, blocks)
     return part
 
 
-def _contacts(robot: DrawnRobot, blocks: Blocks) -> list[dict[str, Any]]:
-    """Return every contact point: body, normal, normal force and friction over time; mode and position if known."""
-    entries = []
-    for contact in contacts(robot, robot.rows):
-        point = contact.point
-        entry: dict[str, Any] = {
-            "name": point.name,
-            "surface": point.surface,
-            "body": point.body,
-            "p": list(point.position),
-            "friction": contact.point.friction,
-            "normal": blocks.add(contact.normal),
-            "force": blocks.add(contact.force),
-        }
-        for name, values in (("tangent", contact.tangent), ("mode", contact.mode), ("at", contact.at)):
-            if values is not None:
-                entry[name] = blocks.add(values)
+def _stands(scene: Scene) -> list[list[float]]:
+    """Return the joints that connect the robot to the world [m], if nothing is drawn below them."""
+    bases = [(b, b.joint) for b in scene.bodies if b.parent == WORLD and b.name not in scene.objects]
+    fixed = [joint for body, joint in bases if joint.kind == "revolute" and not joint.part_of]
+    return [] if scene.fixed else [list(joint.position) for joint in fixed]
+
+
+def _contacts(robot: DrawnRobot, blocks: Blocks) -> tuple[NDArray[np.intp], list[dict[str, Any]]]:
+    """Return samples whose interpolation shows contacts, wheels, gripper and centre of pressure, and the contacts.
+
+    A contact has its body, normal, normal force and friction over time, and mode and position if known.
+    """
+    record, drawn = robot.record, contacts(robot)
+    tolerance = {"normal": FORCE_ERROR, "at": POSE_ERROR, "mode": 0.25}
+    tolerance["force"] = tolerance["tangent"] = FORCE_ERROR * largest_force(drawn)
+    entries, data = [], [np.zeros((len(record), 1))]
+    for contact in drawn:
+        point, at = contact.point, contact.at
+        entry: dict[str, Any] = {"name": point.name, "surface": point.surface, "body": point.body}
+        entry |= {"p": list(point.position), "friction": point.friction, "radius": 0.0}
+        if at is not None:
+            # On a sphere the force acts one radius below the centre.
+            arm = point_positions(record, point) - at
+            radius = float(np.linalg.norm(arm[0]))
+            if np.abs(arm - radius * contact.normal).max() < 0.5 * POSE_ERROR:
+                entry["radius"], at = radius, None
+        values = {"normal": contact.normal, "force": contact.force, "tangent": contact.tangent, "mode": contact.mode}
+        entry |= {name: table for name, table in (values | {"at": at}).items() if table is not None}
+        data += [entry[name].reshape(len(record), -1) / error for name, error in tolerance.items() if name in entry]
         entries.append(entry)
-    return entries
+    for states in (wheel_groups(record, robot.scene).down, gripping(record)):
+        data += [] if states is None else [4.0 * states.reshape(len(record), -1)]
+    if (pressure := cop_of(record)) is not None:
+        data.append(pressure[1] / CENTRE_ERROR)
+    rows = knots(record.time, np.concatenate(data, axis=1), FRAMES)
+    for entry in entries:
+        entry |= {name: blocks.add(entry[name][rows]) for name in tolerance if name in entry}
+    return rows, entries
 
 
 def _motors(record: Record, scene: Scene) -> list[list[Any]]:
@@ -278,38 +368,73 @@ def resistance(record: Record) -> float | None:
     return R if abs(loss - heat) <= HEAT_ERROR * abs(heat) else None
 
 
+def _torque_limits(record: Record) -> dict[str, dict[str, float]]:
+    """Return the torque rating and the stall torque of the motors for which they are known [N m or N]."""
+    motors = record.summary.get("motors", ())
+    keys = {"rating": ("nominal_torque_N_m", "nominal_force_N"), "stall": ("stall_torque_N_m",)}
+    return {
+        name: {motor["joint"]: motor[key] for motor in motors for key in several if motor.get(key)}
+        for name, several in keys.items()
+    }
+
+
 def _finite(value: float | None) -> float | None:
     """Return the value, or None if it is not finite, because JSON has no infinity."""
     return value if value is not None and math.isfinite(value) else None
 
 
-def _signals(record: Record, blocks: Blocks) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+def _plotted(record: Record) -> dict[str, Signal]:
+    """Return the signals that can be plotted."""
+    signals = record.signals | _hand_error(record)
+    return {name: s for name, s in signals.items() if name not in _SHOWN and s.data.size and s.data.ndim <= 3}
+
+
+class _Layout:
+    """Number of samples of the plotted signals of a page, and signals that are plotted in millimetres."""
+
+    def __init__(self, records: Iterable[Record]) -> None:
+        self.small: dict[str, bool] = {}
+        columns = 0
+        for record in records:
+            for name, signal in _plotted(record).items():
+                columns += signal.data[0].size
+                if signal.unit == "m" and "position" not in name.split("_")[1:]:
+                    sizes = np.abs(signal.data[np.isfinite(signal.data)])
+                    small = bool(np.percentile(sizes, 98.0) <= SMALL) if sizes.size else True
+                    self.small[name] = self.small.get(name, True) and small
+        self.samples = min(max(VALUES // max(columns, 1), FEWEST), PLOTTED)
+        self.crowded = self.samples < 4 * FEWEST
+
+
+def _signals(record: Record, blocks: Blocks, layout: _Layout) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """Return the signals for the plots, and their time axes."""
     signals, axes = [], {}
-    for name, signal in (record.signals | _hand_error(record)).items():
-        data = signal.data
-        if name in _SHOWN or not data.size or data.ndim > 3:
-            continue
+    for name, signal in _plotted(record).items():
+        data, unit = signal.data, signal.unit
+        if layout.small.get(name) and unit == "m":
+            data, unit = 1e3 * data, "mm"
         labels = list(signal.labels)
         if data.ndim == 3:
             parts = "xyz" if data.shape[2] == 3 else range(data.shape[2])
             labels = [f"{label} {part}" for label in labels for part in parts]
         every = record.time if signal.axis == TIME else record.axes[signal.axis]
-        time, values = _thinned(every, data.reshape(len(data), -1))
+        time, values = _thinned(every, data.reshape(len(data), -1), layout.samples)
+        resolution = _resolution(values)
         if signal.axis not in axes:
             axes[signal.axis] = blocks.add(time, 1e-9)
         signals.append(
             {
                 "name": name,
-                "unit": signal.unit,
+                "words": _NAMES.get(name) or name.replace("_", " "),
+                "unit": unit,
                 "about": signal.description,
                 "labels": labels,
                 "axis": signal.axis,
-                "data": blocks.add(values, _resolution(values)),
+                "data": blocks.add(values, resolution, resolution if layout.crowded else 0.0),
             }
         )
     if TIME not in axes:
-        axes[TIME] = blocks.add(_thinned(record.time, record.time[:, None])[0], 1e-9)
+        axes[TIME] = blocks.add(_thinned(record.time, record.time[:, None], layout.samples)[0], 1e-9)
     return signals, axes
 
 
@@ -331,12 +456,12 @@ def _hand_error(record: Record) -> dict[str, Signal]:
     return {"hand_error": Signal(distance, "m", description="distance of the hand from its target")}
 
 
-def _thinned(time: Array, values: NDArray[Any]) -> tuple[Array, Array]:
-    """Return at most ``PLOTTED`` samples; for a longer run, these are the two extremes of each bin, in their order."""
+def _thinned(time: Array, values: NDArray[Any], most: int = PLOTTED) -> tuple[Array, Array]:
+    """Return at most ``most`` samples; for a longer run, these are the two extremes of each bin, in their order."""
     values = np.asarray(values, dtype=np.float64)
-    if len(time) <= PLOTTED:
+    if len(time) <= most:
         return time, values
-    size = -(-2 * len(time) // PLOTTED)
+    size = -(-2 * len(time) // most)
     whole = len(time) // size * size
     bins = values[:whole].reshape(-1, size, values.shape[1])
     bare = np.where(np.isfinite(bins), bins, 0.0)

@@ -13,6 +13,8 @@ class Actor {
     this.object.add(this.inner);
     const table = (block) => new D.Table(bytes, block);
     this.times = table(data.frames).column(0);
+    // Contacts, wheels and gripper change at other times than poses.
+    this.instants = table(data.instants).column(0);
     this.position = table(data.position);
     this.orientation = table(data.orientation);
     this.size = Math.max(0.13 * data.reach, 3 * data.radius);
@@ -59,7 +61,8 @@ class Actor {
         mesh.quaternion.set(...S.xyzw(shape.q));
         mesh.castShadow = mesh.receiveShadow = true;
         group.add(mesh);
-        const role = shape.wheel !== undefined ? "wheel" : shape.role === "hub" ? "hub" : "body";
+        mesh.userData.text = shape.text ?? "";
+        const role = shape.wheel !== undefined ? "wheel" : ["hub", "pad", "load"].includes(shape.role) ? shape.role : "body";
         const part = { mesh, material, own, role, alpha: shape.colour ? shape.colour[3] : 1, z: shape.p,
           painted: !own && Boolean(mesh.geometry.attributes.color) };
         paint.push(part);
@@ -114,13 +117,16 @@ class Actor {
   // Sample of the record at a time: positions and orientations interpolated linearly, modes held.
   at(t) {
     this.live = false;
-    const times = this.times, out = this.sample, n = this.bodies.length;
+    const out = this.sample, n = this.bodies.length;
     const clipped = Math.min(Math.max(t, this.span[0]), this.span[1]);
-    const i = times.length > 1 ? D.before(times, clipped) : 0, j = Math.min(i + 1, times.length - 1);
-    const gap = times[j] - times[i], share = gap > 0 ? Math.min((clipped - times[i]) / gap, 1) : 0;
-    // Exactly at a frame, use this frame instead of the previous one.
-    const held = share > 1 - 1e-9 ? j : i;
-    const mix = (table, k) => { const c = table.column(k), a = c[i]; return share > 0 ? a + share * (c[j] - a) : a; };
+    const between = (times) => {
+      const i = times.length > 1 ? D.before(times, clipped) : 0, j = Math.min(i + 1, times.length - 1);
+      const gap = times[j] - times[i], share = gap > 0 ? Math.min(Math.max(clipped - times[i], 0) / gap, 1) : 0;
+      // Exactly at a frame, use this frame instead of the previous one.
+      const held = share > 1 - 1e-9 ? j : i;
+      return [(table, k) => { const c = table.column(k), a = c[i]; return share > 0 ? a + share * (c[j] - a) : a; }, held];
+    };
+    const [mix] = between(this.times), [force, held] = between(this.instants);
     out.time = clipped;
     for (let b = 0; b < n; b++) {
       for (let k = 0; k < 3; k++) out.poses[7 * b + k] = mix(this.position, 3 * b + k);
@@ -128,17 +134,17 @@ class Actor {
     }
     this.contactTables.forEach((c, m) => {
       const one = out.contacts[m];
-      one.force = mix(c.force, 0);
+      one.force = force(c.force, 0);
       one.mode = c.mode ? Math.round(c.mode.value(held, 0)) : null;
-      one.at = c.at ? [0, 1, 2].map((k) => mix(c.at, k)) : null;
+      one.at = c.at ? [0, 1, 2].map((k) => force(c.at, k)) : null;
       for (let k = 0; k < 3; k++) {
-        one.normal[k] = mix(c.normal, k);
-        one.tangent[k] = c.tangent ? mix(c.tangent, k) : 0;
+        one.normal[k] = force(c.normal, k);
+        one.tangent[k] = c.tangent ? force(c.tangent, k) : 0;
       }
     });
     this.depths.forEach((one, k) => { out.depths[k] = mix(one, 0); });
     for (let k = 0; k < out.wheels.length; k++) out.wheels[k] = this.wheelTable ? Math.round(this.wheelTable.value(held, k)) : 1;
-    if (this.pressureTable) out.pressure = [0, 1].map((k) => mix(this.pressureTable, k));
+    if (this.pressureTable) out.pressure = [0, 1].map((k) => force(this.pressureTable, k));
     out.gripper = this.gripperTable ? Math.round(this.gripperTable.value(held, 0)) : null;
     return out;
   }
@@ -208,6 +214,30 @@ class Actor {
     return this.hand.getWorldPosition(out);
   }
 
+  // Posts from the floor to the joints that are fixed in the world.
+  stand(floor) {
+    for (const [x, y, z] of this.data.stands) {
+      const high = z - floor - 1.5 * this.data.radius, radius = 1.2 * this.data.radius || 0.01 * this.data.reach;
+      if (high < 2 * radius) continue;
+      const post = new THREE.Mesh(new THREE.CylinderGeometry(radius, 1.6 * radius, high, 24).rotateX(Math.PI / 2), new THREE.MeshLambertMaterial());
+      post.position.set(x, y, floor + 0.5 * high);
+      post.castShadow = post.receiveShadow = true;
+      this.inner.add(post);
+      this.fixed.push({ mesh: post, own: null });
+    }
+  }
+
+  // Prepare for solid surfaces: parts behind them are drawn again, as translucent silhouettes.
+  seenBehind() {
+    for (const part of this.bodies.flatMap((body) => body.paint)) {
+      Object.assign(part.material, S.stencil(0));
+      part.behind = new THREE.Mesh(part.mesh.geometry, new THREE.MeshBasicMaterial({ transparent: true, opacity: 0.35, depthWrite: false,
+        depthFunc: THREE.GreaterDepth, stencilWrite: true, stencilRef: 1, stencilFunc: THREE.EqualStencilFunc, stencilZPass: THREE.IncrementStencilOp }));
+      part.behind.renderOrder = 2;
+      part.mesh.add(part.behind);
+    }
+  }
+
   // Set the colours of the theme, of hubs (of everything for a translucent ghost), and of the hand path.
   dress(colours, tint, way, ghost) {
     this.colours = colours;
@@ -219,6 +249,7 @@ class Actor {
         part.base = part.own ? part.own.clone() : new THREE.Color(part.painted ? 0xffffff : colours[part.role]);
         if (this.ghost) part.base = this.tint.clone();
         else if (!part.own && part.role === "hub") part.base.copy(this.tint);
+        part.behind?.material.color.copy(part.base);
         part.material.transparent = ghost || part.alpha < 1;
         part.material.opacity = ghost ? 0.3 : part.alpha;
         part.material.depthWrite = !ghost;
@@ -240,7 +271,8 @@ class Actor {
     this.bodies.forEach((body, k) => {
       const colour = colourOf ? colourOf.get(k) : null;
       for (const part of body.paint) {
-        if (part.role !== "wheel") part.material.color.copy(colour ?? (colourOf ? this.plain : part.base));
+        const motor = part.role === "body" || part.role === "hub";
+        if (part.role !== "wheel") part.material.color.copy(motor && colourOf ? colour ?? this.plain : part.base);
         // Colours of motors replace the colours of a mesh file.
         const own = part.painted && !this.ghost && !colourOf;
         if (part.painted && part.material.vertexColors !== own) Object.assign(part.material, { vertexColors: own, needsUpdate: true });

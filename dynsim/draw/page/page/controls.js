@@ -33,7 +33,7 @@ function wire(app) {
   for (const [name, text, key] of [["iso", "corner", 1], ["side", "side", 2], ["front", "front", 3], ["top", "top", 4]])
     button("cameras", text, `view (${key})`, () => app.camera(name), name);
   const follow = button("cameras", "follow", "follow the hand (f)", () => app.set("follow", !app.follow));
-  const switches = [["forces", "forces"], ["cones", "cones"], ["trace", "trace"], ["target", "target"], ["support", "support"], ["depths", "depths"], ["labels", "labels"]]
+  const switches = [["forces", "forces"], ["cones", "friction cones"], ["trace", "hand path"], ["target", "target"], ["support", "support"], ["depths", "depths"], ["labels", "labels"]]
     .filter(([name]) => app.has(name)).map(([name, text]) =>
       [name, button("layers", text, `show or hide: ${ABOUT[name] ?? text}`, () => app.set(name, !app.layers[name]))]);
   const layout = app.actors.length > 1 ? button("layers", "", "side by side or overlaid (g)", () => app.set("ghost", !app.ghost)) : null;
@@ -72,6 +72,7 @@ function wire(app) {
     if (!actor.data.complete) chip.append(D.element("em", { textContent: "incomplete", title: `ended early, at ${D.number(actor.span[1])} s` }));
     if (app.actors.length > 1 || chip.querySelector("em")) $("variants").append(chip);
   });
+  const boxes = app.actors.length > LABELLED ? chooser(app, $("choose"), $("chooser")) : [];
 
   const first = app.span[0], long = app.span[1] - first || 1;
   $("slider").min = first;
@@ -112,14 +113,48 @@ function wire(app) {
     if (layout) layout.textContent = app.ghost ? "overlaid" : "side by side";
     for (const one of $("cameras").querySelectorAll("[data-name]")) one.classList.toggle("on", app.stage.preset === one.dataset.name);
     $("speed").value = app.speed;
+    const many = app.actors.filter((a) => a.object.visible).length > 2 * LABELLED;
     $("colour").value = app.colouring;
     for (const actor of app.actors) {
       actor.chip.classList.toggle("off", !actor.object.visible);
+      actor.chip.hidden = app.actors.length > LABELLED && (!actor.object.visible || many);
       actor.chip.firstChild.style.background = app.colourOf(actor);
     }
+    for (const { actor, shown, labelled } of boxes) shown.checked = actor.object.visible, labelled.checked = app.labelled.includes(actor);
+    if (boxes.length) $("choose").textContent = `variants: ${app.actors.filter((a) => a.object.visible).length} of ${app.actors.length}`;
     for (const cell of $("keys").querySelectorAll("[data-colour]")) cell.style.color = D.palette[app.theme][cell.dataset.colour];
-    for (const sign of $("marks").children) sign.style.color = app.actors.length > 1 ? app.colourOf(app.actors[sign.dataset.actor]) : "";
+    for (const sign of $("marks").children) {
+      const actor = app.actors[sign.dataset.actor];
+      sign.hidden = !actor.object.visible;
+      sign.style.color = app.actors.length > 1 ? app.colourOf(actor) : "";
+    }
   };
+}
+
+// List of the variants with check boxes that show and label them.
+function chooser(app, button, list) {
+  const tick = (act) => D.element("input", { type: "checkbox", onchange: act });
+  const boxes = app.actors.map((actor) => {
+    const labelled = tick(() => app.mark(actor, labelled.checked));
+    return { actor, shown: tick(() => app.toggle(actor)), labelled };
+  });
+  const choose = (actors) => {
+    for (const actor of app.actors) actor.object.visible = false;
+    app.labelled = [];
+    for (const actor of actors) app.admit(actor);
+    app.arrange();
+    app.dress();
+  };
+  const cell = (tag, ...content) => D.element(tag, {}, ...content);
+  list.append(D.element("div", { className: "group" }, D.element("button", { textContent: `first ${LABELLED}`, onclick: () => choose(app.actors.slice(0, LABELLED)) }),
+    D.element("button", { textContent: "all", onclick: () => choose(app.actors) })),
+  D.element("table", {}, cell("tr", cell("th", "show"), cell("th", "label"), cell("th", "variant")), ...boxes.map(({ actor, shown, labelled }) =>
+    cell("tr", cell("td", shown), cell("td", labelled), D.element("td", { textContent: actor.name, onclick: () => app.toggle(actor) })))),
+  D.element("small", { textContent: `at most ${LABELLED} variants have labels and a table of contacts` }));
+  button.hidden = false;
+  button.onclick = () => { list.hidden = !list.hidden; };
+  addEventListener("pointerdown", (event) => { if (!list.contains(event.target) && event.target !== button) list.hidden = true; });
+  return boxes;
 }
 
 // Tooltip of the body under the pointer: name, position, signals of its motor.
@@ -140,7 +175,7 @@ function hovering(app, canvas, box) {
       if (!hit) continue;
       const k = hit.object.bodyIndex, body = actor.bodies[k];
       box.replaceChildren(D.element("b", { textContent: app.actors.length > 1 ? `${actor.name}: ${body.name}` : body.name }),
-        ...app.about(actor, k).map((text) => D.element("div", { textContent: text })));
+        ...app.about(actor, k, hit.object.userData.text).map((text) => D.element("div", { textContent: text })));
       box.style.left = `${Math.min(event.clientX - area.left + 14, area.width - 170)}px`;
       box.style.top = `${event.clientY - area.top + 14}px`;
       box.hidden = false;

@@ -78,10 +78,10 @@ D.element = function (tag, properties = {}, ...children) {
 D.palette = {
   light: { push: "#0072B2", pull: "#D55E00", friction: "#7A3E9D", target: "#000000", hand: "#0072B2", slip: "#E69F00",
     stick: "#009E73", open: "#7F7F7F", support: "#56B4E9", body: "#AEB7C4", hub: "#4A5260", wheel: "#3A4048", down: "#0072B2",
-    lifted: "#FFFFFF", ground: "#EEF0F3", gridline: "#B9C0CA", surface: "#CDD6E0", solid: "#B9C6D4", edge: "#6C7B8C", fog: "#F7F8FA", saturated: "#D55E00", sunk: "#882255", tool: "#3A4048" },
+    lifted: "#FFFFFF", ground: "#EEF0F3", gridline: "#B9C0CA", solid: "#B0BCC9", edge: "#6C7B8C", fog: "#F7F8FA", pad: "#3A4048", saturated: "#D55E00", sunk: "#882255", tool: "#3A4048" },
   dark: { push: "#56B4E9", pull: "#FF7438", friction: "#D9A5E8", target: "#FFFFFF", hand: "#56B4E9", slip: "#F0E442",
     stick: "#2BC79B", open: "#9AA3AD", support: "#56B4E9", body: "#98A2B0", hub: "#67717F", wheel: "#7C8794", down: "#56B4E9",
-    lifted: "#FFFFFF", ground: "#1D2126", gridline: "#3B434D", surface: "#46515E", solid: "#46515E", edge: "#8593A3", fog: "#15181C", saturated: "#FF7438", sunk: "#F28AB8", tool: "#D5DAE0" },
+    lifted: "#FFFFFF", ground: "#1D2126", gridline: "#3B434D", solid: "#46515E", edge: "#8593A3", fog: "#15181C", pad: "#D5DAE0", saturated: "#FF7438", sunk: "#F28AB8", tool: "#D5DAE0" },
 };
 D.variants = { light: ["#0072B2", "#009E73", "#E69F00", "#CC79A7", "#56B4E9", "#000000", "#8C6D31"],
   dark: ["#56B4E9", "#2BC79B", "#F0B429", "#E59BC4", "#9AD4F5", "#FFFFFF", "#C9A86A"] };

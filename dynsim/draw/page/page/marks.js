@@ -49,7 +49,7 @@ M.Contact = class {
     this.normal = new THREE.Vector3();
     this.foot = new THREE.Vector3();
     this.along = new THREE.Vector3();
-    this.state = { name: contact.name, force: null, friction: null, state: "", colour: "" };
+    this.state = { name: contact.name, force: null, friction: null, ratio: null, state: "", colour: "" };
     this.push = new M.Arrow(parent, 0.035 * size, 20);
     this.slide = new M.Arrow(parent, 0.018 * size, 19);
     this.dot = new THREE.Mesh(new THREE.SphereGeometry(0.07 * size, 16, 12), new THREE.MeshBasicMaterial({ ...M.above }));
@@ -68,6 +68,7 @@ M.Contact = class {
     if (now.at) this.at.set(...now.at);
     else this.at.set(...this.contact.p).applyQuaternion(body.quaternion).add(body.position);
     this.normal.set(...now.normal).normalize();
+    if (!now.at && this.contact.radius) this.at.addScaledVector(this.normal, -this.contact.radius);
     const open = mode === 0 || !Number.isFinite(force), pulls = force < 0;
     const slip = Math.hypot(...now.tangent), shown = layers.forces && !open && force !== 0;
     const long = this.size * Math.min(Math.sqrt(Math.abs(force) / scale), 1.6);
@@ -96,7 +97,9 @@ M.Contact = class {
     this.dot.position.copy(this.at);
     this.dot.material.color.set(dot);
     this.dot.material.opacity = open ? 0.45 : 1;
-    Object.assign(this.state, { force, friction: slip, state, colour, shown, dot,
+    // Tangential force relative to the friction limit.
+    const ratio = !open && this.contact.friction > 0 && force !== 0 ? slip / (this.contact.friction * Math.abs(force)) : null;
+    Object.assign(this.state, { force, friction: slip, ratio, state, colour, shown, dot,
       length: shown ? this.push.head.position.z : 0, direction: shown ? (pulls ? -1 : 1) : 0 });
   }
 };

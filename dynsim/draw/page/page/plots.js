@@ -18,7 +18,7 @@ class Plots {
   add(name, column = "all") {
     const signal = this.names.includes(name) ? name : this.names[0];
     if (!signal) return null;
-    const choice = D.element("select", { ariaLabel: "signal" }, ...this.names.map((n) => D.element("option", { value: n, textContent: n })));
+    const choice = D.element("select", { ariaLabel: "signal" }, ...this.names.map((n) => D.element("option", { value: n, textContent: this.titled(n) })));
     const columns = D.element("select", { ariaLabel: "column" });
     const close = D.element("button", { textContent: "×", ariaLabel: "remove plot" });
     const canvas = D.element("canvas"), over = D.element("canvas");
@@ -45,6 +45,12 @@ class Plots {
     plot.columns.replaceChildren(D.element("option", { value: "all", textContent: labels.length ? "all" : "–" }),
       ...labels.map((name) => D.element("option", { value: name, textContent: this.called(name) })));
     plot.columns.hidden = !labels.length;
+  }
+
+  // Name and unit of a signal.
+  titled(name) {
+    const { words, unit } = this.actors.map((a) => a.signals.get(name)).find(Boolean);
+    return unit && unit !== "1" ? `${words} [${unit}]` : words;
   }
 
   // Display name of a column: motors of wheels have special names.
@@ -89,9 +95,12 @@ class Plots {
     c.strokeStyle = rule;
     c.lineWidth = 1;
     c.textAlign = "right";
-    for (const v of Plots.ticks(low, high, Math.max(2, area.h / 28))) {
+    const marks = Plots.ticks(low, high, Math.max(2, area.h / 28)), step = marks[1] - marks[0];
+    // As many decimals as distinguish the ticks.
+    const shown = (v) => (Math.abs(v) < 1e5 && step > 1e-4 ? v.toFixed(Math.max(0, -Math.floor(Math.log10(step) + 1e-9))).replace("-", "−") : D.number(v));
+    for (const v of marks) {
       c.beginPath(), c.moveTo(area.x, Math.round(Y(v)) + 0.5), c.lineTo(area.x + area.w, Math.round(Y(v)) + 0.5), c.stroke();
-      c.fillText(D.number(v), area.x - 4, Y(v) + 3);
+      c.fillText(shown(v), area.x - 4, Y(v) + 3);
     }
     c.textAlign = "center";
     for (const t of Plots.ticks(t0, t1, area.w / 60)) {
@@ -109,7 +118,6 @@ class Plots {
     plot.named = Plots.largest(curves, t0, t1, NAMED);
     plot.X = X;
     plot.Y = Y;
-    plot.unit = curves[0]?.unit ?? "";
     this.cursor(plot, this.time ?? t0);
   }
 
@@ -171,7 +179,8 @@ class Plots {
     all.sort((a, b) => a - b);
     const a = all[Math.floor(0.01 * all.length)], b = all[Math.min(all.length - 1, Math.floor(0.99 * all.length))], mid = b - a;
     if (mid > 0 && high - low > 4 * mid) low = Math.max(low, a - 0.6 * mid), high = Math.min(high, b + 0.6 * mid);
-    const room = 0.06 * (high - low) || Math.max(0.05 * Math.abs(high), 1e-9);
+    // A constant with rounding errors is a flat line.
+    const size = Math.max(Math.abs(low), Math.abs(high)), room = high - low > 1e-4 * size ? 0.06 * (high - low) : Math.max(0.05 * size, 1e-9);
     return [low - room, high + room];
   }
 
@@ -205,7 +214,7 @@ class Plots {
     });
     const more = plot.drawn.length - list.length;
     if (more) list.push(D.element("span", { textContent: `… ${more} smaller`, title: "the curves with the largest rms in the visible range are named" }));
-    plot.values.replaceChildren(D.element("b", { textContent: `${plot.unit === "1" ? "" : plot.unit}` }), ...list);
+    plot.values.replaceChildren(...list);
   }
 
   static value({ times, values }, t) {

@@ -57,20 +57,19 @@ S.mesh = function (bytes, mesh) {
   return made;
 };
 
-// A sheet with a grid that fades towards its edge.
-S.sheet = function (half, step, round) {
+// A floor with a grid that fades towards its edge.
+S.sheet = function (half, step) {
   const uniforms = { ground: { value: new THREE.Color() }, lines: { value: new THREE.Color() }, extent: { value: half },
-    cell: { value: step }, disc: { value: round ? 1 : 0 }, strength: { value: 1 } };
+    cell: { value: step }, strength: { value: 1 } };
   const material = new THREE.ShaderMaterial({
     uniforms, transparent: true, side: THREE.DoubleSide, depthWrite: false, extensions: { derivatives: true },
     polygonOffset: true, polygonOffsetFactor: 2, polygonOffsetUnits: 4,
     vertexShader: `varying vec2 at; void main() { at = position.xy;
       gl_Position = projectionMatrix * modelViewMatrix * vec4(position, 1.0); }`,
-    fragmentShader: `varying vec2 at; uniform vec3 ground, lines; uniform float extent, cell, disc, strength;
+    fragmentShader: `varying vec2 at; uniform vec3 ground, lines; uniform float extent, cell, strength;
       float line(vec2 x, float wide) { vec2 w = fwidth(x); vec2 d = abs(fract(x - 0.5) - 0.5) / w;
         float a = 1.0 - min(min(d.x, d.y) / wide, 1.0); return a * (1.0 - smoothstep(0.15, 0.5, max(w.x, w.y))); }
-      void main() { float far = disc > 0.5 ? length(at) / extent : max(abs(at.x), abs(at.y)) / extent;
-        float fade = disc > 0.5 ? 1.0 - smoothstep(0.45, 1.0, far) : 1.0;
+      void main() { float fade = 1.0 - smoothstep(0.45, 1.0, length(at) / extent);
         float rule = max(0.55 * line(at / cell, 1.1), line(at / (5.0 * cell), 1.4));
         gl_FragColor = vec4(mix(ground, lines, rule), fade * strength * (0.55 + 0.45 * rule)); }`,
   });
@@ -95,32 +94,35 @@ S.grid = function (surface) {
   return made;
 };
 
-// A surface other than the floor: translucent, visible from both sides.
-S.surface = function (surface, step) {
-  if (surface.kind === "plane") {
-    const sheet = S.sheet(surface.half, step, true);
-    sheet.quaternion.set(...S.xyzw(surface.q));
-    sheet.position.set(...surface.p);
-    sheet.material.uniforms.strength.value = 0.8;
-    return sheet;
-  }
+// Stencil that marks whether a surface (1) or something else (0) is in front.
+S.stencil = (ref) => ({ stencilWrite: true, stencilRef: ref, stencilZPass: THREE.ReplaceStencilOp });
+
+// A plane as a slab of some thickness below it, which ends at the floor.
+S.slab = function ({ p, q, size }, thick, floor) {
+  const up = new THREE.Vector3(0, 1, 0).applyQuaternion(new THREE.Quaternion(...S.xyzw(q))).z;
+  const low = up > 0.05 ? Math.min(Math.max(-0.5 * size[1], (floor - p[2]) / up), 0.4 * size[1]) : -0.5 * size[1];
+  return new THREE.BoxGeometry(size[0], 0.5 * size[1] - low, thick).translate(0, 0.5 * (0.5 * size[1] + low), -0.5 * thick);
+};
+
+// A surface other than the floor. From a surface that surrounds the robot only the far side is drawn.
+S.surface = function (surface, thick, floor) {
+  const hollow = surface.radius < 0, grid = surface.kind === "grid";
   const geometry = {
+    plane: () => S.slab(surface, thick, floor),
     sphere: () => new THREE.SphereGeometry(Math.abs(surface.radius), 48, 32).rotateX(Math.PI / 2),
-    cylinder: () => new THREE.CylinderGeometry(Math.abs(surface.radius), Math.abs(surface.radius), surface.length, 64, 1, true)
+    cylinder: () => new THREE.CylinderGeometry(Math.abs(surface.radius), Math.abs(surface.radius), surface.length, 64, 1, hollow)
       .rotateX(Math.PI / 2),
     box: () => new THREE.BoxGeometry(...surface.size),
     grid: () => S.grid(surface),
   }[surface.kind]();
-  const solid = surface.kind === "grid" || surface.kind === "box";
-  const material = new THREE.MeshLambertMaterial({ transparent: !solid, opacity: solid ? 1 : 0.45, side: THREE.DoubleSide,
-    depthWrite: solid, polygonOffset: true, polygonOffsetFactor: 1, polygonOffsetUnits: 2 });
+  const material = new THREE.MeshLambertMaterial({ side: grid ? THREE.DoubleSide : hollow ? THREE.BackSide : THREE.FrontSide,
+    polygonOffset: true, polygonOffsetFactor: 1, polygonOffsetUnits: 2, ...S.stencil(1) });
   const made = new THREE.Mesh(geometry, material);
   // Edges make a solid of one colour visible.
-  if (solid) made.add(new THREE.LineSegments(surface.kind === "box" ? new THREE.EdgesGeometry(geometry) : S.ruled(surface),
+  made.add(new THREE.LineSegments(grid ? S.ruled(surface) : new THREE.EdgesGeometry(geometry, 30),
     new THREE.LineBasicMaterial({ transparent: true, opacity: 0.55 })));
   if (surface.q) made.quaternion.set(...S.xyzw(surface.q));
   if (surface.p) made.position.set(...surface.p);
-  made.renderOrder = solid ? 0 : -5;
   return made;
 };
 
@@ -138,13 +140,23 @@ S.ruled = function ({ rows, columns, points }) {
   return made;
 };
 
+// A wall between the viewer and the robot is drawn translucent.
+S.face = function (made, camera) {
+  const { surface, normal } = made.userData, material = made.material;
+  const back = surface.kind === "plane" && made.getWorldPosition(new THREE.Vector3()).sub(camera.position).dot(normal) > 0;
+  if (material.transparent === back) return;
+  Object.assign(material, { transparent: back, opacity: back ? 0.25 : 1, depthWrite: !back, needsUpdate: true });
+};
+
 S.paint = function (made, colours) {
-  if (!made.material.color) return;
-  made.material.color.set(made.children.length ? colours.solid : colours.surface);
+  made.material.color.set(colours.solid);
+  // Light from above hardly reaches walls.
+  const { surface, normal } = made.userData;
+  made.material.emissive.set(colours.solid).multiplyScalar(surface.kind === "plane" ? 0.3 * (1 - Math.abs(normal.z)) : 0);
   for (const edges of made.children) edges.material.color.set(colours.edge);
 };
 
-// Extent of a surface along a horizontal unit vector; a plane is infinite and has no extent.
+// Extent of a surface along a unit vector; a plane is infinite and has no extent.
 S.extent = function (made, way) {
   const { surface } = made.userData, at = made.position.dot(way);
   const across = (k) => Math.abs(new THREE.Vector3().setComponent(k, 1).applyQuaternion(made.quaternion).dot(way));
@@ -162,7 +174,7 @@ S.extent = function (made, way) {
       let low = Infinity, high = -Infinity;
       for (let i = 0; i < surface.points.length; i += 3) {
         if (surface.points[i] === null) continue;
-        const x = surface.points[i] * way.x + surface.points[i + 1] * way.y;
+        const x = surface.points[i] * way.x + surface.points[i + 1] * way.y + surface.points[i + 2] * way.z;
         low = Math.min(low, x), high = Math.max(high, x);
       }
       return low <= high ? [low, high] : [];

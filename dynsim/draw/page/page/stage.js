@@ -3,7 +3,8 @@
 
 class Stage {
   // The box in which everything moves is rotated by the azimuth about z.
-  constructor(canvas, azimuth) {
+  constructor(canvas, azimuth, prepare) {
+    this.prepare = prepare;
     this.azimuth = azimuth;
     this.canvas = canvas;
     // view.html#fine forces full quality (slow) without a graphics card.
@@ -58,7 +59,7 @@ class Stage {
     this.sun.shadow.bias = -0.0005;
     if (this.floor) this.scene.remove(this.floor, this.shade);
     this.step = Stage.round(span / 12);
-    this.floor = S.sheet(1.5 * span, this.step, true);
+    this.floor = S.sheet(1.5 * span, this.step);
     // A grid that is not a surface of the scenario only helps to judge positions.
     this.floor.material.uniforms.strength.value = this.real ? 1 : 0.4;
     // Grid lines are at multiples of the step in the world.
@@ -91,11 +92,8 @@ class Stage {
   dress(colours) {
     this.colours = colours;
     this.scene.background = new THREE.Color(colours.fog);
-    for (const sheet of [this.floor, ...(this.sheets ?? [])]) {
-      if (!sheet) continue;
-      sheet.material.uniforms.ground.value.set(colours.ground);
-      sheet.material.uniforms.lines.value.set(colours.gridline);
-    }
+    this.floor?.material.uniforms.ground.value.set(colours.ground);
+    this.floor?.material.uniforms.lines.value.set(colours.gridline);
     this.touch();
   }
 
@@ -103,8 +101,8 @@ class Stage {
   look(preset) {
     this.preset = preset;
     // The longest extent of the robot, x before the rotation by the azimuth, is horizontal.
-    // A row of variants is viewed more from the front; otherwise its end would be far away.
-    const from = { iso: this.row ? [-0.22, -1, 0.42] : [-0.5, -1, 0.5], side: [0, -1, 0.06], front: [1, 0, 0.06], top: [0, -0.001, 1] }[preset];
+    // A row of variants is viewed more from the front; otherwise its end would be far away. Several rows are viewed from above.
+    const from = { iso: this.rows ? [-0.3, -1, 1.1] : this.row ? [-0.22, -1, 0.42] : [-0.5, -1, 0.5], side: [0, -1, 0.06], front: [1, 0, 0.06], top: [0, -0.001, 1] }[preset];
     const back = this.turned(new THREE.Vector3(...from).normalize()), centre = this.centre();
     const right = new THREE.Vector3().crossVectors(this.camera.up, back).normalize();
     const up = new THREE.Vector3().crossVectors(back, right);
@@ -156,6 +154,7 @@ class Stage {
 
   draw() {
     this.changed = false;
+    this.prepare(this.camera);
     this.renderer.render(this.scene, this.camera);
   }
 }
