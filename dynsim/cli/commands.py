@@ -44,6 +44,8 @@ from dynsim.cli.export import export
 from dynsim.cli.hardware import EXAMPLE, IMPORT_EXAMPLE, hw, hw_drive, import_recording
 from dynsim.cli.plan import EXAMPLE as PLAN_EXAMPLE
 from dynsim.cli.plan import plan
+from dynsim.cli.pose import EXAMPLE as POSE_EXAMPLE
+from dynsim.cli.pose import pose, view_starts
 from dynsim.cli.sweep import sweep
 from dynsim.cli.tables import (
     console,
@@ -69,6 +71,7 @@ from dynsim.system.terminal import escaped
 if TYPE_CHECKING:
     from dynsim.engine import Start
     from dynsim.record import Record
+    from dynsim.scenario import Scenario
 
 
 @app.command(epilog="Example: dynsim run elbow_comparison --variant two_elbows --set integrator.rtol=1e-8")
@@ -207,12 +210,19 @@ def check(
         ),
     ],
     overrides: SetOption = None,
+    view: Annotated[
+        bool,
+        typer.Option(
+            "--view", help="Open a 3D page of the start postures; it is written to results/SCENARIO/start.html."
+        ),
+    ] = False,
 ) -> None:
     """Validate scenarios without simulating them: keys, model, contacts at the start, reachable references.
 
     For each variant, the command prints the start position of the hand and of each contact point (in full precision,
     ready to be copied into a path or surface), the gap at each contact, the joints that `initial` moved, the joints
-    that start at a limit because no position is set, and the tip margin of a mobile base at rest.
+    that start at a limit because no position is set, and the tip margin of a mobile base at rest. `dynsim pose` changes
+    a start posture.
     """
     from dynsim.engine import check as check_scenario
     from dynsim.engine.compilation import watched
@@ -221,12 +231,14 @@ def check(
     failed = False
     for name in scenarios:
         starts: dict[str, Start] = {}
+        loadable: list[Scenario] = []
         try:
             variants: Sequence[str | None] = variant_names(name) or [None]
             for variant in variants:
                 task = f"checking {escaped(name)} {escaped(variant or '')}"
                 with console.status(task) as status, watched(partial(show_compilation, status, task)):
                     loaded = load_scenario(name, variant, parsed_overrides(overrides))
+                    loadable.append(loaded)
                     # Stored early, so that the start is printed even if a later check fails.
                     starts[variant or ""] = check_scenario(loaded, partial(starts.__setitem__, variant or ""))
         except SimulationInterrupted:
@@ -241,6 +253,8 @@ def check(
             print_line(f"{escaped(name)}: ok ({count})")
             print_starts(console, starts)
             warn_about_meshes(start.scene for start in starts.values())
+        if view and loadable:
+            view_starts(loadable)
     _warn_about_plugins()
     if failed:
         raise typer.Exit(2)
@@ -282,6 +296,7 @@ def plot(
 
 
 app.command(epilog=PLAN_EXAMPLE)(plan)
+app.command(epilog=POSE_EXAMPLE)(pose)
 app.command(epilog="Example: dynsim teleop snake_operator --speed 0.2")(teleop)
 app.command(epilog="Example: dynsim view results/elbow_comparison/*/record.h5 --ghost")(view)
 app.command(epilog="Example: dynsim animate results/elbow_comparison/two_elbows --out film.gif --view side")(animate)

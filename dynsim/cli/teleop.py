@@ -33,7 +33,7 @@ BaseSpeedOption = Annotated[float, option("M/S", "Maximum speed of the mobile ba
 LongestOption = Annotated[float, option("S", "Maximum duration [s].", min=1.0, max=36000.0)]
 HttpPortOption = Annotated[int, option("N", "Local port of the web page; 0 picks a free one.", min=0, max=65535)]
 UntilClosedOption = Annotated[
-    bool, typer.Option("--until-closed", help="End the drive also when the last browser window is closed.")
+    bool, typer.Option("--until-closed", help="End also when the last browser window is closed.")
 ]
 OpenOption = Annotated[bool, typer.Option("--open/--no-open", help="Open the web page in a browser.")]
 
@@ -105,9 +105,9 @@ def require(extra: str, *packages: str) -> None:
             raise DynsimError(f"{package} is not installed: pip install 'dynsim[{extra}]'")
 
 
-def print_address(address: str, ending: str, *, open_: bool) -> None:
-    """Print the address of the page, even with --quiet, because the user needs it to drive."""
-    print_line(f"Drive in a browser on this machine: {address}")
+def print_address(address: str, ending: str, *, open_: bool, action: str = "Drive") -> None:
+    """Print the address of the page, even with --quiet, because the user needs it."""
+    print_line(f"{action} in a browser on this machine: {address}")
     console.print(ending, highlight=False)
     if open_:
         open_address(address)

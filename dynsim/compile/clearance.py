@@ -104,7 +104,7 @@ def sinking(robot: Robot, surfaces: Mapping[str, Surface], q: Array) -> list[Sin
         return sunk
     # The last samples of a diverged run may overflow when squared.
     with np.errstate(over="ignore", invalid="ignore"):
-        for link, name, gap in _axis_gaps(robot, surfaces, q):
+        for link, name, gap in axis_gaps(robot, surfaces, q):
             if gap.min() >= -link.radius - SLACK:
                 continue
             depth = np.where(np.isfinite(gap), -gap, -np.inf)
@@ -119,7 +119,7 @@ def by_surface(sunk: Sequence[Sinking]) -> dict[str, list[Sinking]]:
     return {surface: [s for s in sunk if s.surface == surface] for surface in dict.fromkeys(s.surface for s in sunk)}
 
 
-def _axis_gaps(robot: Robot, surfaces: Mapping[str, Surface], q: Array) -> Iterator[tuple[Link, str, Array]]:
+def axis_gaps(robot: Robot, surfaces: Mapping[str, Surface], q: Array) -> Iterator[tuple[Link, str, Array]]:
     """Yield the minimum distance of each body's axes from each surface, (T,) [m]."""
     tips, carriers = axis_ends(robot), robot.carriers
     for link, R, p in poses(robot, q):

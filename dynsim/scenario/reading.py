@@ -218,7 +218,7 @@ class ScenarioFile:
             raise ScenarioError(f"{self.path}{line}: variant {value_text(variant)} must be a mapping of differences")
         overriding = "--set" if isinstance(overrides, SetOptions) else "overrides"
         origin = Origin(self.path, (difference, shared), tuple(overrides), overriding)
-        merged = _plain(_merge(shared, difference))
+        merged = _plain(merged_with(shared, difference))
         for key, value in overrides.items():
             _override(merged, key, _plain(value), overriding, variant)
         if merged.get("name") in (None, ""):
@@ -305,16 +305,16 @@ def _plain(value: Any) -> Any:
     return str(value)
 
 
-def _merge(base: Any, difference: Any) -> Any:
+def merged_with(base: Any, difference: Any) -> Any:
     """Merge ``difference`` into ``base``: mappings merge, null removes, other values replace."""
     if not (isinstance(base, Mapping) and isinstance(difference, Mapping)):
         return difference
-    merged = {key: _merge(value, {}) if isinstance(value, Mapping) else value for key, value in base.items()}
+    merged = {key: merged_with(value, {}) if isinstance(value, Mapping) else value for key, value in base.items()}
     for key, value in difference.items():
         if value is None:
             merged.pop(key, None)
         else:
-            merged[key] = _merge(merged.get(key), value)
+            merged[key] = merged_with(merged.get(key), value)
     return merged
 
 

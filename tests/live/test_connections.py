@@ -18,7 +18,9 @@ from dynsim.teleop.web.server import MAX_ACCEPTED, Server, _ListeningSocket
 
 @pytest.mark.parametrize("wrong", [False, True])
 def test_all_headers_of_an_answer(wrong: bool) -> None:
-    server = Server(Deadman((), time.monotonic), {}, 0, (), lambda socket: "page", lambda: None)
+    server = Server(
+        deadman=Deadman((), time.monotonic), hello={}, axes=0, modes=(), page=lambda socket: "page", end=lambda: None
+    )
     server.start()
     try:
         connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=30)
@@ -49,7 +51,9 @@ import http.client, logging, resource, socket, sys, time
 from dynsim.teleop.web.pilot import Deadman
 from dynsim.teleop.web.server import Server
 logging.basicConfig(format="%(message)s")
-server = Server(Deadman((), time.monotonic), {}, 0, (), lambda socket: "page", lambda: None)
+server = Server(
+    deadman=Deadman((), time.monotonic), hello={}, axes=0, modes=(), page=lambda socket: "page", end=lambda: None
+)
 server.start()
 idle = [socket.create_connection(("127.0.0.1", server.port)) for _ in range(int(sys.argv[1]))]
 connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=60)

@@ -27,9 +27,12 @@ def prepare_child() -> None:
 class Teleop:
     """Process of ``dynsim teleop``, or of another command with its page, and the address that it prints."""
 
-    def __init__(self, folder: Path, *arguments: str, command: Sequence[str] = ("teleop",)) -> None:
+    def __init__(
+        self, folder: Path, *arguments: str, command: Sequence[str] = ("teleop",), writes: bool = True
+    ) -> None:
         self.folder = folder
-        command = [sys.executable, "-m", "dynsim", *command, *arguments, "--no-open", "--out", str(folder)]
+        out = ["--out", str(folder)] if writes else []
+        command = [sys.executable, "-m", "dynsim", *command, *arguments, "--no-open", *out]
         self.process = subprocess.Popen(
             command,
             stdout=subprocess.PIPE,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -42,6 +42,12 @@ class Config(HandPathConfig):
         return np.array(self.center_m) + self.radius_m * (
             np.outer(np.cos(angle), first) + np.outer(np.sin(angle), second)
         )
+
+
+def starting_at(config: Config, point: list[float]) -> dict[str, Any]:
+    """Return the keys of the circle, shifted so that it starts at a point [m]."""
+    shift = np.array(point) - config.position(np.zeros(1))[0]
+    return {"center_m": (np.array(config.center_m) + shift).tolist()}
 
 
 def build(config: Config, context: BuildContext) -> HandPath:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -27,6 +27,11 @@ class Config(HandPathConfig):
         """Return a + (b − a) s(x) with s = 10x³ − 15x⁴ + 6x⁵ at times t [s], shape (T, 3) [m]."""
         a, b = np.array(self.from_m), np.array(self.to_m)
         return a + np.outer(minimum_jerk(t, self.start_s, self.duration_s), b - a)
+
+
+def starting_at(config: Config, point: list[float]) -> dict[str, Any]:
+    """Return the keys of a line that starts at a point [m]."""
+    return {"from_m": point}
 
 
 def build(config: Config, context: BuildContext) -> HandPath:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -29,6 +29,11 @@ class Config(HandPathConfig):
     def position(self, t: Array) -> Array:
         """Return the positions at times t [s], shape (T, 3) [m]."""
         return clamped_cubic(self.times_s, np.array(self.points_m), t)
+
+
+def starting_at(config: Config, point: list[float]) -> dict[str, Any]:
+    """Return the keys of a path whose first point is moved to another point [m]."""
+    return {"points_m": [point, *config.points_m[1:]]}
 
 
 def build(config: Config, context: BuildContext) -> HandPath:

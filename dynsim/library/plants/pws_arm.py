@@ -6,6 +6,7 @@ The wheels roll without slip ([WM] II.E, eqs 36–50).
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, Literal, Self
 
@@ -183,6 +184,16 @@ def build(config: Config, context: BuildContext) -> Robot:
             stop_on_overturn=base.on_overturn == "stop",
         ),
     )
+
+
+def start_keys(config: Config, positions: Mapping[str, float]) -> dict[str, Any]:
+    """Return the keys that start the robot at the given coordinates [rad or m], with unwound wheels."""
+    base, yaw = config.base, math.radians(config.base.heading_deg)
+    left, right, x, y = (positions[f"{BASE}.{name}"] for name in ("left", "right", "x", "y"))
+    heading = base.heading_deg + math.degrees(base.wheel.radius_m / base.track_m * (right - left))
+    position = np.array(base.position_m) + _turn(yaw)[:2, :2] @ [x, y]
+    arm = families.member("plant", config.arm.type).start_keys(config.arm, positions)
+    return {"base": {"position_m": position.tolist(), "heading_deg": heading}, "arm": arm}
 
 
 def _body(base: Base) -> Inertia:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -259,3 +260,18 @@ def build(config: Config, context: BuildContext) -> Robot:
         q0=np.array(initial),
         nearest=tuple(nearest),
     )
+
+
+def start_keys(config: Config, positions: Mapping[str, float]) -> dict[str, Any]:
+    """Return the keys that start the chain at the given joint positions [rad or m]."""
+    at = iter(range(1, sum(group.count for group in config.chain) + 1))
+    groups = [(group, [positions[f"joint_{next(at)}"] for _ in range(group.count)]) for group in config.chain]
+    if all(group.kind == "revolute" for group, _ in groups):
+        return {"initial_deg": np.rad2deg([angle for _, values in groups for angle in values]).tolist()}
+    chain = []
+    for group, values in groups:
+        entry = {key: value for key, value in group.model_dump(exclude_unset=True).items() if key != "count"}
+        sliding = group.kind == "prismatic"
+        chain += [entry | ({"initial_m": x} if sliding else {"initial_deg": float(np.rad2deg(x))}) for x in values]
+    # The entries include the defaults of `link`.
+    return {"chain": chain} | ({} if config.link is None else {"link": None})

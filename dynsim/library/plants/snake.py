@@ -212,6 +212,15 @@ def build(config: Config, context: BuildContext) -> SnakeDescription | SnakeTree
     )
 
 
+def start_keys(config: Config, positions: Mapping[str, float]) -> dict[str, Any]:
+    """Return the keys for a start at the given joint angles [rad], and x, y [m] and yaw [rad] of the base part."""
+    names = describe(config).joint_names
+    angles = [positions[name] for name in names]
+    count = len(names) if any(angles[config.head_joints :]) else config.head_joints
+    pose = [positions[f"base.{name}"] for name in ("x", "y", "yaw")]
+    return {"initial_joints_rad": angles[:count], "initial_base_pose": pose}
+
+
 def _stop(kind: str, stop_deg: float | None, limit_deg: float) -> float:
     """Return the stop of yaw or pitch joints [rad]; raise ModelError if it is within the limit of the commands."""
     if stop_deg is None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
 
@@ -280,3 +281,34 @@ def _initial(robot: Robot, positions: dict[str, float], poses: dict[str, PoseCon
                 raise ModelError(f"{path}.{key}: must lie in the plane of the joint (normal {normal.tolist()})")
         q[index[rows[0]] : index[rows[0]] + 3] = x @ p, y @ p, np.arctan2(y @ R @ x, x @ R @ x)
     return q
+
+
+def start_keys(config: Config, positions: Mapping[str, float]) -> dict[str, Any]:
+    """Return the keys that start the robot at the given coordinates [rad, m, or 1 for quaternions].
+
+    Joints without a position, such as followers, are omitted.
+    """
+    from dynsim.model.joints.planar import planar
+    from dynsim.model.urdf.reader import MOVING, read_tree
+    from dynsim.record.quaternion import of_turn
+    from dynsim.record.urdf_text import roll_pitch_yaw, rotation
+
+    keys: dict[str, dict[str, Any]] = {"initial_deg": {}, "initial_m": {}, "initial_pose": {}}
+    for name, joint in read_tree(Path(config.file), config.corrections()).joints.items():
+        if name in positions:
+            angle = MOVING[joint.kind] == "revolute"
+            value = float(np.rad2deg(positions[name])) if angle else positions[name]
+            keys["initial_deg" if angle else "initial_m"][name] = value
+            continue
+        if f"{name}.x" not in positions:
+            continue
+        if joint.kind == "planar":
+            x, y, normal = (row.axis for row in planar(joint.link))
+            point = positions[f"{name}.x"] * x + positions[f"{name}.y"] * y
+            turn = of_turn(normal, positions[f"{name}.angle"])
+        else:
+            point = np.array([positions[f"{name}.{axis}"] for axis in "xyz"])
+            turn = np.array([positions[f"{name}.q{part}"] for part in "wxyz"])
+        rpy = np.rad2deg(roll_pitch_yaw(rotation(turn))).tolist()
+        keys["initial_pose"][name] = {"position_m": point.tolist(), "rpy_deg": rpy}
+    return {key: values for key, values in keys.items() if values}

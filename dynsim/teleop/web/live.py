@@ -14,6 +14,7 @@ import numpy as np
 
 from dynsim.draw.page import page
 from dynsim.errors import DynsimError, SimulationStopped
+from dynsim.record import Record
 from dynsim.record.quaternion import rotated
 from dynsim.record.scene import WORLD
 from dynsim.snake.description import NO_REQUEST
@@ -142,7 +143,14 @@ class LiveDrive:
             "gripper": session.has_gripper,
             "period": session.period,
         }
-        self.server = Server(self.deadman, hello, len(session.axes), session.modes, self._page, self.end)
+        self.server = Server(
+            deadman=self.deadman,
+            hello=hello,
+            axes=len(session.axes),
+            modes=session.modes,
+            page=self._page,
+            end=self.end,
+        )
         self.report = DriveReport()
 
     def open(self, port: int = 0) -> str:
@@ -275,8 +283,12 @@ class LiveDrive:
         return forces
 
     def _page(self, socket: str) -> str:
-        own = resources.files("dynsim.teleop.web").joinpath("page")
-        style = own.joinpath("drive.css").read_text(encoding="utf-8")
-        program = own.joinpath("drive.js").read_text(encoding="utf-8")
-        constants = f"const DRIVE = {json.dumps({'socket': socket, 'style': style})};"
-        return page({self.name: self.session.still}, scripts=[f"{constants}\n{program}"], connect=socket)
+        return live_page("drive", self.name, self.session.still, socket)
+
+
+def live_page(program: str, name: str, still: Record, socket: str) -> str:
+    """Return the page of a record with one of the programs ``drive`` and ``pose``, which connects to the socket."""
+    own = resources.files("dynsim.teleop.web").joinpath("page")
+    style, text = (own.joinpath(f"{program}.{kind}").read_text(encoding="utf-8") for kind in ("css", "js"))
+    constants = f"const DRIVE = {json.dumps({'socket': socket, 'style': style})};"
+    return page({name: still}, scripts=[f"{constants}\n{text}"], connect=socket)

@@ -68,16 +68,7 @@ def parse(text: str | bytes, axes: int, modes: tuple[int, ...]) -> PilotCommand 
     Refused
         If the message is not valid.
     """
-    if not isinstance(text, str):
-        raise Refused("binary message; send text")
-    try:
-        message = json.loads(text, parse_constant=_reject_constant)
-    except Refused:
-        raise
-    except (ValueError, RecursionError):
-        raise Refused("not valid JSON") from None
-    if not isinstance(message, dict):
-        raise Refused("not a JSON object")
+    message = parse_object(text)
     if set(message) == {"do"}:
         if message["do"] not in ACTIONS:
             raise Refused(f"do: must be one of {', '.join(ACTIONS)}")
@@ -91,6 +82,27 @@ def parse(text: str | bytes, axes: int, modes: tuple[int, ...]) -> PilotCommand 
         request=_request(message.get("mode"), modes),
         closed=_flag(message, "closed"),
     )
+
+
+def parse_object(text: str | bytes) -> dict[str, Any]:
+    """Parse a JSON object with finite numbers; raise Refused if the message is not valid."""
+    if not isinstance(text, str):
+        raise Refused("binary message; send text")
+    try:
+        message = json.loads(text, parse_constant=_reject_constant)
+    except Refused:
+        raise
+    except (ValueError, RecursionError):
+        raise Refused("not valid JSON") from None
+    if not isinstance(message, dict):
+        raise Refused("not a JSON object")
+    return message
+
+
+def finite(value: Any) -> bool:
+    """Return whether a value is a finite number; an integer may be too large for a float."""
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    return number and (isinstance(value, int) or math.isfinite(value))
 
 
 def _reject_constant(name: str) -> NoReturn:
@@ -110,11 +122,7 @@ def _axes(values: Any, count: int) -> tuple[float, ...]:
     axes = []
     for value in values:
         # An integer may have thousands of digits, and a float may have overflowed to infinity.
-        if (
-            isinstance(value, bool)
-            or not isinstance(value, int | float)
-            or not (isinstance(value, int) or math.isfinite(value))
-        ):
+        if not finite(value):
             raise Refused("axes: must be finite numbers")
         axes.append(round(STEPS * max(-1.0, min(1.0, value))) / STEPS)
     return tuple(axes)

@@ -1,4 +1,4 @@
-"""Server of a drive: page by HTTP, commands and frames by web socket, on this machine only.
+"""Servers of live pages: page by HTTP, commands and frames by web socket, on this machine only.
 
 All users of the machine, and all web pages in a browser on it, can reach the loopback address. Therefore the path
 contains a token, ``Host`` must be this server (against DNS rebinding), and the ``Origin`` of a web socket must be the
@@ -110,38 +110,25 @@ class _Client:
     messages: int = 0
 
 
-@dataclass(eq=False)
-class Server:
-    """Server that runs in a separate thread from :meth:`start` to :meth:`stop`.
+@dataclass(eq=False, kw_only=True)
+class PageServer:
+    """Server of one page and its web sockets; it runs in a separate thread from :meth:`start` to :meth:`stop`.
 
     Parameters
     ----------
-    deadman : Deadman
-        Dead-man switch that receives the commands from the pilot.
     hello : mapping
         First message to each client.
-    axes : int
-        Number of axes of the robot.
-    modes : tuple of int
-        Modes that a pilot may request.
     page : callable
         Function that returns the page; its argument is the address of the web socket.
-    end : callable
-        Function that is called when the pilot ends the drive.
     """
 
-    deadman: Deadman
     hello: Mapping[str, Any]
-    axes: int
-    modes: tuple[int, ...]
     page: Callable[[str], str]
-    end: Callable[[], None]
     token: str = field(default_factory=lambda: secrets.token_urlsafe(24))
     port: int = 0
     failure: BaseException | None = None
     had_clients: bool = False
     _clients: dict[ServerConnection, _Client] = field(default_factory=dict)
-    _pilot: _Client | None = None
     _frame: str = ""
     _loop: asyncio.AbstractEventLoop | None = None
     _thread: threading.Thread | None = None
@@ -268,7 +255,9 @@ class Server:
         sender: asyncio.Task[None] | None = None
         try:
             await socket.send(json.dumps({"hello": dict(self.hello)}))
-            await self._send_roles()
+            await self._joined()
+            if self._frame:
+                client.new_frame.set()
             sender = asyncio.create_task(self._send(client))
             async for message in socket:
                 if not self._count(client):
@@ -281,9 +270,7 @@ class Server:
             del self._clients[socket]
             if sender is not None:
                 sender.cancel()
-            if self._pilot is client:
-                self._release()
-                await self._send_roles()
+            await self._left(client)
 
     def _count(self, client: _Client) -> bool:
         assert self._loop is not None
@@ -294,36 +281,24 @@ class Server:
         return client.messages <= MAX_MESSAGES
 
     async def _handle(self, client: _Client, message: str | bytes) -> None:
+        """Handle a message; close the connection after too many invalid messages."""
         try:
-            parsed = parse(message, self.axes, self.modes)
+            await self._receive(client, message)
         except Refused as reason:
             client.refused += 1
             await client.socket.send(json.dumps({"refused": str(reason)}))
             if client.refused >= MAX_REFUSED:
                 await client.socket.close(1008, "too many invalid messages")
-            return
-        if parsed == "take" and self._pilot is None:
-            self._pilot = client
-            await self._send_roles()
-        elif client is not self._pilot:
-            return
-        elif isinstance(parsed, PilotCommand):
-            self.deadman.receive(parsed)
-        elif parsed == "leave":
-            self._release()
-            await self._send_roles()
-        elif parsed == "end":
-            self.end()
 
-    def _release(self) -> None:
-        self._pilot = None
-        self.deadman.reset()
+    async def _receive(self, client: _Client, message: str | bytes) -> None:
+        """Handle a message; raise Refused if it is not valid."""
+        raise NotImplementedError
 
-    async def _send_roles(self) -> None:
-        for client in list(self._clients.values()):
-            role = "pilot" if client is self._pilot else "watching"
-            with suppress(ConnectionClosed):
-                await client.socket.send(json.dumps({"role": role, "free": self._pilot is None}))
+    async def _joined(self) -> None:
+        """Inform the clients that another client has connected."""
+
+    async def _left(self, client: _Client) -> None:
+        """Inform the other clients that a client has disconnected."""
 
     async def _send(self, client: _Client) -> None:
         """Send the newest frame whenever a new frame is available."""
@@ -333,6 +308,55 @@ class Server:
                 client.new_frame.clear()
                 await client.socket.send(self._frame)
                 await asyncio.sleep(1.0 / FRAMES)
+
+
+@dataclass(eq=False, kw_only=True)
+class Server(PageServer):
+    """Server of a drive: one client is the pilot, the others watch.
+
+    Parameters
+    ----------
+    deadman : Deadman
+        Dead-man switch that receives the commands from the pilot.
+    axes : int
+        Number of axes of the robot.
+    modes : tuple of int
+        Modes that a pilot may request.
+    end : callable
+        Function that is called when the pilot ends the drive.
+    """
+
+    deadman: Deadman
+    axes: int
+    modes: tuple[int, ...]
+    end: Callable[[], None]
+    _pilot: _Client | None = None
+
+    async def _receive(self, client: _Client, message: str | bytes) -> None:
+        parsed = parse(message, self.axes, self.modes)
+        if parsed == "take" and self._pilot is None:
+            self._pilot = client
+            await self._joined()
+        elif client is not self._pilot:
+            return
+        elif isinstance(parsed, PilotCommand):
+            self.deadman.receive(parsed)
+        elif parsed == "leave":
+            await self._left(client)
+        elif parsed == "end":
+            self.end()
+
+    async def _left(self, client: _Client) -> None:
+        if self._pilot is client:
+            self._pilot = None
+            self.deadman.reset()
+            await self._joined()
+
+    async def _joined(self) -> None:
+        for client in list(self._clients.values()):
+            role = "pilot" if client is self._pilot else "watching"
+            with suppress(ConnectionClosed):
+                await client.socket.send(json.dumps({"role": role, "free": self._pilot is None}))
 
 
 def _answer(status: http.HTTPStatus, body: bytes = b"") -> Response:

@@ -116,7 +116,14 @@ def _server() -> Any:
     from dynsim.teleop.web.pilot import Deadman
     from dynsim.teleop.web.server import Server
 
-    server = Server(Deadman(_axes(), lambda: 0.0), {"robot": "x"}, AXES, MODES, lambda address: "page", lambda: None)
+    server = Server(
+        deadman=Deadman(_axes(), lambda: 0.0),
+        hello={"robot": "x"},
+        axes=AXES,
+        modes=MODES,
+        page=lambda address: "page",
+        end=lambda: None,
+    )
     server.start()
     return server
 
