@@ -48,6 +48,8 @@ AXIS_POINTS = 17
 """Number of points on the axis of a body among which a new brace is chosen."""
 PATH_SAMPLES = 200
 """Number of points of the drawn hand path."""
+FLAT = 90
+"""Maximum length of a mapping in one line of the copied text."""
 DECIMALS = {"_deg": 8, "_m": 10, "_rad": 10, "initial_base_pose": 10}
 """Decimal places of positions in the copied text, by the end of the key; they change a gap by less than 1 nm."""
 
@@ -498,8 +500,8 @@ class ArmPosture(StartPosture):
             )
         ends = [end for end in axis_ends(self.robot)[body] if np.linalg.norm(end) > 0.0] or [np.zeros(3)]
         candidates = [share * end for end in ends for share in np.linspace(0.0, 1.0, AXIS_POINTS)]
-        places = [self.model.point_position(body, point, self.q) for point in candidates]
-        nearest = candidates[int(np.argmin([surfaces[surface].gap(place) for place in places]))]
+        positions = [self.model.point_position(body, point, self.q) for point in candidates]
+        nearest = candidates[int(np.argmin([surfaces[surface].gap(position) for position in positions]))]
         name, count = f"{body}_{surface}", 1
         while name in self.points:
             count += 1
@@ -555,13 +557,13 @@ class ArmPosture(StartPosture):
         return [load for load in loads if load.body in self.robot.bodies]
 
     def _details(self, poses: Array) -> dict[str, Any]:
-        rest, reason = self._rest()
+        balance, reason = self._rest()
         gaps, index = self.gaps(), self.robot.joint_names.index
         points = []
         for name, contact in self.points.items():
             body, point = self.robot.attach(contact.body, contact.point)
             at = self.model.point_position(contact.body, contact.point, self.q)
-            force = rest.normal_forces.get(name)
+            force = balance.normal_forces.get(name)
             points.append(
                 {
                     "name": name,
@@ -584,7 +586,7 @@ class ArmPosture(StartPosture):
         ]
         torques = {
             joint: [
-                round(float(rest.torques[index(joint)]), 6),
+                round(float(balance.torques[index(joint)]), 6),
                 *(round(x, 6) if np.isfinite(x) else None for x in most),
             ]
             for joint, most in self._ratings.items()
@@ -596,15 +598,15 @@ class ArmPosture(StartPosture):
             "torques": torques,
             "units": {link.joint: link.units[3] for link in self.robot.links},
             "rest": reason,
-            "margin": self._margin(rest),
+            "margin": self._margin(balance),
         }
 
-    def _margin(self, rest: Rest) -> float | None:
+    def _margin(self, balance: Rest) -> float | None:
         """Return the tip margin of a mobile base at rest, with its braces; None without a mobile base."""
         if self.robot.base is None:
             return None
         forces = load_forces(self.model, self.q, self._loads())
-        return round(static_margin(self.model, self.q, [*forces, *rest.forces]), 4)
+        return round(static_margin(self.model, self.q, [*forces, *balance.forces]), 4)
 
     # Keys of the scenario.
 
@@ -665,9 +667,11 @@ class ArmPosture(StartPosture):
         for name, gap in self.gaps().items():
             contact = self.points[name]
             at = self.model.point_position(contact.body, contact.point, self.q)
-            notes["contacts", "points", name] = f"at {_flow(np.round(at, 6).tolist())} m, gap {1e3 * gap:+.4f} mm"
+            notes["contacts", "points", name] = (
+                f"at {_flow((np.round(at, 6) + 0.0).tolist())} m, gap {1e3 * round(gap, 7) + 0.0:+.4f} mm"
+            )
         off = 1e3 * float(np.linalg.norm(self._off_path()))
-        return notes | {("controller", "hand", "path"): f"moved by {off:.4g} mm to the hand"}
+        return notes | {("controller", "hand", "path"): f"moved by {off:.4g} mm, to start at the hand"}
 
     def _off_path(self) -> Array:
         """Return the vector from the hand to the start of its path, (3,) [m]; zero without a path."""
@@ -813,20 +817,19 @@ def _decimals(key: str) -> int:
 
 
 def yaml_text(keys: Mapping[str, Any], notes: Mapping[tuple[str, ...], str], above: tuple[str, ...] = ()) -> str:
-    """Return keys as YAML text; ``notes`` are comments by key. Mappings at the third level are in one line."""
+    """Return keys as YAML text; ``notes`` are comments above keys. Mappings at the third level are in one line."""
     lines = []
     for key, value in keys.items():
         at, indent = (*above, str(key)), "  " * len(above)
-        note = f"   # {notes[at]}" if at in notes else ""
-        deep = len(at) < 3 and isinstance(value, Mapping) and value
-        if isinstance(value, list) and value and isinstance(value[0], Mapping):
-            lines += [f"{indent}{_plain(key)}:{note}\n", *(f"{indent}  - {_flow(item)}\n" for item in value)]
-            continue
-        flow = _flow(value)
-        if deep and not (len(at) == 2 and len(flow) < 90 and not any(isinstance(x, Mapping) for x in value.values())):
-            lines += [f"{indent}{_plain(key)}:{note}\n", yaml_text(value, notes, at)]
+        flow, start = _flow(value), f"{indent}{_plain(key)}:"
+        lines += [f"{indent}# {notes[at]}\n"] if at in notes else []
+        nested = isinstance(value, Mapping) and any(isinstance(item, Mapping) for item in value.values())
+        if isinstance(value, Mapping) and value and (len(at) == 1 or (len(at) == 2 and (nested or len(flow) > FLAT))):
+            lines += [f"{start}\n", yaml_text(value, notes, at)]
+        elif isinstance(value, list) and value and isinstance(value[0], Mapping):
+            lines += [f"{start}\n", *(f"{indent}  - {_flow(item)}\n" for item in value)]
         else:
-            lines.append(f"{indent}{_plain(key)}: {flow}{note}\n")
+            lines.append(f"{start} {flow}\n")
     return "".join(lines)
 
 

@@ -122,11 +122,9 @@ def test_sliders_of_base_and_attitude_are_copied(name: str, variant: str, tmp_pa
     values = other.frame()["values"]
     assert any(value for name, value in values.items() if "." in name)
     assert values == pytest.approx(before["values"], abs=1e-6)
-    # Wheels turn differently; their poses are not part of the start.
-    wheels = 7 * len(posture.scene.base[1:])
-    poses = [np.array(one["poses"])[: len(one["poses"]) - wheels] for one in (before, other.frame())]
-    if not wheels:
-        assert poses[0] == pytest.approx(poses[1], abs=2e-6)
+    # The wheels of a base, which are the last bodies, start at the angle zero.
+    count = 7 * (len(posture.scene.bodies) - len(posture.scene.base[1:]))
+    assert before["poses"][:count] == pytest.approx(other.frame()["poses"][:count], abs=2e-6)
 
 
 def test_hand_target_keeps_braces_and_orientation() -> None:
@@ -195,7 +193,7 @@ def test_new_brace_is_copied_touches_after_snap_and_is_undone(tmp_path: Path) ->
     posture.add_brace("link_8", "floor")
     posture.snap("link_8_floor")
     frame = posture.frame()
-    (point,) = [one for one in frame["points"] if one["name"] == "link_8_floor"]
+    (point,) = [entry for entry in frame["points"] if entry["name"] == "link_8_floor"]
     assert point["gap"] == pytest.approx(0.0, abs=1e-9)
     assert point["force"] > 0.1
     start = check(pasted(posture._original, "".join(frame["text"].values()), tmp_path))
@@ -280,3 +278,9 @@ def test_invalid_messages_of_a_page_are_refused(text: str | bytes) -> None:
     with pytest.raises(Refused):
         parse_change(text)
     assert parse_change('{"do": "set", "name": "x", "value": 1}')["value"] == 1
+
+
+def test_plant_without_start_keys_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr("dynsim.library.plants.serial_arm.start_keys")
+    with raises(DynsimError, "serial_arm", "start_keys", "docs/extending.md"):
+        opened("single_pendulum")

@@ -43,6 +43,9 @@ TABLES = [
                 "drive of an arm whose hand nothing moves",
                 "teleop elbow_comparison --no-open --set controller.hand=null",
             ),
+            ("posture of a file that does not exist", "pose nonsense.yaml --no-open"),
+            ("posture of a file with a mistake", "pose case.yaml --no-open"),
+            ("posture of a variant that does not exist", "pose two.yaml --variant medium --no-open"),
             ("drive into a file", "teleop elbow_comparison --no-open --out case.yaml"),
             (
                 "run that makes no progress",

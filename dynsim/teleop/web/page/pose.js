@@ -90,8 +90,8 @@ class Pose {
     this.target = ["x", "y", "z"].map((axis) => D.element("input", { type: "number", step: 0.005, title: `${axis} of the hand [m]` }));
     this.target.forEach((input, k) => { input.dataset.name = `hand.${"xyz"[k]}`; input.oninput = () => { this.typed = true; }; });
     const tick = (text, title, checked) => { const box = D.element("input", { type: "checkbox", checked }); return [box, D.element("label", { title }, box, ` ${text}`)]; };
-    const [braces, bracesLabel] = tick("keep braces", "contact points that touch stay on their surfaces", true);
-    const [turn, turnLabel] = tick("keep orientation", "the hand does not turn", false);
+    const [braces, bracesLabel] = tick("braces", "contact points that touch stay on their surfaces", true);
+    const [turn, turnLabel] = tick("orientation", "the hand does not turn", false);
     const move = this.button("move", "move the hand to this point by inverse kinematics", () => {
       const target = this.target.map((input) => Number(input.value));
       this.typed = false;
@@ -99,7 +99,7 @@ class Pose {
     }, "move");
     for (const input of this.target) input.onkeydown = (event) => { if (event.key === "Enter") move.click(); };
     for (const input of this.target) input.disabled = !reaches;
-    const row = D.element("div", { className: "row" }, ...this.target, D.element("span", { className: "off", textContent: "m" }), ...(reaches ? [move, bracesLabel, turnLabel] : []));
+    const row = D.element("div", { className: "row" }, ...this.target, D.element("span", { className: "off", textContent: "m" }), ...(reaches ? [move, " keep ", bracesLabel, turnLabel] : []));
     return [D.element("h2", { textContent: "Hand" }), row];
   }
 
