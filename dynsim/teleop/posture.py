@@ -65,9 +65,9 @@ class Slider:
     unit : str
         ``deg`` or ``m``.
     low, high : float
-        Range in ``unit``.
-    limited : bool
-        True if the range is the range of the joint.
+        Range of the slider in ``unit``.
+    limits : tuple of float or None
+        Lower and upper limit of the joint in ``unit``; None if there is none.
     leader : str
         Joint that this joint follows; empty if it is free.
     index : int
@@ -82,7 +82,7 @@ class Slider:
     unit: str
     low: float
     high: float
-    limited: bool
+    limits: tuple[float | None, float | None] = (None, None)
     leader: str = ""
     index: int = 0
     part: str = ""
@@ -129,7 +129,9 @@ class StartPosture:
         slider, q = self.sliders[name], self.q.copy()
         if slider.leader:
             raise ModelError(f"{name} follows {slider.leader}; move {slider.leader}")
-        self._put(slider, float(np.clip(value, slider.low, slider.high) if slider.limited else value), q)
+        lower, upper = slider.limits
+        value = max(value, value if lower is None else lower)
+        self._put(slider, min(value, value if upper is None else upper), q)
         self._change(q, name=name)
 
     def undo(self) -> None:
@@ -529,23 +531,33 @@ class ArmPosture(StartPosture):
             ratings[motor.joint] = most, lasting
         return ratings
 
+    @cached_property
+    def _uncoupled_model(self) -> Model:
+        """Model without couplings; a torque at each follower, without heat, replaces the force of its coupling."""
+        couplings, driven = self.robot.couplings, {motor.joint for motor in self.robot.motors}
+        forces = tuple(TorqueSource(coupling.joint) for coupling in couplings if coupling.joint not in driven)
+        return (
+            Model(replace(self.robot, couplings=(), motors=(*self.robot.motors, *forces))) if couplings else self.model
+        )
+
     def _rest(self) -> tuple[Rest, str]:
         """Return the torques at rest, and the reason if no motors and braces can hold the posture."""
-        scenario, model, q = self.scenario, self.model, self.q
-        loads = self._loads()
-        free = np.asarray(model.bias_forces(q, np.zeros(model.n))) + load_torques(model, q, loads)
-        if self.robot.couplings:  # the motor of a leader also holds its followers
-            names, moved = self.robot.joint_names, np.linalg.svd(model.coupling_rows)[2][len(self.robot.couplings) :]
-            wanted = [k for k, name in enumerate(names) if name in self._ratings]
-            held_torques = np.zeros(model.n)
-            held_torques[wanted] = np.linalg.lstsq(moved[:, wanted], moved @ free, rcond=None)[0]
-            return Rest(held_torques, {}, []), ""
-        able = [m.joint for m in self.robot.motors if not (isinstance(m, Servo) and m.velocity_mode)]
-        real = scenario.config.contacts.law == "unilateral"
+        model, q, loads = self._uncoupled_model, self.q, self._loads()
+        able = [m.joint for m in model.robot.motors if not (isinstance(m, Servo) and m.velocity_mode)]
+        real = self.scenario.config.contacts.law == "unilateral"
         try:
-            return holding_torques(model, q, self._enabled, loads, able, real), ""
+            balance, reason = holding_torques(model, q, self._enabled, loads, able, real), ""
         except ModelError as error:
-            return Rest(free, {}, []), str(error).removeprefix("initial.equilibrium: ")
+            free = np.asarray(model.bias_forces(q, np.zeros(model.n))) + load_torques(model, q, loads)
+            balance, reason = Rest(free, {}, []), str(error).removeprefix("initial.equilibrium: ")
+        # The motor of a leader also holds its followers.
+        leads, index = {coupling.joint: coupling for coupling in self.robot.couplings}, self.robot.joint_names.index
+        for follower in leads:
+            joint, torque = follower, balance.torques[index(follower)]
+            while joint in leads:
+                joint, torque = leads[joint].leader, leads[joint].ratio * torque
+            balance.torques[index(joint)] += torque
+        return balance, reason
 
     def _forces(self) -> dict[str, float]:
         """Return the normal force of each enabled contact point at rest [N]; NaN if it does not touch."""
@@ -599,6 +611,7 @@ class ArmPosture(StartPosture):
             "units": {link.joint: link.units[3] for link in self.robot.links},
             "rest": reason,
             "margin": self._margin(balance),
+            "target": self._target(),
         }
 
     def _margin(self, balance: Rest) -> float | None:
@@ -615,7 +628,10 @@ class ArmPosture(StartPosture):
         hand = getattr(self.scenario.controller, "hand", None)
         if hand is None or getattr(hand.path, "frame", "world") == "start":
             return None
-        return families.build("path", hand.path, BuildContext(self.scenario.duration_s), HandPath)
+        return self._built(hand.path)
+
+    def _built(self, path: Any) -> HandPath:
+        return families.build("path", path, BuildContext(self.scenario.duration_s), HandPath)
 
     def keys(self) -> dict[str, Any]:
         """Return the scenario keys of the posture: plant, path start, ``initial`` and contact points."""
@@ -673,6 +689,15 @@ class ArmPosture(StartPosture):
         off = 1e3 * float(np.linalg.norm(self._off_path()))
         return notes | {("controller", "hand", "path"): f"moved by {off:.4g} mm, to start at the hand"}
 
+    def _target(self) -> list[float]:
+        """Return points of the hand path with the copied keys, flattened x, y, z [m]; empty without a path."""
+        if self.path() is None:
+            return []
+        hand = self.scenario.controller.hand
+        moved = self._controller_keys().get("hand", {}).get("path", {})
+        times = np.linspace(0.0, self.scenario.duration_s, PATH_SAMPLES)
+        return np.round(self._built(hand.path.model_copy(update=moved)).position(times), 4).ravel().tolist()
+
     def _off_path(self) -> Array:
         """Return the vector from the hand to the start of its path, (3,) [m]; zero without a path."""
         path = self.path()
@@ -701,9 +726,9 @@ class SnakePosture(StartPosture):
         if scenario.plant.level != "kinematic":
             drawn = tuple(drawn_surface(name, surface) for name, surface in surfaces.items())
             self.scene = replace(self.scene, surfaces=drawn)
-        limits = np.rad2deg([description.lower, description.upper]).T
+        limits = np.rad2deg([description.lower, description.upper]).T.tolist()
         joints = [
-            Slider(name, "deg", float(low), float(high), True, index=k)
+            Slider(name, "deg", low, high, (low, high), index=k)
             for k, (name, (low, high)) in enumerate(zip(self._names, limits, strict=True))
         ]
         n = len(joints)
@@ -781,22 +806,15 @@ def _slider(link: Link, index: int, leader: str) -> Slider:
     angle = link.units[0] == "rad"
     scale = 180.0 / np.pi if angle else 1.0
     default = REVOLUTE_RANGE if angle else PRISMATIC_RANGE
-    low, high = (float(scale * limit) if np.isfinite(limit) else None for limit in (link.lower, link.upper))
-    limited = low is not None or high is not None
-    return Slider(
-        link.joint,
-        "deg" if angle else "m",
-        min(-default, high or 0.0) if low is None else low,
-        max(default, low or 0.0) if high is None else high,
-        limited,
-        leader,
-        index,
-    )
+    lower, upper = (float(scale * limit) if np.isfinite(limit) else None for limit in (link.lower, link.upper))
+    low = min(-default, upper or 0.0) if lower is None else lower
+    high = max(default, lower or 0.0) if upper is None else upper
+    return Slider(link.joint, "deg" if angle else "m", low, high, (lower, upper), leader, index)
 
 
 def _unlimited(name: str, unit: str, index: int, part: str = "", component: int = 0) -> Slider:
     span = REVOLUTE_RANGE if unit == "deg" else 2.0 * PRISMATIC_RANGE
-    return Slider(name, unit, -span, span, False, "", index, part, component)
+    return Slider(name, unit, -span, span, index=index, part=part, component=component)
 
 
 # Text of scenario keys.

@@ -336,6 +336,23 @@ def test_check_prints_positions_that_can_be_copied_into_a_surface(tmp_path: Path
     assert not snake.contacts
 
 
+def test_check_writes_a_page_of_start_postures_also_if_it_refuses(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture
+):
+    monkeypatch.chdir(tmp_path)
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"):
+        monkeypatch.delenv(name, raising=False)
+    # The path is out of reach, which the page of the postures helps to see.
+    far = "controller.hand.path.radius_m=0.6"
+    code, out, errors = in_process(monkeypatch, capfd, "check", "elbow_comparison", "--view", "--set", far)
+    assert code == 2
+    assert len(errors) == 1
+    assert mentions(out, "results/elbow_comparison/start.html")
+    assert says(out, "no browser")
+    page = (tmp_path / "results" / "elbow_comparison" / "start.html").read_text(encoding="utf-8")
+    assert page.startswith("<!DOCTYPE html>")
+
+
 def test_check_says_where_it_starts_before_it_refuses(tmp_path: Path):
     """Hand and gaps, also of a path out of reach and of points off their surfaces; and what puts these there."""
     path = "controller.hand.path.center_m=[9, 9, 9]"

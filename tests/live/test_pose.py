@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -141,6 +144,9 @@ def test_posture_found_on_the_page_passes_the_check(
     page.type("hand.z", round(before[2] + 0.03, 4))
     page.until(f"dynsim.pose.last.hand[2] > {before[2] + 0.025}")
     assert page.js("dynsim.pose.last.points[0].gap") == pytest.approx(0.0, abs=1e-9)
+    line = "dynsim.app.actors[0].paths.find((path) => path.kind === 'target').line"
+    target = page.js(f"{line}.geometry.attributes.instanceStart.array.slice(0, 3)")
+    assert target == pytest.approx(page.js("dynsim.pose.last.hand"), abs=1e-4)
     shown = page.js("dynsim.state().records[0].hand")
     assert shown == pytest.approx(page.js("dynsim.pose.last.hand"), abs=1e-5)
     page.button("check")
@@ -182,3 +188,26 @@ def test_bodies_below_a_surface_are_red_and_a_new_brace_is_drawn(
     page.until("dynsim.state().records[0].contacts.some((one) => one.name === 'link_8_floor')")
     page.button("undo")
     page.until("!dynsim.state().records[0].contacts.some((one) => one.name === 'link_8_floor')")
+
+
+def test_page_of_check_shows_the_start_of_every_variant(browser: Any, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "dynsim", "check", "elbow_comparison", "--view"]
+    environment = {key: value for key, value in os.environ.items() if key not in ("DISPLAY", "BROWSER")}
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, env=environment, check=False)
+    assert done.returncode == 0, done.stderr
+    page = browser.new_page(viewport={"width": 1000, "height": 600})
+    complaints: list[str] = []
+    page.on("pageerror", lambda error: complaints.append(str(error)))
+    page.goto((tmp_path / "results" / "elbow_comparison" / "start.html").as_uri())
+    page.evaluate("dynsim.ready")
+    shown = {record["name"]: record for record in page.evaluate("dynsim.state().records")}
+    hand = check(load_scenario("elbow_comparison")).hand
+    assert list(shown) == ["two_elbows", "elbow_7", "elbow_4", "no_elbow"]
+    for record in shown.values():
+        assert record["hand"] == pytest.approx(hand, abs=1e-5)
+    # Bilateral contact: elbow 4 pulls.
+    forces = {point["name"]: point["force"] for point in shown["two_elbows"]["contacts"]}
+    assert forces["elbow_4"] < 0.0 < forces["elbow_7"]
+    assert not page.locator("#side").is_visible()
+    assert complaints == []
+    page.close()

@@ -284,3 +284,49 @@ def test_plant_without_start_keys_is_refused(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.delattr("dynsim.library.plants.serial_arm.start_keys")
     with raises(DynsimError, "serial_arm", "start_keys", "docs/extending.md"):
         opened("single_pendulum")
+
+
+COUPLED = """\
+<robot name="coupled">
+  <link name="world"/>
+  <link name="upper"><inertial><origin xyz="0 0 0.2"/><mass value="2"/><inertia ixx="0.01" iyy="0.01" izz="0.01"
+    ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <link name="lower"><inertial><origin xyz="0 0 0.3"/><mass value="1"/><inertia ixx="0.01" iyy="0.01" izz="0.01"
+    ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <joint name="lead" type="revolute"><parent link="world"/><child link="upper"/><axis xyz="0 1 0"/>
+    <limit lower="-1" upper="9" effort="100" velocity="3"/></joint>
+  <joint name="follow" type="continuous"><parent link="upper"/><child link="lower"/><origin xyz="0 0 0.5"/>
+    <axis xyz="0 1 0"/><mimic joint="lead" multiplier="-0.5" offset="0.2"/></joint>
+</robot>
+"""
+
+
+def test_motor_of_a_leader_holds_its_follower(tmp_path: Path) -> None:
+    (tmp_path / "coupled.urdf").write_text(COUPLED, encoding="utf-8")
+    file = tmp_path / "coupled.yaml"
+    file.write_text(
+        "duration_s: 1\nplant: {type: urdf_arm, file: coupled.urdf, motors: {lead: {type: torque}}}\n", encoding="utf-8"
+    )
+    posture = open_posture(load_scenario(file))
+    posture.set("lead", 40.0)
+    lead = np.deg2rad(40.0)
+
+    def potential(q: float) -> float:
+        follow = -0.5 * q + 0.2
+        return 9.81 * (2.0 * 0.2 * np.cos(q) + 0.5 * np.cos(q) + 0.3 * np.cos(q + follow))
+
+    torque = (potential(lead + 1e-5) - potential(lead - 1e-5)) / 2e-5
+    frame = posture.frame()
+    assert frame["values"]["follow"] == pytest.approx(-20.0 + np.rad2deg(0.2))
+    assert frame["torques"]["lead"][0] == pytest.approx(torque, abs=1e-5)
+    assert read_yaml(frame["text"]["plant"]) == {"plant": {"initial_deg": {"lead": 40}}}
+
+
+def test_typed_values_end_at_the_limits_of_the_joint() -> None:
+    posture = opened("single_pendulum", **{"plant.chain.0.limit_deg": [-30, 400]})
+    for typed, value in ((-90.0, -30.0), (390.0, 390.0), (500.0, 400.0)):
+        posture.set("joint_1", typed)
+        assert posture.frame()["values"]["joint_1"] == pytest.approx(value)
+    free = opened("single_pendulum")
+    free.set("joint_1", 720.0)
+    assert free.frame()["values"]["joint_1"] == pytest.approx(720.0)

@@ -122,7 +122,16 @@ class LivePosture:
             # Execute everything that has arrived before the page is updated.
             while not self._changes.empty():
                 self._execute(self._changes.get())
-            self.server.show(self.posture.frame())
+            self.server.show(self._frame())
+
+    def _frame(self) -> dict[str, Any]:
+        """Return the frame of the posture; undo a change after which it cannot be computed."""
+        try:
+            return self.posture.frame()
+        except DynsimError as error:
+            self.posture.undo()
+            self.posture.note = f"undone: {error}"
+            return self.posture.frame()
 
     def _execute(self, change: Mapping[str, Any]) -> None:
         """Execute one change; an error becomes a note on the page."""

@@ -76,7 +76,7 @@ class Pose {
       range.dataset.name = number.dataset.name = one.name;
       range.oninput = () => { this.waiting.set(one.name, Number(range.value)); number.value = this.digits(Number(range.value), one.unit); };
       number.onchange = () => { if (number.value !== "" && Number.isFinite(Number(number.value))) this.send("set", { name: one.name, value: Number(number.value) }); };
-      const title = fixed ? `follows ${one.leader}` : one.limited ? `limits ${D.number(one.low)} to ${D.number(one.high)} ${one.unit}` : "no limits";
+      const title = fixed ? `follows ${one.leader}` : one.limits.some((x) => x !== null) ? `limits ${one.limits.map((x) => D.number(x)).join(" to ")} ${one.unit}` : "no limits";
       const name = D.element("td", { textContent: one.name, title: `${one.name}: ${title}` });
       const torque = D.element("td"), limit = D.element("td", { className: "off" });
       table.append(D.element("tr", { title }, name, D.element("td", { className: "wide" }, range), D.element("td", {}, number),
@@ -146,6 +146,7 @@ class Pose {
     this.place(actor, frame);
     dynsim.frame({ time: 0, poses: frame.poses, pressure: null, contacts: actor.contacts.map((c) => this.sample(frame, c.contact.name)) });
     this.redden(actor, frame);
+    this.showTarget(actor, frame);
     for (const [name, row] of this.rows) this.showRow(row, frame.values[name], frame.torques[name], frame.units?.[name]);
     if (!this.typed && frame.hand) frame.hand.forEach((x, k) => { if (document.activeElement !== this.target[k]) this.target[k].value = Number(x.toFixed(5)); });
     this.note.textContent = frame.note;
@@ -190,6 +191,17 @@ class Pose {
     return { force: touches && point.force !== null ? point.force : NaN, normal: point.normal, tangent: [0, 0, 0], mode: touches ? 2 : 0 };
   }
 
+  // The hand path with the copied keys, which starts at the hand.
+  showTarget(actor, frame) {
+    const line = actor.paths.find((path) => path.kind === "target")?.line, key = String(frame.target);
+    if (!line || !frame.target.length || key === this.shownTarget) return;
+    this.shownTarget = key;
+    line.geometry.dispose();
+    line.geometry = new THREE.LineGeometry();
+    line.geometry.setPositions(frame.target);
+    line.computeLineDistances();
+  }
+
   // Bodies below a surface are red in the scene.
   redden(actor, frame) {
     const below = new Set(frame.near.filter((one) => one.gap < one.least).map((one) => one.body));
@@ -199,11 +211,11 @@ class Pose {
 
   showRow(row, value, torque, unit) {
     const { one, range, number } = row;
-    const outside = one.limited && (value < one.low - 1e-6 || value > one.high + 1e-6);
-    const at = one.limited && !outside && (value < one.low + 1e-6 || value > one.high - 1e-6);
+    const [low, high] = [one.limits[0] ?? -Infinity, one.limits[1] ?? Infinity];
+    const outside = value < low - 1e-6 || value > high + 1e-6, at = !outside && (value < low + 1e-6 || value > high - 1e-6);
     if (document.activeElement !== range || !this.waiting.has(one.name)) range.value = value;
     if (document.activeElement !== number) number.value = this.digits(value, one.unit);
-    row.name.className = outside || at ? "bad" : one.leader ? "off" : "";
+    row.name.className = outside ? "bad" : at ? "edge" : one.leader ? "off" : "";
     row.name.textContent = at ? `${one.name} ⊣` : one.name;
     if (!torque) return;
     const [now, most, lasting] = torque, share = Math.abs(now) / (most ?? Infinity);
