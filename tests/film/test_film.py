@@ -22,8 +22,8 @@ from dynsim.cli import commands
 from dynsim.cli.tables import record_files
 from dynsim.draw.figures.style import BLUE, DEEP, PULLING
 from dynsim.draw.film import Film, write
-from dynsim.draw.film.film import Strip, largest
-from dynsim.draw.film.painter import FINER, FRICTION, Painter, font, labels
+from dynsim.draw.film.film import Strip
+from dynsim.draw.film.painter import FINER, FRICTION, Painter, font, labels, largest, painted
 from dynsim.draw.geometry.meshes import Meshes
 from dynsim.draw.geometry.projection import view_axes
 from dynsim.draw.geometry.robot import bounds
@@ -43,6 +43,11 @@ def hand_mark(painter, time):
     position, turn, _, _ = painter._pose(time)
     hand = painter.robot.scene.hand
     return painter.camera.project(position[hand.body] + rotated(turn[hand.body], np.array(hand.position)))[:2] / FINER
+
+
+def empty(painter: Painter) -> Image.Image:
+    """The picture without anything that moves, not reduced."""
+    return painted(painter._ground, painter._static)
 
 
 def short(name: str | Path, variant: str | None = None, **options: object) -> Record:
@@ -143,10 +148,8 @@ def test_round_surfaces_are_whole(braced: Record, view: str, curved: tuple[int, 
     Q = np.sign(size) * np.diag(curved).astype(float)
     surface = SceneSurface.of_quadric("round", Q, -Q @ centre, 0.5 * (centre @ Q @ centre - np.sign(size) * radius**2))
     assert surface.radius == pytest.approx(radius)
-    painter = Painter(known.robot, known.camera, known.size, (low, high))
-    painter._paths.clear()
-    painter.robot = replace(known.robot, scene=replace(known.robot.scene, surfaces=(surface,)))
-    shown = np.asarray(painter._background(low, high)).astype(int)
+    robot = replace(known.robot, scene=replace(known.robot.scene, surfaces=(surface,)))
+    shown = np.asarray(empty(Painter(robot, known.camera, known.size, (low, high)))).astype(int)
     rng = np.random.default_rng(3)
     away = rng.normal(size=(4000, 3)) * np.array(curved)
     points = centre + 0.98 * abs(radius) * away / np.linalg.norm(away, axis=1)[:, None]
@@ -158,6 +161,79 @@ def test_round_surfaces_are_whole(braced: Record, view: str, curved: tuple[int, 
     assert (np.abs(shown[y[inside], x[inside]] - 255).max(axis=1) > 20).all()
 
 
+def test_a_pixel_shows_the_nearest_face() -> None:
+    """Random quadrilaterals, some far outside the image, against the depths of all planes at each pixel."""
+    rng = np.random.default_rng(7)
+    corners = rng.uniform(-10.0, 50.0, (40, 4, 3))
+    corners[::20] = corners[::20] * [1e4, 1e4, 1.0] - [0.0, 0.0, 50.0]
+    # The fourth corner is in the plane of the others.
+    corners[:, 3] = corners[:, 0] + rng.uniform(0.2, 1.0, (40, 1)) * (corners[:, 2] - corners[:, 1])
+    colours = rng.integers(1, 255, (40, 3)).astype(np.uint8)
+    shown = np.asarray(
+        painted(Image.new("RGB", (40, 30)), [(corners[:25], colours[:25]), (corners[25:], colours[25:])])
+    )
+    best, expected = np.full((30, 40), -np.inf), np.zeros((30, 40, 3), dtype=np.uint8)
+    y, x = np.mgrid[:30, :40]
+    for face, colour in zip(corners, colours, strict=True):
+        for a, b, c in (face[[0, 1, 2]], face[[0, 2, 3]]):
+            inverse = np.linalg.inv(np.stack([b - a, c - a], axis=1)[:2])
+            v, w = np.einsum("ij,jyx->iyx", inverse, np.stack([x - a[0], y - a[1]]))
+            z = a[2] + v * (b[2] - a[2]) + w * (c[2] - a[2])
+            nearer = (v >= 0.0) & (w >= 0.0) & (v + w <= 1.0) & (z > best)
+            best[nearer], expected[nearer] = z[nearer], colour
+    assert len(np.unique(expected.reshape(-1, 3), axis=0)) > 10
+    np.testing.assert_array_equal(shown, expected)
+
+
+def box(centre: np.ndarray, edges: tuple[float, float, float]) -> SceneSurface:
+    zero = ((0.0, 0.0, 0.0),) * 3
+    return SceneSurface(
+        "table", zero, zero[0], 0.0, "box", tuple(centre), radius=0.0, orientation=(1.0, 0.0, 0.0, 0.0), edges=edges
+    )
+
+
+@pytest.mark.parametrize("view", ["side", "iso"])
+def test_a_box_hides_the_robot_behind_it_only(braced: Record, view: str) -> None:
+    """A box nearer to the viewer covers the last link, a box behind it does not; its visible faces are whole."""
+    for side in (-1.0, 1.0):
+        record = replace_surfaces(braced, ())
+        known = Film({"one": record}, view=view, plot="", size=(640, 480)).painters["one"]
+        near = known.camera.axes[2]
+        link = braced[POSITION][0, -1].astype(float)
+        surface = box(link + side * 0.4 * near, (0.2, 0.2, 0.2))
+        film = Film({"one": replace_surfaces(braced, (surface,))}, view=view, plot="", size=(640, 480))
+        painter = film.painters["one"]
+        # The whole box is in the picture.
+        half = 0.1 * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+        corners = painter.camera.project(np.array(surface.position) + half)[:, :2] / FINER
+        assert (corners > 0.0).all()
+        assert (corners < painter.size).all()
+        # Points on the faces that face the viewer are painted in three shades.
+        shades = set()
+        shown = empty(painter)
+        for axis in range(3):
+            towards = np.sign(near[axis])
+            if abs(near[axis]) > 0.1:
+                for a, b in np.random.default_rng(axis).uniform(-0.095, 0.095, (20, 2)):
+                    point = np.insert([a, b], axis, 0.1 * towards) + surface.position
+                    x, y, _ = painter.camera.project(point)
+                    shades.add(shown.getpixel((round(x), round(y))))
+        assert len(shades) == int((np.abs(near) > 0.1).sum())
+        assert (255, 255, 255) not in shades
+        position, turn, row, _ = painter._pose(0.0)
+        image = painted(painter._ground, [*painter._static, painter._body_faces(position, turn, row)])
+        x, y, _ = painter.camera.project(link)
+        assert (image.getpixel((round(x), round(y))) in shades) == (side > 0.0)
+
+
+def replace_surfaces(record: Record, surfaces: tuple[SceneSurface, ...]) -> Record:
+    changed = Record(record.time, provenance=record.provenance)
+    for name in (POSITION, ORIENTATION):
+        changed.add(name, record[name], record.units[name], labels=record.labels[name])
+    changed.scene = replace(record.scene, surfaces=surfaces, points=(record.scene.hand,))
+    return changed
+
+
 def test_a_hub_is_not_covered_by_a_rod_that_leans_to_the_viewer(braced: Record) -> None:
     """A hub about x of radius 1.45 r hides the beginning of a rod of radius r, seen along y, but not the rest of it."""
     painter = Film({"one": braced}, view="side", plot="", size=(640, 480)).painters["one"]
@@ -165,11 +241,8 @@ def test_a_hub_is_not_covered_by_a_rod_that_leans_to_the_viewer(braced: Record) 
     along = np.cos(np.pi / 6) * right + np.sin(np.pi / 6) * near
     hub = {"kind": "cylinder", "size": [1.45 * r, 3.6 * r], "p": [0.0] * 3, "q": from_z(right).tolist()}
     rod = {"kind": "capsule", "size": [r, 20.0 * r], "p": (10.0 * r * along).tolist(), "q": from_z(along).tolist()}
-    (corners, faces), (more, other) = solid(hub, []), solid(rod, [])
-    colours = np.array(len(faces) * [[255.0, 0.0, 0.0]] + len(other) * [[0.0, 0.0, 255.0]])
-    image = Image.new("RGB", (1280, 960))
-    every = np.concatenate([faces, other + len(corners)])
-    painter._paint_faces(ImageDraw.Draw(image), np.concatenate([corners, more]), every, colours)
+    groups = [painter._faces(*solid(s, []), np.array(c)) for s, c in ((hub, [255.0, 0, 0]), (rod, [0, 0, 255.0]))]
+    image = painted(Image.new("RGB", (1280, 960)), groups)
     for depth, hidden in ((-1.0, True), (-0.5, True), (0.1, True), (1.0, False), (3.0, False)):
         x, y, _ = painter.camera.project(depth * r * right)
         red, _, blue = image.getpixel((round(x), round(y)))
@@ -347,12 +420,32 @@ def test_the_force_with_friction_has_its_own_direction() -> None:
     assert np.all((arrow - [x, y]) @ along > 0.0)
 
 
+@pytest.mark.parametrize("kind", ["arm", "mobile", "snake", "urdf", "payload"])
+@pytest.mark.parametrize("view", ["side", "iso", "top"])
+def test_every_corner_of_a_robot_is_in_the_picture(kind: str, view: str, robots: dict[str, Record]) -> None:
+    """At all samples, also of the last body, whose solid extends beyond its origin and the hand."""
+    record = robots[kind] if kind in robots else short("sampled_arm", duration_s=0.3, **{"metrics.settle_s": 0.1})
+    painter = Film({"one": record}, view=view, size=(480, 320)).painters["one"]
+    solids = painter._solids
+    assert len(solids.corners) > 100
+    seen = []
+    for instant in np.linspace(0.0, record.time[-1], 30):
+        position, turn, *_ = painter._pose(instant)
+        corners = solids.corners + solids.aside[0]
+        world = position[solids.body] + rotated(turn[solids.body].T, corners.T).T
+        seen.append(painter.camera.project(world)[:, :2] / FINER)
+    low, high = np.min(seen, axis=(0, 1)), np.max(seen, axis=(0, 1))
+    assert (low > 0.0).all()
+    assert (high < painter.size).all()
+    assert ((high - low) / painter.size).max() > 0.6
+
+
 @pytest.mark.parametrize("kind", ["arm", "mobile", "snake", "urdf"])
 @pytest.mark.parametrize("view", ["side", "iso"])
 def test_all_robots_are_painted_within_the_picture(kind: str, view: str, robots: dict[str, Record]) -> None:
     film = Film({kind: robots[kind]}, view=view, size=(480, 320))
     (painter,) = film.painters.values()
-    still = np.asarray(painter._still.reduce(FINER)).astype(int)
+    still = np.asarray(empty(painter).reduce(FINER)).astype(int)
     for instant in (film.times[0], film.times[-1]):
         moving = np.abs(np.asarray(painter.frame(float(instant))).astype(int) - still).max(axis=2) > 20
         rows, columns = np.nonzero(moving)
@@ -416,7 +509,7 @@ def test_a_run_that_diverged_and_one_of_a_single_sample(braced: Record, tmp_path
         (painter,) = film.painters.values()
         assert len(film.times) == count
         first, last = (np.asarray(painter.frame(float(film.times[k]))) for k in (0, -1))
-        still = np.asarray(painter._still.reduce(FINER))
+        still = np.asarray(empty(painter).reduce(FINER))
         assert np.any(first != still)
         assert np.array_equal(last, still) == (count > 1)
         write({"one": record}, tmp_path / "film.gif", size=(320, 240), fps=5)

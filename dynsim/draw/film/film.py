@@ -18,9 +18,9 @@ from PIL import Image, ImageColor, ImageDraw
 from dynsim.draw.figures import style
 from dynsim.draw.figures.style import GREY, PULLING, VARIANT_COLOURS
 from dynsim.draw.figures.style import title as titled
-from dynsim.draw.film.painter import FINER, PAPER, Camera, Painter, font
+from dynsim.draw.film.painter import FINER, PAPER, Camera, Painter, font, largest
 from dynsim.draw.geometry.projection import FROM, View, view_axes
-from dynsim.draw.geometry.robot import Array, azimuth, bounds, robots
+from dynsim.draw.geometry.robot import Array, azimuth, bounds, framed, robots
 from dynsim.errors import RecordError
 from dynsim.record import TIME, Record
 from dynsim.system.arguments import names_wrong_types
@@ -130,12 +130,6 @@ class Strip:
         canvas.draw()
         self._image = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
         self._axes = axes
-
-
-def largest(values: style.Array, count: int) -> list[int]:
-    """Return the indices of the ``count`` columns of values, (T, n), with the largest rms over time, in order."""
-    effort = np.nan_to_num(values.astype(float) ** 2).sum(axis=0)
-    return sorted(np.argsort(-effort, kind="stable")[:count].tolist())
 
 
 def _cut(name: str, letters: int) -> str:
@@ -360,7 +354,7 @@ class Film:
         self._area = (0, HEAD, width, height - (strip[1] if has_plot else 0))
         some = list(shown.values())
         axes = view_axes(view, azimuth(some))
-        low, high = bounds(some, axes)
+        low, high = framed(some, axes)
         self._places, cell = _layout(len(some), self._area, high - low)
         if min(cell) < CELL_MIN:
             raise RecordError(

@@ -1,7 +1,7 @@
-"""Frames of one robot: static background drawn once, moving faces drawn from far to near; drawing tools and camera.
+"""Frames of one robot: background drawn once, and solids with a depth buffer; drawing tools and camera.
 
-Frames are painted with Pillow at ``FINER`` times their size and then reduced, which smooths all edges. Faces are sorted
-by the depth of their centres, which is sufficient for faces that are small compared with their distances.
+Frames are painted at ``FINER`` times their size and then reduced, which smooths all edges: faces with
+:func:`dynsim.draw.film.raster.fill`, everything else with Pillow.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageColor, ImageDraw, ImageFont
 
 from dynsim.draw.figures.style import BLACK, BLUE, DEEP, GREEN, GREY, ORANGE, PULLING, SKY
+from dynsim.draw.film.raster import fill
 from dynsim.draw.geometry.meshes import Meshes, simplified
 from dynsim.draw.geometry.projection import Projection
 from dynsim.draw.geometry.robot import (
@@ -36,20 +37,18 @@ from dynsim.draw.geometry.shapes import (
     body_shapes,
     cop_of,
     drawn_shape,
-    drawn_surface,
-    grid_faces,
+    floor_level,
     gripper,
     outline,
-    round_patch,
     solid,
     supports,
-    surface_grids,
+    surface_solid,
     wheel_groups,
 )
 from dynsim.record.measures import GRIPPER_STATES
 from dynsim.record.poses import ORIENTATION, POSITION
 from dynsim.record.quaternion import rotated
-from dynsim.record.scene import HERE, WORLD, SceneSurface
+from dynsim.record.scene import HERE, WORLD
 
 # Drawing tools, in pixels.
 Box = tuple[float, float, float, float]
@@ -106,7 +105,7 @@ def labels(
     size: tuple[int, int],
     paper: str,
 ) -> list[Box]:
-    """Draw texts on background patches above their anchors, inside the image and without overlap.
+    """Draw texts with outlines above their anchors, inside the image and without overlap.
 
     Parameters
     ----------
@@ -119,7 +118,7 @@ def labels(
     size : tuple of int
         Size of the image [pixel].
     paper : str
-        Colour of the patches.
+        Colour of the outlines.
 
     Returns
     -------
@@ -139,8 +138,8 @@ def labels(
                 break
             y = min(box[1] for box in hidden) - height
         boxes.append((x, y, x + width, y + height))
-        draw.rounded_rectangle(boxes[-1], radius=edge, fill=paper)
-        draw.text((x + 0.5 * width, y + 0.5 * height), text, fill=colour, font=face, anchor="mm")
+        middle = x + 0.5 * width, y + 0.5 * height
+        draw.text(middle, text, fill=colour, font=face, anchor="mm", stroke_width=round(edge), stroke_fill=paper)
     return boxes
 
 
@@ -187,7 +186,7 @@ Array = NDArray[np.float64]
 FINER = 2
 # Maximum number of triangles of all meshes; the image of a robot is about 500 pixels wide.
 TRIANGLES = 20_000
-PAPER, GROUND, LINES, FAINT, SURFACE = "#FFFFFF", "#F1F3F5", "#D3D8DE", "#ECEEF1", "#C9D3DE"
+PAPER, GROUND, LINES, FAINT, SURFACE = "#FFFFFF", "#F1F3F5", "#D3D8DE", "#ECEEF1", "#DCE3EB"
 BODY, HUB, WHEEL, SUPPORT = "#AEB7C4", "#4A5260", "#3A4048", "#D5EAF8"
 FRICTION = "#7A3E9D"
 # Friction forces below this fraction of the largest normal force are drawn without an arrow.
@@ -195,10 +194,20 @@ MIN_FRICTION_SHARE = 1e-3
 MODES = {0: GREY, 1: ORANGE, 2: GREEN}
 # Direction to the light in view coordinates: right, up, towards the viewer.
 LIGHT = np.array([-0.35, 0.75, 0.56]) / np.linalg.norm([-0.35, 0.75, 0.56])
+# Distance by which planes that would hide the robot are moved away from the viewer [m].
+BEHIND = 1e6
 # Image height below which a smaller font is used [pixel].
 SMALL_HEIGHT = 200
+# Number of contact points whose forces are written (the largest by rms); all have arrows.
+LABELLED = 5
 # Maximum number of points of a path.
 PATH_POINTS = 600
+
+
+def largest(values: Array, count: int) -> list[int]:
+    """Return the indices of the ``count`` columns of values, (T, n), with the largest rms over time, in order."""
+    effort = np.nan_to_num(values.astype(float) ** 2).sum(axis=0)
+    return sorted(np.argsort(-effort, kind="stable")[:count].tolist())
 
 
 @dataclass(frozen=True)
@@ -214,6 +223,18 @@ class _Solids:
     colour: Array
     wheel: NDArray[np.int64]
     aside: Array
+
+
+Faces = tuple[Array, NDArray[np.uint8]]
+
+
+def painted(image: Image.Image, faces: Sequence[Faces]) -> Image.Image:
+    """Return an image with faces in front of it, each group with its corners and colours; see :func:`fill`."""
+    pixels = np.array(image)
+    depth = np.full(pixels.shape[:2], -np.inf)
+    for corners, colours in faces:
+        fill(pixels, depth, corners, colours)
+    return Image.fromarray(pixels)
 
 
 class Painter:
@@ -254,7 +275,7 @@ class Painter:
         meshes = Meshes()
         meshes.of_robot(record.scene)
         shapes = body_shapes(robot.scene, robot.reach, meshes)
-        self._fixed = [shown for shape in robot.scene.fixed if (shown := drawn_shape(shape, meshes)) is not None]
+        fixed = [shown for shape in robot.scene.fixed if (shown := drawn_shape(shape, meshes)) is not None]
         self._meshes = simplified(meshes.unique, TRIANGLES)
         self._wheels = wheel_groups(record, robot.scene)
         # Find the body that carries the gripper.
@@ -265,30 +286,38 @@ class Painter:
         self._contacts = contacts(robot)
         self._sunk = penetrations(record, robot.scene)
         self._full = largest_force(self._contacts)
+        forces = np.stack([np.zeros(len(record)), *(contact.force for contact in self._contacts)], axis=1)
+        self._labelled = {k - 1 for k in largest(forces, LABELLED)}
         self._paths = dict(paths(record, robot.scene))
         self._supports = supports(robot.scene, self._wheels)
         self._pressure = cop_of(record)
         # Use smaller text in the smaller images of several robots.
         self._font = font((13 if size[1] >= SMALL_HEIGHT else 11) * FINER)
         self.labels: list[Box] = []
-        self._still = self._background(*bounds)
+        self._floors = [level for surface in robot.scene.surfaces if (level := floor_level(surface)) is not None]
+        self._ground = self._background(*bounds)
+        self._static = self._fixed_faces(fixed, *bounds)
 
     def frame(self, time: float) -> Image.Image:
         """Return the image of the robot at a time [s], with linear interpolation between samples."""
         position, turn, row, share = self._pose(time)
-        image = self._still.copy()
-        draw = ImageDraw.Draw(image)
-        if np.isfinite(position).all() and np.isfinite(turn).all():
+        image, faces = self._ground.copy(), list(self._static)
+        if known := bool(np.isfinite(position).all() and np.isfinite(turn).all()):
             hull = self._support(position, turn, row)
             if len(hull) > 2:
                 corners = self.camera.project(np.column_stack([hull, np.zeros(len(hull))]))[:, :2]
-                draw.polygon([tuple(corner) for corner in corners.tolist()], fill=SUPPORT, outline=SKY)
-            self._paint_bodies(draw, position, turn, row)
+                polygon = [tuple(corner) for corner in corners.tolist()]
+                ImageDraw.Draw(image).polygon(polygon, fill=SUPPORT, outline=SKY)
+            faces.append(self._body_faces(position, turn, row))
+        image = painted(image, faces)
+        if known:
+            draw = ImageDraw.Draw(image)
             self._paint_pressure(draw, hull, row)
             self._paint_path(draw, time, row)
             for point in self._sunk:
                 self._paint_sunk(draw, point, position, turn, row, share)
             forces = [self._paint_contact(draw, contact, position, turn, row, share) for contact in self._contacts]
+            forces = [force for k, force in enumerate(forces) if k in self._labelled]
             self._paint_hand(draw, position, turn)
             # Paint texts last, so that they are on top.
             self._paint_grip_state(draw, row)
@@ -352,18 +381,11 @@ class Painter:
     def _background(self, low: Array, high: Array) -> Image.Image:
         image = Image.new("RGB", (self.size[0] * FINER, self.size[1] * FINER), PAPER)
         draw = ImageDraw.Draw(image)
-        if not self.robot.scene.surfaces:
+        for level in self._floors:
+            self._paint_floor(draw, low, high, level)
+        if not self._floors:
             # A grid helps to judge positions.
             self._paint_floor(draw, low, high, float(low[2]), real=False)
-        for surface in self.robot.scene.surfaces:
-            plane = surface.kind == "plane" and surface.direction is not None
-            if plane and abs((surface.direction or (0, 0, 1))[2]) > 1.0 - 1e-9:
-                self._paint_floor(draw, low, high, (surface.position or (0, 0, 0))[2])
-            else:
-                self._paint_surface(draw, surface, low, high)
-        for shape in self._fixed:
-            points, cells = solid(shape, self._meshes)
-            self._paint_faces(draw, points, cells, self._colours(shape, len(cells), HUB))
         if (target := self._paths.get("target")) is not None:
             dashes(draw, _finite_path(self.camera.project(target)[:, :2]), 6.0 * FINER, BLACK, FINER)
         if (path := self._paths.get("hand")) is not None:
@@ -373,20 +395,23 @@ class Painter:
             draw.text((10 * FINER, 8 * FINER), self.title, fill=self.tint, font=self._font)
         return image
 
-    def _paint_surface(self, draw: ImageDraw.ImageDraw, surface: SceneSurface, low: Array, high: Array) -> None:
-        """Paint a small sphere or cylinder as a closed solid, and any other surface as a patch near the robot."""
-        colour = np.array(_rgb(SURFACE))
-        round_one = surface.kind in ("sphere", "cylinder")
-        drawn = drawn_surface(surface, low, high) if round_one else {"kind": surface.kind}
-        if drawn["kind"] not in ("sphere", "cylinder"):
-            for grid in [round_patch(surface, low, high)] if round_one else surface_grids(surface, low, high):
-                self._paint_faces(draw, *grid_faces(grid), colour, both=True)
-            return
-        radius = float(drawn["radius"])
-        shape = {"q": HERE, **drawn, "size": [abs(radius), drawn.get("length", 0.0)]}
-        corners, faces = solid(shape, [], finer=3)
-        # If the robot is inside the surface, only the far wall must be visible.
-        self._paint_faces(draw, corners, faces if radius > 0.0 else faces[:, ::-1], colour)
+    def _fixed_faces(self, fixed: list[dict[str, Any]], low: Array, high: Array) -> list[Faces]:
+        """Return the visible faces of fixed shapes and surfaces.
+
+        Planes that would hide the robot are moved behind it.
+        """
+        groups = []
+        for shape in fixed:
+            corners, faces = solid(shape, self._meshes)
+            groups.append(self._faces(corners, faces, self._colours(shape, len(faces), HUB)))
+        for surface in self.robot.scene.surfaces:
+            if floor_level(surface) is not None:
+                continue
+            shown, colours = self._faces(*surface_solid(surface, low, high), np.array(_rgb(SURFACE), dtype=float))
+            if surface.kind == "plane" and np.array(surface.direction) @ self.camera.axes[2] < -1e-9:
+                shown[..., 2] -= BEHIND
+            groups.append((shown, colours))
+        return groups
 
     def _paint_floor(self, draw: ImageDraw.ImageDraw, low: Array, high: Array, z: float, *, real: bool = True) -> None:
         """Paint a horizontal plane with a grid (in side view: the area below), or only the grid if not ``real``."""
@@ -414,10 +439,9 @@ class Painter:
         for row in self.camera.project(np.array(ends))[..., :2]:
             draw.line(row.ravel().tolist(), fill=LINES if real else FAINT, width=FINER)
 
-    def _paint_bodies(self, draw: ImageDraw.ImageDraw, position: Array, turn: Array, row: int) -> None:
+    def _body_faces(self, position: Array, turn: Array, row: int) -> Faces:
+        """Return the visible faces of all moving solids."""
         solids = self._solids
-        if not len(solids.faces):
-            return
         own = solids.corners
         if self._gripped != WORLD:
             assert self._grip is not None
@@ -429,34 +453,20 @@ class Painter:
             standing = (solids.wheel >= 0) & ~lifted
             colour = np.where(lifted[:, None], np.array(_rgb("#F4F6F8")), colour)
             colour = np.where(standing[:, None], np.array(_rgb(BLUE)), colour)
-        self._paint_faces(draw, corners, solids.faces, colour)
+        return self._faces(corners, solids.faces, colour)
 
-    def _paint_faces(
-        self,
-        draw: ImageDraw.ImageDraw,
-        corners: Array,
-        faces: NDArray[np.int64],
-        colour: Array,
-        *,
-        both: bool = False,
-    ) -> None:
-        """Paint faces that face the viewer (or ``both`` sides), from far to near, lit from the upper left."""
-        seen = self.camera.project(corners)
-        shown = seen[faces]
+    def _faces(self, corners: Array, faces: NDArray[np.int64], colour: Array) -> Faces:
+        """Return the faces that face the viewer, projected, and their colours, lit from the upper left."""
+        shown = self.camera.project(corners)[faces]
         # Compute area and direction from the diagonals; this also works for a triangle that repeats a corner.
         a, b = shown[:, 2] - shown[:, 0], shown[:, 3] - shown[:, 1]
         scale = np.array([1.0, -1.0, self.camera.scale])
         normal = np.cross(a * scale, b * scale)
         size = np.linalg.norm(normal, axis=1)
-        kept = (size > 1e-12) & ((normal[:, 2] > 0.0) | both)
-        shown, normal, size = shown[kept], normal[kept], size[kept]
-        normal = normal / size[:, None] * np.where(normal[:, 2:] < 0.0, -1.0, 1.0)
-        light = 0.58 + 0.42 * np.clip(normal @ LIGHT, 0.0, 1.0)
+        kept = (size > 1e-12) & (normal[:, 2] > 0.0)
+        light = 0.58 + 0.42 * np.clip(normal[kept] / size[kept, None] @ LIGHT, 0.0, 1.0)
         shades = np.broadcast_to(colour, (len(faces), 3))[kept] * light[:, None]
-        order = np.argsort(shown[..., 2].mean(axis=1))
-        fills = np.minimum(shades[order], 255.0).astype(int).tolist()
-        for corner, fill in zip(shown[order, :, :2].reshape(-1, 8).tolist(), fills, strict=True):
-            draw.polygon(corner, fill=tuple(fill))
+        return shown[kept], np.minimum(shades, 255.0).astype(np.uint8)
 
     def _support(self, position: Array, turn: Array, row: int) -> Array:
         """Return the corners of the support polygon, (n, 2) [m], counterclockwise."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -63,11 +64,17 @@ class Meshes:
 
     def _read(self, path: Path) -> int | None:
         try:
-            self.unique.append(welded(read_mesh(path)))
+            self.unique.append(_welded(path, path.stat().st_mtime_ns))
         except (RecordError, OSError, ValueError) as error:
             self._unreadable[str(error)] = None
             return None
         return len(self.unique) - 1
+
+
+@lru_cache(maxsize=64)
+def _welded(path: Path, changed: int) -> Mesh:
+    """Return a mesh file with merged corners; a file that changed since it was read is read again."""
+    return welded(read_mesh(path))
 
 
 def mesh_paths(scene: Scene, files: Iterable[str]) -> dict[str, Path]:

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dynsim.draw.geometry.meshes import Meshes
+from dynsim.draw.geometry.shapes import body_shapes, drawn_shape, floor_level, gripper, solid, surface_solid
 from dynsim.errors import RecordError
 from dynsim.record import Record
 from dynsim.record.measures import hand_target
 from dynsim.record.poses import ORIENTATION, POSITION, TOUCHING, contact_positions, point_positions
-from dynsim.record.scene import NOT_BELOW, WORLD, Point, Scene, Vector3
+from dynsim.record.quaternion import rotated
+from dynsim.record.scene import HERE, NOT_BELOW, WORLD, Point, Scene, Vector3
 
 Array = NDArray[np.float64]
 # Maximum error of poses interpolated between the frames of a page [m].
@@ -25,6 +30,11 @@ FRAMES = 20_000
 LONGEST = 256
 WORLD_AXES = np.eye(3)
 HERE_POINT: Vector3 = (0.0, 0.0, 0.0)
+# The extent of a solid is measured along these directions, at no more than so many samples.
+DIRECTIONS = np.array([step for step in itertools.product((-1.0, 0.0, 1.0), repeat=3) if any(step)])
+SAMPLES = 200
+# Margin around the robot in which surfaces extend the view, relative to the longest edge of the box of the robot.
+SURROUNDINGS = 0.25
 
 
 def robots(records: Mapping[str, Record]) -> dict[str, DrawnRobot]:
@@ -49,6 +59,23 @@ class DrawnRobot:
     scene: Scene
     rows: NDArray[np.intp]
     reach: float
+
+    @cached_property
+    def extremes(self) -> list[Array]:
+        """Outermost corners of the solids of each body in its frame, and of all fixed solids, (n, 3) [m] each."""
+        meshes = Meshes()
+        meshes.of_robot(self.scene)
+        shapes = body_shapes(self.scene, self.reach, meshes)
+        hand = self.scene.hand
+        if hand is not None and hand.body != WORLD and gripping(self.record) is not None:
+            both = gripper(shapes, self.reach)
+            length, width, height = both["size"]
+            position = (np.array(hand.position) + np.array([both["ahead"], 0.0, 0.0])).tolist()
+            size = [length, width + 2.0 * both["aside"][0], height]
+            shapes[hand.body].append({"kind": "box", "size": size, "p": position, "q": list(HERE)})
+        shapes.append([shown for shape in self.scene.fixed if (shown := drawn_shape(shape, meshes)) is not None])
+        clouds = [np.concatenate([np.zeros((0, 3)), *(solid(s, meshes.unique)[0] for s in own)]) for own in shapes]
+        return [cloud[np.unique((cloud @ DIRECTIONS.T).argmax(axis=0))] if len(cloud) else cloud for cloud in clouds]
 
 
 def gripping(record: Record) -> Array | None:
@@ -140,12 +167,29 @@ def bounds(robots: Sequence[DrawnRobot], axes: Array = WORLD_AXES) -> tuple[Arra
     # A robot that hardly moves must not fill the window, and a flat scene needs some depth.
     span, reach = float((high - low).max()), max(robot.reach for robot in robots)
     smallest = max(0.24 * span, 0.6 * reach if span < 0.6 * reach else 0.0)
-    room = np.maximum(0.5 * (smallest - (high - low)), 0.0) + 0.03 * smallest + max(map(_thickness, robots))
+    room = np.maximum(0.5 * (smallest - (high - low)), 0.0) + 0.03 * smallest
     return low - room, high + room
 
 
+def framed(robots: Sequence[DrawnRobot], axes: Array) -> tuple[Array, Array]:
+    """Return the box along ``axes`` of everything that moves and of the surfaces next to it, as for :func:`bounds`."""
+    low, high = bounds(robots)
+    room = SURROUNDINGS * float((high - low).max())
+    corners = [np.stack(bounds(robots, axes))]
+    for surface in {surface for robot in robots for surface in robot.scene.surfaces}:
+        if abs(surface.radius or 0.0) > 4.0 * room:
+            continue  # only a part of it is drawn, behind the robot
+        if (level := floor_level(surface)) is None:
+            shown = np.clip(surface_solid(surface, low, high)[0], low - room, high + room)
+            corners.append(shown[np.isfinite(shown).all(axis=1)] @ axes.T)
+        elif low[2] - room <= level <= high[2]:
+            corners.append(np.array([[*(0.5 * (low + high))[:2], level]]) @ axes.T)
+    pooled = np.concatenate(corners)
+    return pooled.min(axis=0), pooled.max(axis=0)
+
+
 def moving(robots: Sequence[DrawnRobot]) -> Array:
-    """Return positions of all bodies, the hand and its target, and the extent of fixed shapes, (n, 3) [m]."""
+    """Return positions of the solids of all bodies, of the hand and its target, and of fixed solids, (n, 3) [m]."""
     points = []
     for robot in robots:
         record = robot.record
@@ -153,11 +197,15 @@ def moving(robots: Sequence[DrawnRobot]) -> Array:
             record[POSITION].reshape(-1, 3).astype(np.float64),
             *(path for _, path in paths(record, robot.scene)),
         ]
+        rows = robot.rows[:: -(-len(robot.rows) // SAMPLES)]
+        origins, turns = (np.moveaxis(record[name][rows].astype(np.float64), -1, 0) for name in (POSITION, ORIENTATION))
+        *bodies, fixed = robot.extremes
+        for k, corners in enumerate(bodies):
+            turned = rotated(turns[:, :, k, None], np.broadcast_to(corners.T[:, None], (3, len(rows), len(corners))))
+            clouds.append(np.reshape(origins[:, :, k, None] + turned, (3, -1)).T)
         # The last samples of a diverging run are far away from all other samples.
         points += clouds if record.complete else [_without_ends(cloud) for cloud in clouds]
-        for shape in robot.scene.fixed:
-            middle, half = np.array(shape.position), 0.5 * max(shape.size) if shape.kind != "mesh" else 0.0
-            points += [np.stack([middle - half, middle + half])]
+        points.append(fixed)
     pooled = np.concatenate(points)
     return np.asarray(pooled[np.isfinite(pooled).all(axis=1)])
 
@@ -166,15 +214,6 @@ def _without_ends(points: Array) -> Array:
     """Clip points, (T, 3), to the 1st and 99th percentile along each axis."""
     points = points[np.isfinite(points).all(axis=1)]
     return np.clip(points, *np.percentile(points, (1.0, 99.0), axis=0)) if len(points) else points
-
-
-def _thickness(robot: DrawnRobot) -> float:
-    """Return the approximate distance by which shapes extend from the lines between bodies [m]."""
-    shapes = [shape for body in robot.scene.bodies for shape in body.shapes]
-    round_ = [shape.size[0] for shape in shapes if shape.kind in ("cylinder", "capsule", "sphere")]
-    boxes = [0.5 * sorted(shape.size)[1] for shape in shapes if shape.kind == "box"]
-    meshes = [0.08 * robot.reach for shape in shapes if shape.kind == "mesh"]
-    return min(max([*round_, *boxes, *meshes], default=0.0), 0.5 * robot.reach)
 
 
 def azimuth(robots: Sequence[DrawnRobot]) -> float:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dynsim.draw.geometry.meshes import Mesh, Meshes
 from dynsim.record import Record
 from dynsim.record.poses import ORIENTATION, POSITION
-from dynsim.record.quaternion import of_turn, rotated
+from dynsim.record.quaternion import of_matrix, of_turn, rotated
 from dynsim.record.scene import HERE, WORLD, Body, Scene, SceneSurface, Shape, quaternion
 
 # Number of points along each side of the drawn part of a curved surface, and along each side of a box face.
@@ -154,14 +154,14 @@ Array = NDArray[np.float64]
 Faces = NDArray[np.int64]
 # Number of faces around a round solid, and from its equator to a pole.
 AROUND, RINGS = 28, 4
-# Number of short pieces, each as long as the radius, at each end of a long rod.
-ENDS = 3
 # Radius of a rod drawn for a body without shapes, relative to the reach of the robot.
 ROD = 0.008
 # A spherical or cylindrical surface is drawn only near the robot if it is larger than this multiple of the view.
 LARGE = 1.0
 # Density of the ball that represents a payload without a radius [kg/m³] (steel), and colour of payloads.
 DENSITY, BRASS = 7850.0, [0.72, 0.53, 0.2, 1.0]
+# Thickness of a wall or slope relative to the view.
+WALL = 0.02
 
 
 def drawn_shape(shape: Shape, meshes: Meshes) -> dict[str, Any] | None:
@@ -357,6 +357,47 @@ def drawn_surface(surface: SceneSurface, low: Array, high: Array) -> dict[str, A
     return drawn | {"kind": "grid", "rows": rows, "columns": columns, "points": numbers}
 
 
+def floor_level(surface: SceneSurface) -> float | None:
+    """Return the height of a horizontal plane whose free side is above it [m], or None for any other surface."""
+    normal = surface.direction if surface.kind == "plane" else None
+    return float((surface.position or HERE)[2]) if normal is not None and normal[2] > 1.0 - 1e-9 else None
+
+
+def surface_solid(surface: SceneSurface, low: Array, high: Array) -> tuple[Array, Faces]:
+    """Return corners, (n, 3) [m], and faces, (m, 4), of the part of a surface near the box ``low`` to ``high``.
+
+    A plane is a thin wall behind the surface. Boxes and small spheres and cylinders are whole, with faces that point to
+    the free side. Other surfaces have faces on both sides.
+    """
+    round_one = surface.kind in ("sphere", "cylinder")
+    shape = drawn_surface(surface, low, high) if round_one or surface.kind == "box" else {"kind": surface.kind}
+    if shape["kind"] == "plane":
+        shape = _wall(surface, low, high)
+    if shape["kind"] == "box":
+        return solid(shape, [])
+    if shape["kind"] in ("sphere", "cylinder"):
+        radius = float(shape["radius"])
+        corners, faces = solid({"q": HERE, **shape, "size": [abs(radius), shape.get("length", 0.0)]}, [], finer=3)
+        return corners, faces if radius > 0.0 else faces[:, ::-1]
+    (grid,) = [round_patch(surface, low, high)] if round_one else surface_grids(surface, low, high)
+    corners, faces = grid_faces(grid)
+    return corners, np.concatenate([faces, faces[:, ::-1]])
+
+
+def _wall(surface: SceneSurface, low: Array, high: Array) -> dict[str, Any]:
+    """Return a plane as a box behind it, as long and as wide as the box ``low`` to ``high`` requires."""
+    patch = quadric_patch(surface, low, high)
+    u, v, normal = patch[0, 1] - patch[0, 0], patch[1, 0] - patch[0, 0], np.array(surface.direction)
+    size = np.array([np.linalg.norm(u), np.linalg.norm(v), WALL * float((high - low).max())])
+    first = u / size[0]
+    return {
+        "kind": "box",
+        "size": size.tolist(),
+        "p": (patch.mean(axis=(0, 1)) - 0.5 * size[2] * normal).tolist(),
+        "q": of_matrix(np.stack([first, np.cross(normal, first), normal], axis=1)).tolist(),
+    }
+
+
 def solid(shape: dict[str, Any], meshes: list[Mesh], finer: int = 1) -> tuple[Array, Faces]:
     """Return corners, (n, 3) [m], and faces, (m, 4), of a shape of :func:`drawn_shape`.
 
@@ -377,29 +418,16 @@ def solid(shape: dict[str, Any], meshes: list[Mesh], finer: int = 1) -> tuple[Ar
         radius = size[0]
         if shape["kind"] == "cylinder":
             half = 0.5 * size[1]
-            rings = [(0.0, -half), *((radius, z) for z in _cuts(radius, half)), (0.0, half)]
+            rings = [(0.0, -half), (radius, -half), (radius, half), (0.0, half)]
         else:
             half = 0.5 * size[1] if shape["kind"] == "capsule" else 0.0
             ball = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
             apart = np.array([0.0, half])
             low, high = ball[: rings_each + 1] - apart, ball[rings_each:] + apart
-            rings = [*low, *((radius, z) for z in _cuts(radius, half)[1:-1]), *(high if half else high[1:])]
+            rings = [*low, *(high if half else high[1:])]
         corners, faces = _turned(np.array(rings), AROUND * finer)
     turned = rotated(np.array(shape["q"]), corners.T).T
     return np.array(shape["p"]) + turned, faces
-
-
-def _cuts(radius: float, half: float) -> Array:
-    """Return heights from −half to half at which a round side is cut into pieces.
-
-    The pieces are as long as the radius; a long rod has at most three of them at each end. Faces are painted in the
-    order of their centres. If a rod that leans towards the viewer were not cut, its centre might be nearer than the hub
-    at its end, and the rod would hide the hub.
-    """
-    if 2.0 * half <= 2.0 * ENDS * radius:
-        return np.linspace(-half, half, max(int(np.ceil(2.0 * half / max(radius, 1e-12))), 1) + 1)
-    end = radius * np.arange(ENDS + 1)
-    return np.concatenate([end - half, half - end[::-1]])
 
 
 def _box(size: Array) -> tuple[Array, Faces]:
