@@ -59,7 +59,7 @@ def overturning(record: Record) -> Figure | None:
         style.shade(axes, record.time, bare, "#EFEFEF", "a wheel carries no load")
         axes.axhline(1.0, color=style.PULLING, linewidth=0.8, label="slips above 1")
         axes.set_ylim(0.0, min(max(axes.get_ylim()[1], 1.15), TRACTION_TOP))
-    for panels, label in zip(rows, ("load [N]", "tip margin", "traction demand\n|F| / (μ N)"), strict=True):
+    for panels, label in zip(rows, ("load [N]", "tip margin", "traction demand\n/ friction limit"), strict=True):
         for axes in panels:
             _mark_tipping(axes, [record], [style.PULLING])
         panels[0].set_ylabel(label)
@@ -256,12 +256,12 @@ def top_view(record: Record) -> Figure | None:
         return None
     low, high = _extent(body, rows)
     size = high - low
-    wide = size[0] > 1.8 * size[1]
+    stacked = size[0] > 1.8 * size[1] or style.narrow()
     # If the world panel has a separate row, its height follows from its width, with 0.6 inch for labels.
-    above = 0.6 + 6.3 * float(size[1] / size[0])
-    height = 0.8 + above + BELOW if wide else 0.9 + float(np.clip(3.9 * size[1] / size[0], 3.3, 6.0))
+    above = 0.6 + (style.width() - 0.9) * float(size[1] / size[0])
+    height = 0.8 + above + BELOW if stacked else 0.9 + float(np.clip(3.9 * size[1] / size[0], 3.3, 6.0))
     figure = style.new_figure(height, style.title(record, "base from above"))
-    if wide:
+    if stacked:
         world, own = figure.subplots(2, 1, height_ratios=[above, BELOW])
     else:
         world, own = figure.subplots(1, 2, width_ratios=[1.25, 1.0])

@@ -293,7 +293,7 @@ def motors(record: Record) -> Figure | None:
     for (name, (label, entries, keys)), panels in zip(signals.items(), rows, strict=True):
         for axes in panels:
             _draw(axes, record, name, columns[name], shown)
-        _draw_limits(figure, panels[-1], [entries.get(record.labels["current"][k], {}) for k in shown], keys, label)
+        draw_limits(figure, panels[-1], [entries.get(record.labels["current"][k], {}) for k in shown], keys, label)
         panels[0].set_ylabel(label.replace(" [", "\n["))
     style.legend_below(figure, [panels[-1] for panels in rows], 4)
     contacts.mark_all(figure, rows, record)
@@ -326,9 +326,7 @@ def torques(record: Record) -> Figure | None:
         for key, text, look in zip(keys, ("limit (stall)", "rating (for the rms)"), (LIMIT, RATING), strict=True):
             known = [(motor[key], k) for k, motor in enumerate(motors) if key in motor]
             for value, k in known:
-                axes.plot([value, value], [k - 0.45, k + 0.45], color=style.PULLING, **look)
-            if known:
-                axes.plot([], [], color=style.PULLING, label=text, **look)
+                limit_mark(axes, k, value, text, **look)
         axes.set_yticks(level, [called.get(motor["joint"], motor["joint"]) for motor in motors])
         axes.set(ylim=(len(motors) - 0.4, -0.6), xlabel=f"{name} [{symbol}]")
         axes.set_xlim(0.0, 1.05 * axes.get_xlim()[1])
@@ -337,6 +335,11 @@ def torques(record: Record) -> Figure | None:
     if not limits:
         figure.note("The scenario has neither torque limits nor torque ratings of motors.")
     return figure
+
+
+def limit_mark(axes: Axes, level: int, value: float, label: str, **look: Any) -> None:
+    """Draw a limit across a horizontal bar."""
+    axes.plot([value, value], [level - 0.45, level + 0.45], color=style.PULLING, label=label, **{**LIMIT, **look})
 
 
 def _most_loaded(record: Record) -> list[int]:
@@ -364,7 +367,7 @@ def _draw(axes: Axes, record: Record, name: str, columns: Sequence[int], shown: 
     axes.axhline(0.0, color=style.GREY, linewidth=0.6)
 
 
-def _draw_limits(
+def draw_limits(
     figure: style.Drawing, axes: Axes, motors: Sequence[Mapping[str, Any]], keys: Sequence[str], label: str
 ) -> None:
     """Draw limits and ratings of motors if their lines are near the curves; otherwise add a note."""

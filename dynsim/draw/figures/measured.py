@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -33,10 +33,10 @@ def joints(record: Record) -> Figure | None:
     if not followed:
         return None
     shown = _largest(followed, JOINTS)
-    columns = 2 if len(shown) > 3 else 1
+    columns = 2 if len(shown) > (6 if style.narrow() else 3) else 1
     lines = -(-len(shown) // columns)
     note = "" if len(shown) == len(followed) else f"; {len(shown)} of {len(followed)} with the largest error"
-    figure = style.new_figure(1.0 + 1.15 * lines, style.title(record, f"joints and their goals{note}"))
+    figure = style.new_figure(0.9 + 1.15 * lines, style.title(record, f"joints and their goals{note}"))
     grid = figure.subplots(lines, columns, sharex=True, squeeze=False)
     for axes, (label, unit, measured, goal) in zip(grid.T.ravel(), shown, strict=False):
         style.line(axes, record.time, measured, color=style.BLUE, label="measured")
@@ -58,30 +58,38 @@ def following_error(record: Record) -> Figure | None:
         return None
     shown = _largest(followed, LINES)
     note = "" if len(shown) == len(followed) else f"; {len(shown)} of {len(followed)} with the largest error"
-    figure = style.new_figure(3.4 + 0.12 * len(shown), style.title(record, f"following error{note}"))
-    over_time, largest = figure.subplots(2, 1, height_ratios=[1.6, 1.0])
+    figure = style.new_figure(2.9 + 0.17 * len(shown), style.title(record, f"following error{note}"))
+    over_time, largest = figure.subplots(2, 1, height_ratios=[1.7, 0.4 + 0.17 * len(shown)])
     units = {unit for _, unit, _, _ in shown}
     one_unit = f" [m{units.pop()}]" if len(units) == 1 else ""
     looks = style.variant_styles([label for label, *_ in shown])
     for label, unit, measured, goal in shown:
         name = label if one_unit else f"{label} [m{unit}]"
         style.line(over_time, record.time, MILLI * (measured - goal), label=name, **looks[label])
-    over_time.set_ylabel(f"measured − goal{one_unit}")
+    over_time.set_ylabel(f"measured − goal\n{one_unit.strip()}")
     over_time.set_xlabel("time [s]")
     _mark_replay(over_time, record, named=True)
     during = record.time >= 0.0 if (record.time >= 0.0).any() else slice(None)
     errors = [MILLI * np.abs(measured - goal)[during] for _, _, measured, goal in shown]
-    places = np.arange(len(shown))
-    largest.bar(places, [_finite(np.nanmax, error) for error in errors], color="#CFCFCF", width=0.7, label="max")
+    level = np.arange(len(shown))
+    largest.barh(level, [_finite(np.nanmax, error) for error in errors], color="#CFCFCF", height=0.7, label="maximum")
     rms = [_finite(lambda e: np.sqrt(np.nanmean(e**2)), error) for error in errors]
-    largest.bar(places, rms, color=style.BLUE, width=0.4, label="rms")
-    largest.set_xticks(places, [label for label, *_ in shown], rotation=30 if len(shown) > 6 else 0, ha="center")
-    largest.set_ylabel(f"magnitude in the replay{one_unit}")
-    largest.margins(x=0.02)
-    largest.grid(axis="x", visible=False)
-    style.legend_above(largest)
-    figure.legend(*over_time.get_legend_handles_labels(), loc="outside right upper")
+    largest.barh(level, rms, color=style.BLUE, height=0.4, label="rms")
+    for k, (label, *_) in enumerate(shown):
+        if (limit := _limits(record, "following_error_rad").get(label)) is not None:
+            energy.limit_mark(largest, k, MILLI * limit, "limit of the error")
+    largest.set_yticks(level, [label for label, *_ in shown])
+    largest.set(ylim=(len(shown) - 0.4, -0.6), xlabel=f"magnitude during the replay{one_unit}")
+    largest.set_xlim(0.0, 1.05 * largest.get_xlim()[1])
+    largest.grid(axis="y", visible=False)
+    style.legend_below(figure, [over_time, largest], 4)
     return figure
+
+
+def _limits(record: Record, name: str) -> dict[str, float]:
+    """Return a limit of the servo map by joint, such as "torque_N_m"; empty for records of older versions."""
+    limits: dict[str, dict[str, float]] = record.provenance.get("limits", {})
+    return {joint: values[name] for joint, values in limits.items() if name in values}
 
 
 def servos(record: Record) -> Figure | None:
@@ -89,11 +97,11 @@ def servos(record: Record) -> Figure | None:
     rows = [
         (name, label)
         for name, label in (
-            ("torque_estimate", "torque [N m],\nestimated"),
-            ("current", "current [A]"),
+            ("torque_estimate", "estimated\ntorque [N m]"),
+            ("current", "current\n[A]"),
             ("load", "load / stall\ntorque"),
             ("pwm", "PWM / supply\nvoltage"),
-            ("supply_voltage", "supply [V]"),
+            ("supply_voltage", "supply\nvoltage [V]"),
             ("temperature", "temperature\n[°C]"),
         )
         if name in record and record[name].shape[1:] != (0,) and np.isfinite(record[name]).any()
@@ -107,7 +115,7 @@ def servos(record: Record) -> Figure | None:
     timed = "lateness" in record
     note = "" if len(shown) == len(names) else f"; {len(shown)} of {len(names)} with the largest {rows[0][0]}"
     title = style.title(record, f"servos{note.replace('_', ' ')}")
-    figure = style.new_figure(1.1 + 1.35 * (len(rows) + timed), title)
+    figure = style.new_figure(1.1 + 1.2 * (len(rows) + timed), title)
     grid = figure.subplots(len(rows) + timed, 1, sharex=True, squeeze=False)
     for (name, label), axes in zip(rows, grid[:, 0], strict=False):
         columns = dict(zip(record.labels[name], record[name].T, strict=True))
@@ -117,25 +125,27 @@ def servos(record: Record) -> Figure | None:
         axes.set_ylabel(label)
         style.at_least(axes, 0.5)
         _mark_replay(axes, record, named=axes is grid[0, 0])
+    if rows[0][0] == "torque_estimate":
+        limits = _limits(record, "torque_N_m")
+        motors = [{"limit": limits.get(joint)} for joint in shown]
+        energy.draw_limits(figure, grid[0, 0], motors, ("limit",), "torque [N m]")
+    style.legend_below(figure, [grid[0, 0]], 4)
     if timed:
         _cycles(grid[-1, 0], record)
     _label_time(grid)
-    figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside right upper")
     return figure
 
 
 def _cycles(axes: Axes, record: Record) -> None:
     """Draw the lateness of the cycles, and mark cycles in which a servo did not answer."""
-    style.line(axes, record.time, MILLI * record["lateness"], color=style.BLACK, lw=0.9)
+    style.line(axes, record.time, MILLI * record["lateness"], color=style.BLACK, lw=0.9, label="cycle late by")
     if "exchange" in record:
-        style.line(axes, record.time, MILLI * record["exchange"], color=style.SKY, lw=0.9)
-        axes.set_ylabel("late (black),\non the bus [ms]")
-    else:
-        axes.set_ylabel("late [ms]")
+        style.line(axes, record.time, MILLI * record["exchange"], color=style.SKY, lw=0.9, label="exchange on the bus")
+    axes.set_ylabel("duration\n[ms]")
     if "missed" in record and (missed := record["missed"].any(axis=1)).any():
-        axes.plot(record.time[missed], np.zeros(missed.sum()), "x", color=style.PULLING, markersize=4)
-        text = f"× {missed.sum()} cycles with a servo that did not answer"
-        axes.text(0.01, 0.9, text, transform=axes.transAxes, color=style.PULLING, fontsize=style.letters(7.0), va="top")
+        text = f"{missed.sum()} cycles with a servo that did not answer"
+        axes.plot(record.time[missed], np.zeros(missed.sum()), "x", color=style.PULLING, markersize=4, label=text)
+    style.legend_above(axes)
     _mark_replay(axes, record)
 
 
@@ -180,14 +190,18 @@ def _mark_replay(axes: Axes, record: Record, *, named: bool = False) -> None:
         axes.axvline(event.time, color=colour, linestyle=":", linewidth=0.8, zorder=1)
         # Label only some changes, because the first states may follow each other within milliseconds.
         if named and (event.kind == "fault" or event.name == "REPLAY"):
+            # The names are above the axes, and faults above the start of the replay, which may be near.
+            look: dict[str, Any] = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points"}
+            side = "right" if event.time > 0.7 * end + 0.3 * start else "left"
+            level = 2.0 + (event.kind == "fault") * 9.0
             axes.annotate(
-                event.name.lower(),
+                f"fault: {event.name.lower()}" if event.kind == "fault" else event.name.lower(),
                 (event.time, 1.0),
-                xycoords=("data", "axes fraction"),
-                xytext=(3, -8),
-                textcoords="offset points",
+                xytext=(0.0, level),
+                ha=side,
                 color=colour,
                 fontsize=style.letters(7.0),
+                **look,
             )
 
 
@@ -279,33 +293,34 @@ def draw_errors(title: str, time: Array, quantities: Sequence[Compared], named: 
         rows = [style.legend_row() / 72.0 * (3 + min(len(quantity.names), HIGHLIGHTED)) / 2 for quantity in quantities]
         figure = style.new_figure(sum(4.2 + row for row in rows), title)
         panels = figure.subplots(2 * len(quantities), 1, sharex=True)
+        # A joint has the same colour in all panels.
+        chosen: dict[str, None] = {}
+        for quantity in quantities:
+            own = [name for name in (named or chosen) if name in quantity.names]
+            order = sorted(range(len(quantity.names)), key=lambda k: -quantity.rms[k])
+            chosen.update(dict.fromkeys(own or [quantity.names[k] for k in order[:HIGHLIGHTED]]))
+        looks = {name: look | {"linewidth": 1.2} for name, look in style.variant_styles(list(chosen)).items()}
         for quantity, (values, errors) in zip(quantities, panels.reshape(-1, 2), strict=True):
-            _draw(values, errors, time, quantity, named)
+            _draw(values, errors, time, quantity, looks)
         panels[-1].set_xlabel("record time [s]")
         return style.save(figure, path)
 
 
-def _draw(values: Axes, errors: Axes, time: Array, quantity: Compared, named: Sequence[str]) -> None:
-    ranking = sorted(range(len(quantity.names)), key=lambda k: -quantity.rms[k])
-    chosen = [quantity.names.index(name) for name in dict.fromkeys(named) if name in quantity.names] or ranking[
-        :HIGHLIGHTED
-    ]
-    looks = style.variant_styles([quantity.names[k] for k in sorted(chosen)])
+def _draw(values: Axes, errors: Axes, time: Array, quantity: Compared, looks: Mapping[str, dict[str, Any]]) -> None:
+    ranking = sorted(range(len(quantity.names)), key=lambda k: quantity.rms[k])
     simulated, measured = quantity.values
-    coloured = {
-        k: {key: looks[quantity.names[k]][key] for key in ("color", "linestyle")} | {"linewidth": 1.2} for k in chosen
-    }
+    chosen = [k for k, name in enumerate(quantity.names) if name in looks]
     for k in chosen:
-        style.line(values, time, measured[:, k], **coloured[k])
+        style.line(values, time, measured[:, k], **looks[quantity.names[k]])
         style.line(values, time, simulated[:, k], **SIMULATED)
-    for k in [k for k in reversed(ranking) if k not in chosen] + chosen:
-        look = coloured[k] | {"label": quantity.texts[k]} if k in chosen else FAINT
+    for k in [k for k in ranking if k not in chosen] + chosen:
+        look = looks[quantity.names[k]] | {"label": quantity.texts[k]} if k in chosen else FAINT
         style.line(errors, time, quantity.scale * (measured[:, k] - simulated[:, k]), **look)
     if others := len(quantity.names) - len(chosen):
         errors.plot([], [], label=f"the other {others} {quantity.kind}", **FAINT)
     values.plot([], [], label="simulated (measured in colour)", **SIMULATED)
     style.legend_above(values)
     style.legend_above(errors, columns=2)
-    values.set_ylabel(quantity.quantity)
+    values.set_ylabel(quantity.quantity.replace(" [", "\n["))
     errors.axhline(0.0, color=style.GREY, linewidth=0.6)
-    errors.set_ylabel(quantity.error)
+    errors.set_ylabel(quantity.error.replace("− ", "−\n"))

@@ -23,7 +23,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.legend import Legend
 from matplotlib.lines import Line2D
 from matplotlib.text import Text
-from matplotlib.ticker import FuncFormatter, LogFormatter, LogLocator, NullFormatter, NullLocator
+from matplotlib.ticker import AutoLocator, FuncFormatter, LogFormatter, LogLocator, NullFormatter, NullLocator
 from numpy.typing import NDArray
 
 from dynsim.draw.figures.look import Look
@@ -265,7 +265,16 @@ class Drawing(Figure):
         if isinstance(engine, ConstrainedLayoutEngine):
             share = min(used / self.bbox.height, 0.8)
             engine.set(rect=(0.0, share, 1.0, 1.0 - share))
+        # With ticks that depend on the height, the layout may alternate between two heights, and cut labels off.
+        vertical = [(axes.yaxis, axes.yaxis.get_major_locator()) for axes in self.axes]
+        automatic = [(axis, locator) for axis, locator in vertical if isinstance(locator, AutoLocator)]
+        for axis, locator in automatic:
+            locator.set_params(nbins=int(np.clip(0.85 * axis.get_tick_space(), 1, 9)))
+        if engine is not None and any(axes.get_aspect() != "auto" for axes in self.axes):
+            engine.execute(self)  # the space for labels of axes with a fixed aspect is only known afterwards
         super().draw(renderer)
+        for _, locator in automatic:
+            locator.set_params(nbins="auto")
 
 
 def _lines(text: str) -> int:

@@ -674,6 +674,10 @@ class Replay:
         motion, servo_map = self.motion, self.map
         labels = {servo.joint: servo.label for servo in servo_map.servos if servo.label != servo.joint}
         provenance: dict[str, Any] = {"robot": servo_map.robot, "speed": motion.speed, "rate_Hz": motion.plan.rate}
+        provenance["limits"] = {
+            servo.joint: {"torque_N_m": servo.kind.limits.torque, "following_error_rad": servo.kind.following_error}
+            for servo in servo_map.servos
+        }
         self._servos = servo_map.servos
         self._found_holding = False
         self.recorder = Recorder(servo_map)
