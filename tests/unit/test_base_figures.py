@@ -186,7 +186,7 @@ def test_a_peak_of_the_demand_does_not_hide_the_rest(braced: Record) -> None:
     figure = drawn(base.overturning(braced))
     columns = len(figure.axes) // 3
     assert all(axes.get_ylim()[1] <= base.TRACTION_TOP for axes in figure.axes[2 * columns :])
-    assert mentions(figure.axes[-1].get_xlabel(), f"{base.TRACTION_TOP:g}")
+    assert mentions(figure.caption, f"{base.TRACTION_TOP:g}")
 
 
 def test_demand_without_load_is_said_and_no_number(braced: Record) -> None:
@@ -200,7 +200,7 @@ def test_demand_without_load_is_said_and_no_number(braced: Record) -> None:
     assert "inf" not in text
     assert "nan" not in text
     share = 2 * len(rows) / len(record)
-    assert mentions(figure.axes[-1].get_xlabel(), percent(share))
+    assert mentions(figure.caption, percent(share))
     finite = record["traction_demand"][np.isfinite(record["traction_demand"])]
     summary = measures.base_summary(record, 0.0, np.zeros(0), np.zeros(len(record)))
     assert summary["traction_demand_max"] == finite.max()

@@ -212,7 +212,7 @@ def test_scenes_keep_boxes_and_fields_and_figures_draw_them(tmp_path, monkeypatc
 
     monkeypatch.setattr(posture, "Poly3DCollection", Kept)
     axes = plt.figure().add_subplot(projection="3d")
-    for surface, cells in (("box", 6 * 12 * 12), ("hills", 60 * 4)):
+    for surface, cells in (("box", 6), ("hills", 60 * 4)):
         posture._draw_surface(axes, drawn[surface], np.array([-1.0, -2.0, -1.0]), np.array([3.0, 2.0, 2.0]))
         assert quads[-1].shape == (cells, 4, 3)
     plt.close("all")

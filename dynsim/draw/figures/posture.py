@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
-from matplotlib.patches import Polygon
+from matplotlib.patches import Circle, Polygon, Rectangle
 from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d import Axes3D  # type: ignore[import-untyped]
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection  # type: ignore[import-untyped]
@@ -18,18 +19,33 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection  # typ
 from dynsim.draw.figures import style
 from dynsim.draw.figures.energy import edge_on, target_name
 from dynsim.draw.figures.style import Array
+from dynsim.draw.geometry.meshes import Meshes
 from dynsim.draw.geometry.projection import UP, Projection
 from dynsim.draw.geometry.robot import penetrations, placed
-from dynsim.draw.geometry.shapes import Faces, box_about, corners_of, grid_faces, outline, round_patch, surface_grids
+from dynsim.draw.geometry.shapes import (
+    Faces,
+    box_about,
+    corners_of,
+    drawn_shape,
+    grid_faces,
+    outline,
+    round_patch,
+    solid,
+    surface_grids,
+)
 from dynsim.record import Record
 from dynsim.record.measures import hand_target
-from dynsim.record.poses import POSITION, contact_positions, point_positions
+from dynsim.record.poses import POSITION, TOUCHING, contact_positions, point_positions
 from dynsim.record.scene import WORLD, Point, Scene, SceneSurface
 
 # Number of postures, evenly spaced in time, that are drawn faintly in addition to the last one.
-FAINT = 6
+FAINT = 3
 # Labels of contacts: font size, and height of two lines [point].
 LABEL_SIZE, LABEL_HEIGHT = 7.0, 19.0
+# Maximum number of contacts of the robot with labels.
+LABELLED = 8
+# Size of the symbol of a mount, relative to the extent of the view.
+MOUNT = 0.02
 # Distance from the centre of a contact mark to its label [point].
 NEAR_CONTACT = 7.0
 # Extents below this [m] count as zero, because body poses are stored in single precision.
@@ -48,12 +64,12 @@ class Skeleton:
 
         No line leads to a body that moves freely relative to its parent or the world.
         """
-        points, base = self.record[POSITION][row].astype(np.float64), self.scene.base
+        points, base = self.record[POSITION][row].astype(np.float64), (*self.scene.base, *self.objects)
         lines = []
         for k, body in enumerate(self.scene.bodies):
             # A translation of a floating, planar or rolling joint separates two bodies.
             separates = bool(body.joint.part_of) and body.joint.kind in ("prismatic", "planar")
-            # A mobile base is drawn as a solid, see :meth:`solids`.
+            # A mobile base and objects are drawn as solids, see :meth:`solids`.
             if k in base or body.parent in base or separates:
                 continue
             # A prismatic joint at the root moves its body away from its mount.
@@ -62,15 +78,67 @@ class Skeleton:
         hand = self.scene.hand
         if hand is not None and hand.body != WORLD:
             lines.append((points[hand.body], point_positions(self.record, hand, row)))
-        return np.array(lines)
+        return np.array(lines).reshape(-1, 2, 3)
 
     def solids(self, row: int) -> list[tuple[Array, Faces]]:
-        """Return corners, (n, 3) [m], and faces of the shapes of a mobile base and its wheels at a sample."""
-        return [solid for body in self.scene.base for solid in corners_of(self.record, self.scene, body, row)]
+        """Return corners, (n, 3) [m], and faces of the shapes of a mobile base, its wheels, and objects at a sample."""
+        bodies = (*self.scene.base, *self.objects)
+        return [solid for body in bodies for solid in corners_of(self.record, self.scene, body, row)]
 
     def bases(self) -> list[list[Array]]:
-        """Return the corners of the solids of a mobile base for each posture."""
+        """Return the corners of the solids of a mobile base and objects for each posture."""
         return [[corners for corners, _ in self.solids(k)] for k in self.rows_shown()]
+
+    @cached_property
+    def objects(self) -> tuple[int, ...]:
+        """Indices of the bodies of objects that have shapes, and of the bodies on them or before their joints."""
+        scene, known = self.scene, set[int]()
+        for k, body in enumerate(scene.bodies):
+            if body.name in scene.objects or body.joint.part_of in scene.objects or body.parent in known:
+                known.add(k)
+        return tuple(sorted(known)) if any(scene.bodies[k].shapes for k in known) else ()
+
+    def fixed(self) -> list[tuple[Array, Faces]]:
+        """Return corners, (n, 3) [m], and faces of the shapes that are fixed in the world, without meshes."""
+        shapes = (drawn_shape(shape, Meshes()) for shape in self.scene.fixed)
+        return [solid(shape, []) for shape in shapes if shape is not None]
+
+    def mounts(self) -> Array:
+        """Return lines from the fixed frame of the robot to each joint on it, (m, 2, 3) [m]."""
+        bodies, base = self.scene.bodies, (*self.scene.base, *self.objects)
+        frames = [np.array(frame.position) for frame in self.scene.frames if frame.body == WORLD]
+        lines = []
+        for k, body in enumerate(bodies):
+            kinds = {body.joint.kind, *(child.joint.kind for child in bodies if child.parent == k)}
+            if body.parent == WORLD and k not in base and not body.joint.part_of and "revolute" in kinds:
+                end = np.array(body.joint.position)
+                lines.append((min(frames, key=lambda frame: float(np.linalg.norm(frame - end)), default=end), end))
+        return np.array(lines).reshape(-1, 2, 3)
+
+    def pads(self, row: int) -> list[tuple[Array, float]]:
+        """Return the centre [m] and radius [m] of each sphere with which the robot touches surfaces."""
+        spheres = []
+        for point in self.scene.contacts if TOUCHING in self.record else ():
+            rows = np.array([*self.rows_shown()[:1], row])
+            away = np.linalg.norm(
+                point_positions(self.record, point, rows) - contact_positions(self.record, point, rows), axis=-1
+            )
+            # On a capsule, whose link has a shape, the point that touches moves.
+            if point.body not in self.objects and away[-1] > NOTHING and np.ptp(away) < 1e-4 * away[-1] + NOTHING:
+                spheres.append((point_positions(self.record, point, row), float(away[-1])))
+        return spheres
+
+    def extra(self) -> list[Array]:
+        """Return points of solids, mounts and pads, (…, 3) [m], which the views must contain."""
+        rows = self.rows_shown()
+        around = [
+            centre + sign * radius * np.eye(3)
+            for row in rows[-1:]
+            for centre, radius in self.pads(row)
+            for sign in (-1.0, 1.0)
+        ]
+        solids = [corners for base in self.bases() for corners in base]
+        return [*solids, *(corners for corners, _ in self.fixed()), *around, *self.mounts()]
 
     def postures(self) -> list[Array]:
         """Return the segments at the samples of :meth:`rows_shown`; the last sample comes last."""
@@ -132,7 +200,7 @@ class SidePlane(Projection):
         """Label of the horizontal axis of the plane."""
         # Round first; adding 0 removes the sign of a negative zero.
         azimuth = round(float(np.degrees(np.arctan2(self.axes[0, 1], self.axes[0, 0])))) + 0
-        return f"distance from {self.where}, azimuth {azimuth}° [m]"
+        return f"distance from {self.where}, azimuth {style.number(azimuth)}° [m]"
 
 
 def side_plane(record: Record, drawn: Sequence[Array]) -> SidePlane:
@@ -148,7 +216,7 @@ def side_plane(record: Record, drawn: Sequence[Array]) -> SidePlane:
     first = np.array([1.0, 0.0])
     if np.abs(spread).max(initial=0.0) >= NOTHING:
         first = np.linalg.svd(spread, full_matrices=False)[2][0]
-    if (spread @ first).sum() < 0.0:
+    if (spread @ first).sum() < -NOTHING:
         first = -first
     return SidePlane(np.array([*origin[:2], 0.0]), np.array([[*first, 0.0], UP]), where)
 
@@ -165,7 +233,8 @@ class Label:
     @property
     def half(self) -> Array:
         """Half the width and height of the label [point]."""
-        return 0.5 * np.array([LABEL_SIZE * 0.65 * max(map(len, self.text.splitlines())), LABEL_HEIGHT])
+        size = np.array([LABEL_SIZE * 0.65 * max(map(len, self.text.splitlines())), LABEL_HEIGHT])
+        return 0.5 * style.letters(1.0) * size
 
     @property
     def offset(self) -> Array:
@@ -190,6 +259,9 @@ def contact_labels(body: Skeleton, plane: SidePlane, scale: float) -> list[Label
     """
     labels: list[Label] = []
     points = [(*contact, plane.project(contact[2])) for contact in body.contacts()]
+    points = [point for point in points if point[0].body not in body.objects]
+    if len(points) > LABELLED:
+        return []
     for contact, surface, position, force, at in sorted(points, key=lambda entry: float(entry[4][0])):
         along, up = plane.axes @ surface.gradient(position)
         steep = abs(along) > abs(up)
@@ -215,17 +287,23 @@ def bounds(records: Sequence[Record], drawn: Sequence[Array]) -> tuple[Array, Ar
     """Return the corners of the box of a 3D view [m]."""
     low, high = box_about(_clouds(records, drawn))
     # Even a flat scene needs some depth.
-    extra = np.maximum(0.15 * float((high - low).max() or 1.0) - 0.5 * (high - low), 0.0)
+    extra = np.maximum(0.15 * _span(low, high) - 0.5 * (high - low), 0.0)
     return low - extra, high + extra
 
 
 def extent_of(plane: SidePlane, drawn: Sequence[Array], records: Sequence[Record]) -> tuple[Array, Array]:
     """Return the corners of a side view [m]."""
     low, high = box_about([plane.project(points) for points in _clouds(records, drawn)])
-    span = float((high - low).max() or 1.0)
+    span = _span(low, high)
     # The extent of an upright arm alone would leave no width for the axis.
     extra = np.maximum(np.array([0.3, 0.05]) * span - 0.5 * (high - low), 0.0) + 0.05 * span
     return low - extra, high + extra
+
+
+def _span(low: Array, high: Array) -> float:
+    """Return the largest side of a box [m], or 1 m for a point."""
+    span = float((high - low).max())
+    return span if span > NOTHING else 1.0
 
 
 def _clouds(records: Sequence[Record], drawn: Sequence[Array]) -> list[Array]:
@@ -240,8 +318,9 @@ SHORT_AXIS = 0.45
 DOTS = 40
 ARM_COLOUR = "#444444"
 BASE_COLOUR = "#D5D5D5"
-# Width of a side view in figures with one and with two columns [point].
-FULL, HALF = 440.0, 205.0
+PAD_COLOUR = "#F1E3C6"
+# Space for the labels of a side view on its left and right, alone and next to another view [inch].
+FULL, HALF = 1.1, 0.75
 
 
 def posture(record: Record) -> Figure | None:
@@ -254,28 +333,37 @@ def posture(record: Record) -> Figure | None:
     body, note = skeleton(record)
     drawn = body.postures()
     plane = side_plane(record, drawn)
-    everything = [*drawn, *(solid for base in body.bases() for solid in base)]
+    everything = [*drawn, *body.extra()]
     low, high = bounds([record], everything)
-    wide = np.hypot(high[0] - low[0], high[1] - low[1]) > 2.2 * (high[2] - low[2])
+    # The side view is below the 3D view if the arm is long. A narrow figure has no space for a 3D view.
+    wide = style.narrow() or np.hypot(high[0] - low[0], high[1] - low[1]) > 2.2 * (high[2] - low[2])
     extent = extent_of(plane, everything, [record])
     size = extent[1] - extent[0]
-    # The height of the side view follows from its width, plus the axis labels, title and legend.
-    height = 5.6 if wide else 1.15 + float(np.clip(HALF / 72.0 * size[1] / size[0], 1.5, 3.4))
-    room = np.array([FULL, np.inf]) if wide else np.array([HALF, 72.0 * (height - 1.15)])
+    across = style.width() - FULL if wide else 0.5 * style.width() - HALF
+    tall = float(np.clip(across * size[1] / size[0], 1.2 if wide else 1.5, 3.4))
+    above = 3.0 * (wide and not style.narrow())
+    room = 72.0 * np.array([across, tall if not wide else np.inf])
     extent, scale = _with_labels(extent, [body], plane, room)
-    before = ", ".join(style.number(float(record.time[row]), 2) for row in body.rows_shown()[:-1])
-    faint = f"; faint, at {before} s" if before else ""
-    figure = style.new_figure(height, style.title(record, f"posture at {record.time[-1]:.4g} s{faint}"))
+    size = extent[1] - extent[0]
+    tall = min(float(across * size[1] / size[0]), 3.4) if wide else tall
+    figure = style.new_figure(1.2 + tall + above, style.title(record, f"posture at {record.time[-1]:.4g} s"))
     # If the views are side by side, the labels of the 3D view need some space to their right.
-    grid = figure.add_gridspec(2, 1, height_ratios=[1.25, 1.0]) if wide else figure.add_gridspec(1, 2, wspace=0.15)
-    space: Any = figure.add_subplot(grid[0], projection="3d")
-    side = figure.add_subplot(grid[1])
-    _space_view(space, body, (low, high), zoom=1.65 if wide else 1.15)
+    if style.narrow():
+        grid = figure.add_gridspec(1, 1)
+    elif wide:
+        grid = figure.add_gridspec(2, 1, height_ratios=[above, tall + 0.5])
+    else:
+        grid = figure.add_gridspec(1, 2, wspace=0.15)
+    if not style.narrow():
+        _space_view(figure.add_subplot(grid[0], projection="3d"), body, (low, high), wide)
+    side = figure.add_subplot(grid[-1])
     _side_view(side, body, plane, scale, colour=ARM_COLOUR)
     _frame_side(side, plane, extent, body.scene.surfaces)
     if note:
-        side.set_title(note, color=style.PULLING)
+        side.set_title(style.broken(note, across), color=style.PULLING)
     style.legend_below(figure, [side], 5)
+    if before := ", ".join(style.number(float(record.time[row]), 2) for row in body.rows_shown()[:-1]):
+        figure.note(f"Faint: at {before} s.")
     return figure
 
 
@@ -288,19 +376,18 @@ def posture_comparison(records: Mapping[str, Record]) -> Figure | None:
     some = [records[name] for name in shown]
     everything = [segments for body in shown.values() for segments in body.postures()]
     plane = side_plane(some[0], everything)
-    everything += [solid for body in shown.values() for base in body.bases() for solid in base]
+    everything += [points for body in shown.values() for points in body.extra()]
     low, high = extent_of(plane, everything, some)
     size = high - low
     # Upright arms are drawn next to each other.
-    columns = min(len(shown), 4 if size[1] > size[0] else 2)
+    most = (2 if style.narrow() else 4) if size[1] > size[0] else (1 if style.narrow() else 2)
+    columns = min(len(shown), most)
     lines = -(-len(shown) // columns)
-    room = np.array([FULL if columns == 1 else 2.0 * HALF / columns, 72.0 * 3.2])
-    framed, scale = _with_labels((low, high), list(shown.values()), plane, room)
+    across = style.width() - FULL if columns == 1 else (style.width() - 1.5) / columns
+    framed, scale = _with_labels((low, high), list(shown.values()), plane, 72.0 * np.array([across, 3.2]))
     size = framed[1] - framed[0]
-    each = float(np.clip(6.4 / columns * size[1] / size[0], 0.8, 3.2))
-    figure = style.new_figure(
-        0.9 + (0.3 + each) * lines, style.comparison_title(some, "postures at the end, and before (faint)")
-    )
+    each = float(np.clip(across * size[1] / size[0], 0.8, 3.2))
+    figure = style.new_figure(0.9 + (0.3 + each) * lines, style.comparison_title(some, "postures at the end"))
     grid = figure.subplots(lines, columns, sharex=True, sharey="row", squeeze=False)
     styles = style.variant_styles(list(records))
     for axes, (name, body) in zip(grid.ravel(), shown.items(), strict=False):
@@ -314,6 +401,7 @@ def posture_comparison(records: Mapping[str, Record]) -> Figure | None:
     for axes in grid[:, [k for k in range(columns) if columns > 2 and k != columns // 2]].ravel():
         axes.set_xlabel("")
     style.legend_below(figure, list(grid.ravel()), 5)
+    figure.note("Faint: earlier postures.")
     return figure
 
 
@@ -335,8 +423,10 @@ def _frame_side(axes: Axes, plane: SidePlane, extent: tuple[Array, Array], surfa
     axes.set_aspect("equal", adjustable="box")
     axes.set_xlim(low[0], high[0])
     axes.set_ylim(low[1], high[1])
-    axes.set_xlabel(plane.label)
-    axes.set_ylabel("z [m]")
+    is_x = not plane.origin.any() and np.abs(plane.axes[0] - [1.0, 0.0, 0.0]).max() < NOTHING
+    across = axes.get_window_extent().width / axes.figure.dpi
+    axes.set_xlabel("$x$ [m]" if is_x else style.broken(plane.label, across))
+    axes.set_ylabel("$z$ [m]")
     along, z = np.meshgrid(np.linspace(low[0], high[0], 160), np.linspace(low[1], high[1], 120))
     points = plane.world(np.stack([along, z], axis=-1))
     for surface in surfaces:
@@ -357,10 +447,21 @@ def _side_view(
     named: bool = True,
 ) -> None:
     """Draw the side view; if ``named`` is set, the legend states the depth and surface of penetrations."""
+    look: dict[str, Any]
     record, drawn = body.record, body.postures()
+    if drawn:
+        flat = plane.project(np.concatenate(drawn))
+        size = MOUNT * float(np.ptp(flat.reshape(-1, 2), axis=0).max(initial=0.0))
+        for mount in plane.project(body.mounts()):
+            _draw_mount(axes, mount, size, down=bool(flat[..., 1].mean() > mount[1, 1] - 4.0 * size))
+    fixed = [plane.project(corners) for corners, _ in body.fixed()]
+    add_outlines(axes, fixed, edgecolor=style.GREY, facecolor=BASE_COLOUR, lw=0.8, zorder=1.5)
+    for centre, radius in body.pads(body.rows_shown()[-1]) if drawn else []:
+        look = {"facecolor": PAD_COLOUR, "edgecolor": colour, "lw": 0.8, "zorder": 2.8, "label": "contact sphere"}
+        axes.add_patch(Circle(tuple(plane.project(centre)), radius, **look))
     for k, base in enumerate(body.bases()):
         last = k == len(drawn) - 1
-        look: dict[str, Any] = {"facecolor": BASE_COLOUR if last else "none", "alpha": 1.0 if last else 0.22}
+        look = {"facecolor": BASE_COLOUR if last else "none", "alpha": 1.0 if last else 0.22}
         add_outlines(axes, map(plane.project, base), edgecolor=colour, lw=0.8, zorder=2.5, **look)
     for k, segments in enumerate(drawn):
         last = k == len(drawn) - 1
@@ -404,15 +505,26 @@ def _side_view(
             va="center",
             fontsize=style.letters(LABEL_SIZE),
             linespacing=1.1,
+            bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.6, "pad": 0.5},
             # A line connects a distant label with its contact.
             arrowprops={"arrowstyle": "-", "color": style.GREY, "lw": 0.5, "shrinkB": 4} if label.level else None,
         )
 
 
+def _draw_mount(axes: Axes, line: Array, size: float, *, down: bool) -> None:
+    """Draw the link from the ground to the first joint, (2, 2) [m], and the hatched ground below or above it."""
+    x, z = line[0]
+    axes.plot(*line.T, color=style.GREY, lw=5.0, solid_capstyle="butt", zorder=1.6)
+    low = z - size if down else z
+    look: dict[str, Any] = {"facecolor": "white", "edgecolor": style.GREY, "hatch": "//////", "lw": 0.0, "zorder": 1.4}
+    axes.add_patch(Rectangle((x - 2.0 * size, low), 4.0 * size, size, label="_ground", **look))
+    axes.plot([x - 2.0 * size, x + 2.0 * size], [z, z], color=style.GREY, lw=1.2, zorder=1.5)
+
+
 def add_outlines(axes: Axes, solids: Iterable[Array], label: str = "", **look: Any) -> None:
     """Draw the convex hulls of projected solids, (n, 2) each, with one legend entry."""
-    for solid in solids:
-        axes.add_patch(Polygon(outline(solid), label=label, **look))
+    for corners in solids:
+        axes.add_patch(Polygon(outline(corners), label=label, **look))
         label = ""
 
 
@@ -421,13 +533,26 @@ def _opacity(k: int, count: int) -> float:
     return 1.0 if k == count - 1 else 0.12 + 0.2 * k / count
 
 
-def _space_view(axes: Axes3D, body: Skeleton, bounds: tuple[Array, Array], zoom: float) -> None:
+def _space_view(axes: Any, body: Skeleton, bounds: tuple[Array, Array], wide: bool) -> None:
     (low, high), record, drawn = bounds, body.record, body.postures()
     # Use a fixed drawing order; if objects were sorted by depth, the floor would hide the contacts on it.
     axes.computed_zorder = False
     for surface in body.scene.surfaces:
         _draw_surface(axes, surface, low, high)
-    base = body.solids(body.rows_shown()[-1]) if drawn else []
+    base = [*body.fixed(), *(body.solids(body.rows_shown()[-1]) if drawn else [])]
+    size = MOUNT * float((high - low).max())
+    for start, end in body.mounts():
+        axes.plot(*np.array([start, end]).T, color=style.GREY, lw=4.0, zorder=1.6)
+        corners = start + 2.0 * size * np.array([[1, 1, 0], [1, -1, 0], [-1, -1, 0], [-1, 1, 0]])
+        ground = Poly3DCollection([corners], facecolors=BASE_COLOUR, edgecolors=style.GREY, linewidths=0.8, zorder=1.5)
+        axes.add_collection3d(ground, autolim=False)
+    for centre, radius in body.pads(body.rows_shown()[-1]) if drawn else []:
+        angle = np.linspace(0.0, 2.0 * np.pi, 49)
+        for u, v in ((0, 1), (0, 2), (1, 2)):
+            circle = np.tile(centre, (len(angle), 1))
+            circle[:, u] += radius * np.cos(angle)
+            circle[:, v] += radius * np.sin(angle)
+            axes.plot(*circle.T, color=ARM_COLOUR, lw=0.5, zorder=2.6)
     if base:
         # Draw all faces in one collection, because a collection sorts its faces by depth.
         shown = np.concatenate([corners[faces] for corners, faces in base])
@@ -453,13 +578,15 @@ def _space_view(axes: Axes3D, body: Skeleton, bounds: tuple[Array, Array], zoom:
         axes.plot(*position[:, None], linestyle="none", zorder=7, **_contact_mark(force))
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
     # The square of the axes is smaller than the space available for a long arm. Fill the space without clipping.
-    axes.set_box_aspect(tuple(high - low), zoom=zoom)
+    # A high scene must not extend into the view below it.
+    flat = float((high[2] - low[2]) / np.hypot(*(high - low)[:2]))
+    axes.set_box_aspect(tuple(high - low), zoom=float(np.clip(1.9 - 1.1 * flat, 1.2, 1.65)) if wide else 1.15)
     for artist in axes.get_children():
         artist.set_clip_on(False)
         artist.set_in_layout(False)
-    axes.set_xlabel("x [m]", labelpad=-2)
-    axes.set_ylabel("y [m]", labelpad=-3)
-    axes.set_zlabel("z [m]", labelpad=-3)
+    axes.set_xlabel("$x$ [m]", labelpad=-2)
+    axes.set_ylabel("$y$ [m]", labelpad=-3)
+    axes.set_zlabel("$z$ [m]", labelpad=-3)
     axes.tick_params(pad=-1)
     for axis, a, b, share in zip(
         (axes.xaxis, axes.yaxis, axes.zaxis), low, high, (high - low) / (high - low).max(), strict=True
@@ -482,6 +609,11 @@ def _draw_surface(axes: Axes3D, surface: SceneSurface, low: Array, high: Array) 
         grids = surface_grids(surface, low, high)
     if surface.kind in ("height_field", "box"):
         grids = [_within(grid, low, high) for grid in grids]
+    # A flat face is one polygon, because the edges of its cells would form a pattern.
+    flat = surface.kind in ("plane", "box")
+    grids = [
+        grid[:: len(grid) - 1, :: grid.shape[1] - 1] if flat and np.isfinite(grid).all() else grid for grid in grids
+    ]
     quads = np.concatenate([corners[faces] for corners, faces in map(grid_faces, grids)])
     if len(quads):
         axes.add_collection3d(

@@ -1,0 +1,141 @@
+"""Size, font and style of figures: options of the user, settings of matplotlib, style sheets, and errors."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import matplotlib
+import pytest
+from cycler import cycler
+from support.messages import raises
+
+import dynsim
+from dynsim.cli import main
+from dynsim.draw.figures.look import Look
+from dynsim.draw.figures.style import POINTS, WIDTH, Drawing
+from dynsim.errors import RecordError
+from dynsim.record import Record
+from dynsim.scenario import load_scenario
+
+
+@pytest.fixture(scope="module")
+def record() -> Record:
+    changes = {"duration_s": 0.3, "metrics.settle_s": 0.1}
+    return dynsim.simulate(load_scenario("elbow_comparison", "two_elbows", changes))
+
+
+def drawn(record: Record, name: str = "tracking_error", **options: object) -> Drawing:
+    figure = dynsim.figure(record, name, **options)
+    assert isinstance(figure, Drawing)
+    return figure
+
+
+def test_default_size_and_font(record: Record) -> None:
+    figure = drawn(record)
+    label = figure.axes[0].yaxis.label
+    assert (figure.get_figwidth(), label.get_fontsize()) == (WIDTH, POINTS)
+
+
+def test_settings_of_matplotlib_are_respected(record: Record) -> None:
+    with matplotlib.rc_context():
+        matplotlib.rcParams.update(
+            {
+                "font.family": "serif",
+                "font.size": 6.0,
+                "axes.labelsize": 7.0,
+                "figure.figsize": (3.4, 2.9),
+                "lines.linewidth": 3.0,
+                "axes.grid": False,
+                "axes.prop_cycle": cycler(color=["#112233", "#445566", "#778899"]),
+            }
+        )
+        figure = drawn(record)
+        before = dict(matplotlib.rcParams)
+        drawn(record, "motors")
+        assert dict(matplotlib.rcParams) == before
+    assert tuple(figure.get_size_inches()) == (3.4, 2.9)
+    components, distance = figure.axes
+    assert components.yaxis.label.get_family() == ["serif"]
+    assert components.yaxis.label.get_fontsize() == 7.0
+    assert components.yaxis.get_ticklabels()[0].get_fontsize() == pytest.approx(0.88 * 6.0)
+    assert [line.get_color() for line in components.get_lines()[:3]] == ["#112233", "#445566", "#778899"]
+    assert distance.get_lines()[0].get_linewidth() == 3.0
+    assert not any(line.get_visible() for line in components.get_xgridlines())
+
+
+@pytest.mark.parametrize(
+    ("size", "width", "height"), [(5.0, 5.0, None), ("86mm", 86 / 25.4, None), ((4.0, 3.0), 4.0, 3.0), ("4x3", 4, 3)]
+)
+def test_size_of_figure(record: Record, size: object, width: float, height: float | None) -> None:
+    figure = drawn(record, size=size)
+    assert figure.get_figwidth() == pytest.approx(width)
+    assert height is None or figure.get_figheight() == height
+
+
+def test_font_scales_all_letters(record: Record) -> None:
+    figure = drawn(record, font="serif 12")
+    assert figure.axes[0].yaxis.label.get_fontsize() == 12.0
+    assert figure.axes[0].yaxis.label.get_family() == ["serif"]
+    legend = figure.axes[-1].get_legend()
+    assert legend is not None
+    assert legend.get_texts()[0].get_fontsize() == pytest.approx(0.88 * 12.0)
+
+
+def test_later_style_sheet_takes_precedence(record: Record, tmp_path: Path) -> None:
+    for name, width in (("thin", 0.5), ("wide", 2.5)):
+        (tmp_path / f"{name}.mplstyle").write_text(f"lines.linewidth: {width}\naxes.facecolor: eeeeee\n")
+    sheets = [tmp_path / "wide.mplstyle", tmp_path / "thin.mplstyle"]
+    axes = drawn(record, style=sheets).axes[-1]
+    assert axes.get_lines()[0].get_linewidth() == 0.5
+    assert matplotlib.colors.to_hex(axes.get_facecolor()) == "#eeeeee"
+    assert drawn(record, style=f"{sheets[1]},{sheets[0]}").axes[-1].get_lines()[0].get_linewidth() == 2.5
+
+
+def test_caption_has_the_notes_even_if_they_are_not_drawn(record: Record) -> None:
+    figures = [drawn(record, "contact_forces", caption=caption) for caption in (True, False)]
+    assert "5 ms" in figures[0].caption
+    assert figures[0].caption == figures[1].caption
+    shown = ["5 ms" in " ".join(text.get_text() for text in figure.texts) for figure in figures]
+    assert shown == [True, False]
+    assert figures[0].get_figheight() > figures[1].get_figheight()
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"size": "wide"}, ("size", "wide", "3.4x2.4")),
+        ({"size": 0.2}, ("size", "0.2", "1", "40")),
+        ({"size": (3.0, 2.0, 1.0)}, ("size", "pair")),
+        ({"font": "nosuchfont 8"}, ("font", "nosuchfont")),
+        ({"font": "serif 80"}, ("font", "80", "40")),
+        ({"font": ""}, ("font", "family")),
+        ({"style": "nosuchsheet"}, ("style", "nosuchsheet", "ggplot")),
+    ],
+)
+def test_unusable_look_is_an_error(record: Record, options: dict[str, object], words: tuple[str, ...]) -> None:
+    with raises(RecordError, *words):
+        dynsim.figure(record, "tracking_error", **options)
+
+
+@pytest.mark.parametrize("option", [("--size", "wide"), ("--font", "nosuchfont"), ("--style", "nosuchsheet")])
+def test_unusable_option_is_an_error_and_leaves_files(
+    option: tuple[str, str],
+    record: Record,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    file = record.save(tmp_path / "record.h5")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "hand_path.png").write_text("before")
+    monkeypatch.setattr(sys, "argv", ["dynsim", "plot", str(file), "--out", str(tmp_path / "out"), *option])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code
+    assert option[1] in capsys.readouterr().err
+    assert [path.read_text() for path in (tmp_path / "out").iterdir()] == ["before"]
+
+
+def test_look_without_options_is_the_default() -> None:
+    assert Look.of() == Look()
