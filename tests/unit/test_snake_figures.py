@@ -1,5 +1,6 @@
 """Figures and tables of snake runs: files, axes and labels, charts of modes, values beside those of the paper."""
 
+import copy
 import csv
 import re
 
@@ -144,8 +145,8 @@ def test_modes_that_would_fill_the_chart_are_shares_of_time(monkeypatch):
     assert len(modes) == len(np.unique(record["mode"]))
     np.testing.assert_allclose(modes.sum(axis=0), 1.0, atol=1e-12)
     # Below them range and lowest value of each part.
-    for name, signal, scale in (("σ_min of B̃", "sigma_min", 1.0), ("support margin [mm]", "support_margin", 1e3)):
-        (axis,) = [axis for axis in figure.axes if axis.get_ylabel() == name]
+    for name, signal, scale in (("σ_min of B̃", "sigma_min", 1.0), ("support margin", "support_margin", 1e3)):
+        (axis,) = [axis for axis in figure.axes if name in axis.get_ylabel()]
         values = [scale * record[signal][rows] for rows in parts]
         stairs = axis.patches[0].get_data()
         np.testing.assert_allclose(stairs.values, [part.max() for part in values])
@@ -170,14 +171,60 @@ def test_the_overview_of_a_robot_that_stays_has_a_side_view(record):
     plt.close(figure)
 
 
-def test_an_exact_first_sample_does_not_stretch_the_error_axis(record):
-    assert record["position_error"][0] < 1e-15
-    figure = figures.tracking(record)
-    errors = next(axis for axis in figure.axes if axis.get_ylabel() == "position error [m]")
-    low, high = errors.get_ylim()
-    assert low >= 1e-15
-    assert record["position_error"].max() < high
-    plt.close(figure)
+DYNAMIC = [coordinate + ending for coordinate in TABLE_III for ending in ("", "_kinematic", "_measured")]
+PUSHES = [f"{posture}_{axis}" for posture in ("i", "ii", "iii", "iv", "v", "vi", "vii", "ix") for axis in "xyz"]
+
+
+@pytest.mark.parametrize(
+    ("names", "colours", "dashes", "entries"),
+    [
+        (DYNAMIC, 6, 3, 9),  # six manoeuvres from three sources
+        (PUSHES, 7, 6, 24),  # eight postures: the eighth has the colour of the first, with line styles of its own
+        ([f"{pace}_{load}" for pace in ("slow", "fast") for load in "abcde"], 5, 2, 7),
+        ([f"run{k}" for k in range(9)], 7, 2, 9),  # not related
+        (["a", "a_late", "b", "b_late"], 4, 1, 4),  # fewer than the colours
+    ],
+)
+def test_related_variants_share_a_colour(names, colours, dashes, entries):
+    looks, legend = style.family_styles(names)
+    assert list(looks) == names
+    assert len({(look["color"], str(look["linestyle"])) for look in looks.values()}) == len(names)
+    assert len({look["color"] for look in looks.values()}) == colours
+    assert len({str(look["linestyle"]) for look in looks.values()}) == dashes
+    assert len(legend) == entries
+
+
+def test_names_of_variants_have_a_stem_and_an_ending():
+    assert style.families(["ii_z", "ii_z_kinematic", "i_z"]) == {
+        "ii_z": ("ii_z", ""),
+        "ii_z_kinematic": ("ii_z", "kinematic"),
+        "i_z": ("i_z", ""),
+    }
+    assert style.families(["ii_z", "ii_x", "base"]) == {"ii_z": ("ii", "z"), "ii_x": ("ii", "x"), "base": ("base", "")}
+
+
+@pytest.mark.parametrize(
+    ("errors", "scale", "low", "high"),
+    [
+        (np.linspace(0.0, 5e-7, 100), "linear", 0.0, 1.1 * snake_view.ROUNDING),  # a kinematic run
+        (np.append(0.0, np.geomspace(50.0, 0.05, 100)), "log", 0.02, 75.0),
+        (np.linspace(10.0, 50.0, 100), "linear", 0.0, 55.0),
+    ],
+)
+def test_rounding_errors_do_not_stretch_the_error_axis(errors, scale, low, high):
+    axis = style.new_figure(3.0, "").subplots()
+    axis.plot(errors)
+    snake_view.error_axis(axis, errors)
+    assert axis.get_yscale() == scale
+    assert axis.get_ylim()[0] >= low
+    assert axis.get_ylim()[1] == pytest.approx(high)
+
+
+def test_exact_runs_have_a_note_next_to_errors_on_a_logarithmic_axis(record):
+    late = copy.deepcopy(record)
+    late["position_error"][:] = np.geomspace(0.05, 5e-5, len(record))
+    assert mentions(figures.comparison({"exact": record, "late": late}).caption, "1 of 2 variants")
+    assert not figures.comparison({"one": record, "two": record}).caption
 
 
 def test_a_joint_that_is_never_straightened_has_no_time(simulated):
@@ -261,7 +308,7 @@ def test_variants_that_the_paper_does_not_have_get_no_tables(record):
     assert tables("mine", {"cyclic": record}) == {}
 
 
-TASK = {"servos", "gripper", "object"}
+TASK = {"servos", "servo_loads", "power", "wheels", "gripper", "object"}
 KINEMATIC = {"plant.level": "kinematic", "record.rate_hz": 50}
 
 
@@ -297,6 +344,54 @@ def test_servos_beside_their_limits(simulated):
     assert worst["joint"] == "psi2"
     assert line.get_label() == f"ψ2: rms {worst['torque_rms_N_m']:.2f} N m"
     np.testing.assert_array_equal(line.get_ydata(), record["torque"][:, record.labels["torque"].index("psi2")])
+
+
+def test_each_servo_has_a_bar_below_its_limits(simulated):
+    record = simulated("snake_valve", "turns")
+    joints, wheels = drawn(snake_tasks.servo_loads, record).axes
+    motors = {motor["joint"]: motor for motor in record.summary["motors"]}
+    names = record.labels["torque"]
+    for axis, part, stall, nominal in ((joints, names[:17], 8.4, 1.68), (wheels, names[17:], 2.5, 0.5)):
+        bars = {round(bar.get_x() + 0.5 * bar.get_width()): bar for bar in axis.patches}
+        assert len(bars) == len(part)
+        for k, name in enumerate(part):
+            assert bars[k].get_height() == motors[name]["torque_rms_N_m"]
+            assert (bars[k].get_facecolor() == to_rgba(style.ORANGE)) == (bars[k].get_height() > nominal)
+        by_name = lines(axis)
+        np.testing.assert_allclose(by_name["stall torque"].get_ydata(), stall)
+        np.testing.assert_allclose(by_name["nominal torque"].get_ydata(), nominal)
+
+
+def test_the_area_below_the_power_is_the_energy(simulated):
+    record = simulated("snake_valve", "turns")
+    for axis, signal in zip(
+        drawn(snake_tasks.power, record).axes, ("energy_electrical", "work_mechanical"), strict=True
+    ):
+        values, edges, _ = axis.patches[0].get_data()
+        total = record[signal][-1] - record[signal][0]
+        assert (values * np.diff(edges)).sum() == pytest.approx(total, rel=1e-9)
+        assert mentions(axis.get_legend().texts[0].get_text(), style.number(total, 3))
+
+
+def test_wheels_that_lift_off_are_marked_on_their_pair(simulated):
+    record = simulated("snake_valve", "turns")
+    figure = drawn(snake_tasks.wheels, record)
+    loads, ground, slip = figure.axes
+    load = lines(loads)["pair 2"].get_ydata()
+    forces = record["contact_normal_force"]
+    columns = [record.labels["contact_normal_force"].index(f"wheel2{side}") for side in "LR"]
+    np.testing.assert_array_equal(load, forces[:, columns].sum(axis=1))
+    lifted = [band for band in ground.collections if band.get_label() == "a wheel lifts off"]
+    rows = sorted(round(float(np.mean(band.get_paths()[0].get_extents().intervaly))) for band in lifted)
+    pairs = [
+        k
+        for k, down in enumerate(record["grounded"].T > 0, 1)
+        if (down & (forces[:, 2 * k - 2 : 2 * k] <= 0.0).any(axis=1)).any()
+    ]
+    assert rows == pairs
+    assert 2 in rows
+    assert slip.get_ylim()[1] >= slip.lines[1].get_ydata().max() > 1.0
+    assert mentions(figure.caption, "slip distance", "wheel4R")
 
 
 def test_the_gripper_with_its_bounds_states_and_events(simulated):

@@ -427,13 +427,18 @@ def _frame_side(axes: Axes, plane: SidePlane, extent: tuple[Array, Array], surfa
     across = axes.get_window_extent().width / axes.figure.dpi
     axes.set_xlabel("$x$ [m]" if is_x else style.broken(plane.label, across))
     axes.set_ylabel("$z$ [m]")
-    along, z = np.meshgrid(np.linspace(low[0], high[0], 160), np.linspace(low[1], high[1], 120))
-    points = plane.world(np.stack([along, z], axis=-1))
+    draw_cuts(axes, plane, surfaces)
+
+
+def draw_cuts(axes: Axes, plane: Projection, surfaces: Sequence[SceneSurface]) -> None:
+    """Draw surfaces within the limits of the axes: grey inside (C < 0), with a line at the cut with the plane."""
+    along, up = np.meshgrid(np.linspace(*axes.get_xlim(), 160), np.linspace(*axes.get_ylim(), 120))
+    points = plane.world(np.stack([along, up], axis=-1))
     for surface in surfaces:
         value = surface.value(points)
         if value.min() < 0.0 < value.max():
-            axes.contourf(along, z, value, levels=[-np.inf, 0.0], colors=["#ECECEC"], zorder=0)
-            axes.contour(along, z, value, levels=[0.0], colors=[style.GREY], linewidths=1.0, zorder=1)
+            axes.contourf(along, up, value, levels=[-np.inf, 0.0], colors=["#ECECEC"], zorder=0)
+            axes.contour(along, up, value, levels=[0.0], colors=[style.GREY], linewidths=1.0, zorder=1)
 
 
 def _side_view(

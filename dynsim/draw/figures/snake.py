@@ -123,7 +123,7 @@ def overview(record: Record) -> Figure:
     """Draw the whole run in one picture: postures over time, path of the controlled point and its target."""
     rows = moments(record, IN_A_PICTURE)
     views = [View(record, row) for row in rows]
-    every = f", one every {record.time[rows[1]] - record.time[rows[0]]:.2g} s" if len(rows) > 1 else ""
+    every = f", one\u00a0every\u00a0{record.time[rows[1]] - record.time[rows[0]]:.2g}\u00a0s" if len(rows) > 1 else ""
     return overlaid(style.title(record, f"postures{every}"), {"": (record, views)})
 
 

@@ -85,7 +85,7 @@ def servos(record: Record) -> Figure:
         if nominal:
             _both(axis, nominal, f"nominal, rms: {nominal:g} N m", color="black", ls=":", lw=0.9)
         if friction:
-            label = f"gear friction {friction:g} N m: carried\nwithout current"
+            label = f"friction of the gear {friction:g} N m,\ncarried without current"
             axis.axhspan(-friction, friction, color=style.SKY, alpha=0.25, lw=0, zorder=0, label=label)
         axis.set(xlim=(record.time[0], record.time[-1]), ylim=(-1.1 * stall, 1.1 * stall), ylabel="torque [N m]")
         style.legend_beside(axis)

@@ -14,7 +14,7 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from dynsim.draw.figures import style
-from dynsim.draw.figures.posture import add_outlines
+from dynsim.draw.figures.posture import add_outlines, draw_cuts
 from dynsim.draw.figures.style import Array
 from dynsim.draw.geometry.projection import ABOVE, UP, Projection
 from dynsim.draw.geometry.shapes import corners_of, wheel_groups
@@ -68,6 +68,7 @@ class View:
             raise RecordError("cannot draw the record of a snake without a scene that contains its wheels and links")
         self.row, self.time, self.mode = row, float(record.time[row]), int(record["mode"][row])
         self.points: Array = record["posture"][row]
+        self.surfaces = scene.surfaces
         self.path: Array = record["w"][:, :2]
         self.centre: Array = record["centre_of_mass"][row]
         self.grounded = record["grounded"][row].astype(bool)
@@ -90,15 +91,19 @@ class View:
         return self.project(np.concatenate([self.points, *wheels, *self.objects]), above)
 
     def draw(self, axes: Axes, above: bool) -> None:
-        """Draw objects, body, controlled point and wheels and, from above, the support polygon and centre of mass."""
+        """Draw body, controlled point, wheels and objects, surfaces within the limits of the axes, and support polygon.
+
+        The support polygon and the centre of mass are drawn only from above.
+        """
         objects = (self.project(corners, above) for corners in self.objects)
         add_outlines(axes, objects, fc=OBJECT, ec=BODY, lw=0.5, zorder=1.5)
         if above:
             stands = [corners.mean(axis=0)[:2] for k in np.flatnonzero(self.grounded) for corners in self.wheels[k]]
             add_outlines(axes, [np.array(stands)], color=SUPPORT, alpha=0.25, lw=0, zorder=1)
             axes.plot(*self.centre[:2], "x", color="black", ms=4, mew=1.0, zorder=6)
-        else:
-            axes.axhline(0.0, color="#BBBBBB", lw=0.8, zorder=0)
+        # Seen from above, surfaces are cut at the height of the controlled point.
+        plane = Projection(np.array([0.0, 0.0, self.points[0, 2]]), ABOVE.axes) if above else self.beside
+        draw_cuts(axes, plane, self.surfaces)
         self.draw_body(axes, above, BODY, HEAD)
         for down, pair in zip(self.grounded, self.wheels, strict=True):
             # In side view, a lifted pair is drawn slightly above the ground; the model has no height for it ([T] II.A).
@@ -309,7 +314,7 @@ def limit_line(axis: Axes, value: float, text: str = "") -> None:
 
 
 def pair_wheels(record: Record) -> dict[str, list[int]]:
-    """Return the columns of the contact signals that belong to each wheel pair, by its name in words."""
+    """Return the columns of the contact signals that belong to each wheel pair; keys: "pair 1", …."""
     names = record.labels["contact_normal_force"]
     return {
         pair.replace("pair", "pair "): [k for k, n in enumerate(names) if n[:-1] == pair.replace("pair", "wheel")]
@@ -318,7 +323,7 @@ def pair_wheels(record: Record) -> dict[str, list[int]]:
 
 
 def pair_loads(record: Record) -> dict[str, Array]:
-    """Return the load of each wheel pair [N], (T,), by its name in words."""
+    """Return the load of each wheel pair [N], (T,); keys: "pair 1", …."""
     forces = record["contact_normal_force"]
     return {pair: forces[:, columns].sum(axis=1) for pair, columns in pair_wheels(record).items()}
 
@@ -447,6 +452,8 @@ def _explain(figure: style.Drawing, views: Sequence[View], more: Mapping[str, An
         "controlled point": Line2D([], [], color=HEAD, marker="o", ls="", ms=4),
         **more,
     }
+    if any(len(view.surfaces) > 1 for view in views):
+        entries["surface"] = Patch(facecolor="#ECECEC", edgecolor=style.GREY, lw=0.8)
     if any(view.objects for view in views):
         entries["object"] = Patch(facecolor=OBJECT, edgecolor=BODY, lw=0.5)
     figure.put_below(entries, 5)

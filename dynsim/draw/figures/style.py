@@ -416,8 +416,8 @@ def family_styles(names: Sequence[str]) -> tuple[dict[str, dict[str, Any]], dict
     """Return the look of each variant, and the lines of their legend by label.
 
     If there are more variants than colours, related variants share a colour and differ in their line style, see
-    :func:`families`: the colour is that of the stem, or of the ending if there are more endings than stems. The legend
-    then explains colours and line styles separately.
+    :func:`families`. Stems select the colour, unless there are more endings than stems. The legend then explains
+    colours and line styles separately.
     """
     colours, parts = _colours(), families(names)
     stems, endings = (list(dict.fromkeys(part)) for part in zip(*parts.values(), strict=True))
