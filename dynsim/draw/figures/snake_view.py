@@ -161,7 +161,7 @@ def _grid(title: str, rows: Sequence[Sequence[Box]], columns: int, lines: int) -
     axes = figure.subplots(len(heights), columns, squeeze=False, height_ratios=heights)
     for panel in axes.ravel():
         panel.set_aspect("equal", adjustable="box")
-        panel.locator_params(axis="x", nbins=4)
+        panel.locator_params(axis="x", nbins=int(np.clip((cell - 0.3) / style.letters(0.4), 1, 4)))
         panel.locator_params(axis="y", nbins=3)
         panel.tick_params(labelsize=style.letters(SMALL))
     return figure, axes.reshape(len(rows), -1, columns)
