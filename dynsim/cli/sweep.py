@@ -30,6 +30,7 @@ from dynsim.system.terminal import escaped
 
 if TYPE_CHECKING:
     from dynsim.draw.figures.look import Look
+    from dynsim.draw.figures.sweep import Sweep
     from dynsim.studies.sweep import SweepRow
     from dynsim.studies.sweep_plan import Plan
 
@@ -181,11 +182,9 @@ def _draw(
     plotted: Sequence[str] = (),
 ) -> None:
     from dynsim.config.problems import suggest
-    from dynsim.draw.figures.sweep import Sweep, draw
-    from dynsim.scenario.quantities import quantity
-    from dynsim.studies.sweep import OK, TABLES
+    from dynsim.draw.figures.sweep import draw
+    from dynsim.studies.sweep import TABLES
 
-    scenario = plan.scenario(next(plan.points()))
     known = dict.fromkeys(key for row in rows for key in row.numbers)
     unknown = [number for number in plotted if known and number not in known]
     if unknown:
@@ -194,15 +193,36 @@ def _draw(
             f"{suggest(unknown[0], known) if len(unknown) == 1 else ''}; {folder / TABLES[0]} lists all; "
             "use --resume with another --plot to redraw without simulating"
         )
-    # The numbers of a run that stopped early must not be plotted like those of a complete run.
-    table = Sweep(
+    with drawing(folder, quiet):
+        draw(drawn_table(name, rows, plan, plotted), folder, format_, look)
+
+
+def drawn_table(name: str, rows: Sequence[SweepRow], plan: Plan, plotted: Sequence[str] = ()) -> Sweep:
+    """Return the table of a sweep for its figures; runs that stopped early have no numbers.
+
+    Parameters
+    ----------
+    name : str
+        Name of the scenario.
+    rows : sequence of SweepRow
+        Runs.
+    plan : Plan
+        Plan of the sweep.
+    plotted : sequence of str, optional
+        Columns to draw; default: energy and error.
+    """
+    from dynsim.draw.figures.sweep import Sweep
+    from dynsim.scenario.quantities import quantity
+    from dynsim.studies.sweep import OK
+
+    scenario = plan.scenario(next(plan.points()))
+    keys = [*(axis.key for axis in plan.grid), *plan.sampled]
+    return Sweep(
         name,
         [(row if row.status == OK else replace(row, numbers={})).cells() for row in rows],
         [axis.key for axis in plan.grid],
         plan.sampled,
         plan.file.variants,
         plotted,
-        {key: quantity(key, scenario) for key in [*(axis.key for axis in plan.grid), *plan.sampled]},
+        {key: quantity(key, scenario) for key in keys},
     )
-    with drawing(folder, quiet):
-        draw(table, folder, format_, look)

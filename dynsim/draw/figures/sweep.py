@@ -17,8 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap, LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
-from matplotlib.patches import Patch
-from matplotlib.ticker import LogLocator, MaxNLocator
+from matplotlib.ticker import MaxNLocator
 
 from dynsim.draw.figures import style
 from dynsim.draw.figures.look import Look
@@ -86,11 +85,13 @@ class Sweep:
         """Variants in the order of the table; a single variant without a name if the table lists no variants."""
         return list(dict.fromkeys(str(row.get("variant", "")) for row in self.rows))
 
-    def title(self, subject: str) -> str:
-        """Return a title with the scenario, the variant if there is only one, and the number of failed runs."""
+    def figure(self, height: float, subject: str) -> style.Drawing:
+        """Create a figure; its title has the scenario and a single variant, and a note the number of failed runs."""
         variant = f" / {self.variants[0]}" if len(self.variants) == 1 and self.variants[0] else ""
-        bad = sum(map(_failed, self.rows))
-        return f"{self.name}{variant}: {subject}{f'; {bad} of {len(self.rows)} runs failed' if bad else ''}"
+        figure = style.new_figure(height, f"{self.name}{variant}: {subject}")
+        if bad := sum(map(_failed, self.rows)):
+            figure.note(f"{bad} of {len(self.rows)} runs failed.")
+        return figure
 
     @property
     def looks(self) -> dict[str, dict[str, Any]]:
@@ -145,7 +146,7 @@ def lines(sweep: Sweep) -> Figure | None:
         return None
     (key,) = sweep.grid
     styles, metrics, varied = sweep.looks, sweep.metrics, sweep.varied(key)
-    figure = style.new_figure(_PANEL * len(metrics) + _ROOM, sweep.title(f"effect of {varied.name}"))
+    figure = sweep.figure(_PANEL * len(metrics) + _ROOM, f"effect of {varied.name}")
     panels = figure.subplots(len(metrics), 1, sharex=True, squeeze=False)[:, 0]
     levels = _levels(sweep.rows, key)
     numeric = _numeric(levels)
@@ -213,9 +214,10 @@ def heat_map(sweep: Sweep) -> Figure | None:
     grid = _Grid([len(drawn) for drawn in variants.values()], _ACROSS)
     panel = (0.75 if grid.rows > 3 or style.narrow() else 1.0) * _PANEL
     height = panel * grid.rows + _ROOM + _COLOURS * len(grid.bands)
-    figure = style.new_figure(height, sweep.title(f"effect of {sweep.varied(x).name} and {sweep.varied(y).name}"))
+    figure = sweep.figure(height, f"effect of {sweep.varied(x).name} and {sweep.varied(y).name}")
     panels = grid.subplots(figure)
     notes: dict[str, str] = {}
+    contours = False
     for m, (row, (metric, drawn)) in enumerate(zip(panels, metrics.items(), strict=True)):
         tables = np.full((len(variants[metric]), len(ys), len(xs)), np.nan)
         failed = np.zeros(tables.shape, dtype=bool)
@@ -228,6 +230,8 @@ def heat_map(sweep: Sweep) -> Figure | None:
                     failed[k, j, i] = not len(values) and all(map(_failed, runs))
         low, high = np.nanmin(tables), np.nanmax(tables)
         norm = LogNorm(low, high) if _is_wide(low, high) else Normalize(low, high)
+        texts = _cell_texts(tables, norm)
+        written = _fit_cells(texts, grid.width)
         for k, (axes, table, bad, variant) in enumerate(zip(row, tables, failed, variants[metric], strict=False)):
             if len(sweep.variants) > 1:
                 axes.set_title(variant)
@@ -241,7 +245,8 @@ def heat_map(sweep: Sweep) -> Figure | None:
                 notes["no run succeeded"] = style.GREY
             if (np.isnan(table) & ~bad).any():
                 notes["number does not exist"] = _LACKING
-            _write_cells(axes, image, table, grid.width)
+            if written:
+                _write_cells(axes, image, table, texts[k])
             _name_cells(axes, "y", sweep.varied(y), ys, 8, 0.55 * panel)
             _name_cells(axes, "x", sweep.varied(x), xs, 8 if grid.width > _ACROSS else 5, 0.8 * grid.width)
             if k % grid.columns or (m % grid.beside and k < len(variants[next(iter(metrics))])):
@@ -251,14 +256,23 @@ def heat_map(sweep: Sweep) -> Figure | None:
                 axes.tick_params(labelbottom=False)
                 axes.set_xlabel("")
         # Place the colour bar below its panels; next to them, the label would be at the next column.
-        bar = figure.colorbar(image, ax=row, label=drawn.label, location="bottom", aspect=30, pad=0.02)
+        name = style.broken(drawn.label, 0.85 * grid.width * grid.columns)
+        bar = figure.colorbar(image, ax=row, label=name, location="bottom", aspect=30 * grid.columns, pad=0.02)
         if isinstance(norm, LogNorm):
             style.log_axis(bar.ax, "x")
+        if not written and min(tables.shape[1:]) > 1 and high > low:
+            levels = [tick for tick in bar.ax.get_xticks() if low < tick < high]
+            for axes, table in zip(row, tables, strict=False):
+                axes.contour(table, levels=levels, colors="white", linewidths=0.7)
+            contours = True
         if lacking := [variant for variant in sweep.variants if variant not in variants[metric]]:
             figure.note(f"{drawn.name}: does not exist for {', '.join(lacking)}.")
+    if contours:
+        figure.note("White lines: contours at the ticks of the colour bar.")
+    for text, colour in notes.items():
+        panels[0][0].plot([], [], "s", color=colour, markersize=8.0, label=text)
     if notes:
-        handles = [Patch(facecolor=colour, label=text) for text, colour in notes.items()]
-        figure.legend(handles=handles, loc="outside lower right", ncols=len(handles))
+        style.legend_below(figure, [panels[0][0]], 2)
     if others := [*sweep.grid[2:], *sweep.sampled]:
         figure.note(f"Mean over {_listed(sweep, others)}.")
     return figure
@@ -287,8 +301,9 @@ class _Grid:
 
     @property
     def beside(self) -> int:
-        """Number of metrics that are side by side."""
-        return min(len(self.members), self.fit)
+        """Number of metrics that are side by side, without gaps in the figure."""
+        count = len(self.members)
+        return max(k for k in range(1, self.fit + 1) if k == 1 or (count % k == 0 and len(set(self.members)) == 1))
 
     @property
     def columns(self) -> int:
@@ -326,31 +341,34 @@ class _Grid:
         return panels
 
 
-def _write_cells(axes: Axes, image: AxesImage, table: Array, across: float) -> None:
-    """Write the values of a map into its cells if there is space; otherwise draw contours."""
-    size = style.letters(_DIGITS)
-    high = float(np.nanmax(np.abs(table), initial=0.0))
+def _cell_texts(tables: Array, norm: Normalize) -> Any:
+    """Return the values of maps as texts, an array of the same shape; missing values are empty."""
+    high = float(np.nanmax(np.abs(tables)))
     # Equal decimals unless the values differ widely.
-    places = (
-        max(3 - math.floor(math.log10(high)), 0) if 1e-3 < high < 1e5 and not isinstance(image.norm, LogNorm) else None
-    )
-    texts = {
-        at: f"{float(f'{value:.3g}'):g}" if places is None else f"{value:.{places}f}".replace("-", "−")
-        for at, value in np.ndenumerate(table)
-        if np.isfinite(value)
-    }
-    longest = max(map(len, texts.values()), default=0)
-    # Margins with tick labels take up about a fifth of a panel's width.
-    if 0.8 * 72.0 * across / table.shape[1] < 1.15 * longest * style.LETTER * size + 4.0 or table.shape[0] > _CELLS:
-        if min(table.shape) > 1 and np.nanmax(table) > np.nanmin(table):
-            locator = LogLocator(subs=(1.0, 2.0, 5.0)) if isinstance(image.norm, LogNorm) else MaxNLocator(6)
-            levels = locator.tick_values(*map(float, image.get_clim()))
-            axes.contour(table, levels=levels, colors="white", linewidths=0.6)
-        return
-    for (row, column), text in texts.items():
+    equal = 1e-3 < high < 1e5 and not isinstance(norm, LogNorm)
+    places = max(3 - math.floor(math.log10(high)), 0) if equal else 0
+
+    def text(value: float) -> str:
+        shown = f"{value:.{places}f}" if equal else f"{float(f'{value:.3g}'):g}"
+        return shown.replace("-", "−") if np.isfinite(value) else ""
+
+    return np.vectorize(text, otypes=[object])(tables)
+
+
+def _fit_cells(texts: Any, across: float) -> bool:
+    """Return whether texts fit into the cells of maps that are ``across`` wide [inch]."""
+    # Labels of ticks and axes are 0.45 in wide; digits are wider than the mean letter.
+    space = 72.0 * (across - 0.45) / texts.shape[2] - 4.0
+    longest = max(map(len, texts.flat))
+    return bool(space > 1.15 * style.LETTER * style.letters(_DIGITS) * longest and texts.shape[1] <= _CELLS)
+
+
+def _write_cells(axes: Axes, image: AxesImage, table: Array, texts: Any) -> None:
+    """Write the values of a map into its cells, in black or white depending on the colour."""
+    for (row, column), text in np.ndenumerate(texts):
         shade = image.cmap(image.norm(table[row, column]))[:3]
         colour = "black" if np.dot(shade, (0.3, 0.6, 0.1)) > 0.5 else "white"
-        axes.text(column, row, text, ha="center", va="center", fontsize=size, color=colour)
+        axes.text(column, row, text, ha="center", va="center", fontsize=style.letters(_DIGITS), color=colour)
 
 
 def pareto(sweep: Sweep) -> Figure | None:
@@ -359,7 +377,7 @@ def pareto(sweep: Sweep) -> Figure | None:
         return None
     (energy, up), (error, right) = sweep.metrics.items()
     rows = [row for row in sweep.rows if None not in (row.get(error), row.get(energy))]
-    figure = style.new_figure(3.6, sweep.title("energy versus error"))
+    figure = sweep.figure(3.6, "energy versus error")
     axes = figure.subplots()
     styles = sweep.looks
     points = np.array([(right.scale * row[error], up.scale * row[energy]) for row in rows], dtype=float).reshape(-1, 2)
@@ -450,9 +468,9 @@ def samples(sweep: Sweep) -> Figure | None:
     shown = [points[k] for k in np.linspace(0, len(points) - 1, min(room, len(points))).round().astype(int)]
     members = [(variant, point) for variant in variants for point in shown]
     grid = _Grid([len(members)] * len(metrics), _ACROSS)
-    figure = style.new_figure(
+    figure = sweep.figure(
         (_LOW if grid.rows > 1 else _PANEL) * grid.rows + _ROOM,
-        sweep.title(f"distribution over {len(sweep.rows)} random runs"),
+        f"distribution over {len(sweep.rows)} random runs",
     )
     for m, (row, (metric, drawn)) in enumerate(zip(grid.subplots(figure), metrics.items(), strict=True)):
         for k, (axes, (variant, point)) in enumerate(zip(row, members, strict=False)):
@@ -510,9 +528,9 @@ def tornado(sweep: Sweep) -> Figure | None:
     small = style.letters(7.0)
     labels = [style.broken(sweep.deviation(key), 0.48 * grid.width, small) for key in sweep.sampled]
     lines = max(label.count("\n") + 1 for label in labels)
-    figure = style.new_figure(
+    figure = sweep.figure(
         (max(_BAR * (len(variants) + 1), 1.3 / 72.0 * small * lines) * bars + _ROOM) * grid.rows + 0.5,
-        sweep.title("effect of one standard deviation of each parameter"),
+        "effect of one standard deviation of each parameter",
     )
     panels = [row[0] for row in grid.subplots(figure)]
     explained: list[str] = []
@@ -611,10 +629,18 @@ def _is_geometric(levels: Array) -> bool:
 
 def _name_cells(axes: Axes, which: str, varied: Quantity, levels: Sequence[Any], count: int, room: float) -> None:
     """Label the rows or columns of an image, at most about ``count`` of them; the axis is ``room`` long [inch]."""
-    shown = range(0, len(levels), -(-len(levels) // count))
-    texts = [f"{varied.scale * levels[k]:.3g}" if _numeric(levels) else str(levels[k]) for k in shown]
+    at, texts = np.arange(len(levels)), list(map(str, levels))
+    if _numeric(levels):
+        values = varied.scale * np.array(levels, dtype=float)
+        if len(levels) > count and np.ptp(np.diff(values)) < 1e-6 * np.ptp(values):
+            # Many evenly spaced levels have ticks at round numbers.
+            ticks = MaxNLocator(count, steps=_STEPS).tick_values(values[0], values[-1])
+            values = ticks[(ticks > values[0] - 1e-9) & (ticks < values[-1] + 1e-9)]
+            at = np.interp(values, varied.scale * np.array(levels, dtype=float), at)
+        texts = [f"{value:.3g}".replace("-", "−") for value in values]
+    every = -(-len(texts) // (count + 1))
     label = style.broken(_label(varied), room)
-    axes.set(**{f"{which}ticks": list(shown), f"{which}ticklabels": texts, f"{which}label": label})
+    axes.set(**{f"{which}ticks": at[::every], f"{which}ticklabels": texts[::every], f"{which}label": label})
 
 
 def _at(rows: Sequence[Mapping[str, Any]], values: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
