@@ -7,17 +7,16 @@ from pathlib import Path
 import numpy as np
 
 from dynsim.draw.figures.look import Look
-from dynsim.draw.figures.plan import Corner, PlanPicture, Pose, draw_plan_figures
+from dynsim.draw.figures.plan import CornerRun, PlanPicture, Pose, draw_plan_figures
 from dynsim.draw.geometry.meshes import Meshes
 from dynsim.draw.geometry.projection import UP, Array, Projection
 from dynsim.draw.geometry.robot import placed
 from dynsim.draw.geometry.shapes import corners_of, drawn_shape, solid
 from dynsim.errors import SimulationStopped
-from dynsim.planner import verify
 from dynsim.planner.answer import BracePlan, Size
 from dynsim.planner.arm import axis_lines
 from dynsim.planner.problem import Task
-from dynsim.planner.verify import Tolerances
+from dynsim.planner.verify import Corner, Tolerances
 from dynsim.record import Record
 from dynsim.scenario import build
 
@@ -110,7 +109,7 @@ def _base(record: Record | None, view: Projection) -> list[Array]:
     return [view.project(corners) for corners, _ in solids]
 
 
-def _corner(corner: verify.Corner, planned: float, tolerances: Tolerances) -> Corner:
+def _corner(corner: Corner, planned: float, tolerances: Tolerances) -> CornerRun:
     """Return a run with the limits that it must meet."""
     errors = {
         f"friction × {corner.friction_factor:g}": corner.friction_factor != 1.0,
@@ -119,7 +118,7 @@ def _corner(corner: verify.Corner, planned: float, tolerances: Tolerances) -> Co
     label = ", ".join(text for text, differs in errors.items() if differs) or "as planned"
     most = tolerances.heat if any(errors.values()) else 1.0 + tolerances.nominal
     allowed = 1e3 * (abs(corner.surface_shift_m) + tolerances.hand_m)
-    return Corner(label, corner.heat_W / planned, most, 1e3 * corner.hand_rms_m, allowed, bool(corner.reason))
+    return CornerRun(label, corner.heat_W / planned, most, 1e3 * corner.hand_rms_m, allowed, bool(corner.reason))
 
 
 def _view(task: Task) -> Projection:

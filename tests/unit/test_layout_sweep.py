@@ -37,7 +37,7 @@ FRICTION, VOLTAGE, MASS = "contacts.friction", "plant.link.motor.voltage_limit_V
 
 def faults(makers: Mapping[str, Callable[[Any], Figure | None]], of: Any, size: str) -> tuple[list[str], list[str]]:
     """The names of the drawn figures, and all faults of their layout."""
-    names, found_faults = [], []
+    names, overlaps = [], []
     with style.look(Look.of(size)):
         for name, make in makers.items():
             if (figure := make(of)) is None:
@@ -45,9 +45,9 @@ def faults(makers: Mapping[str, Callable[[Any], Figure | None]], of: Any, size: 
             style.literal(figure)
             figure.set_dpi(110)
             names.append(name)
-            found_faults += [f"{name}: {fault}" for fault in layout_faults(figure)]
+            overlaps += [f"{name}: {fault}" for fault in layout_faults(figure)]
             assert figure.get_figwidth() == float(size)
-    return names, found_faults
+    return names, overlaps
 
 
 def run(scenario: str, folder: Path, variants: Sequence[str | None], *keys: str, samples: str = "", **values: Any):
@@ -74,7 +74,10 @@ def _value(text: str) -> float | str | None:
 
 @pytest.mark.parametrize("size", SIZES)
 def test_shipped_sweep_of_the_voltage_has_no_faults(size: str) -> None:
-    assert faults(sweep_figures.FIGURES, shipped_table(VOLTAGE, "voltage"), size) == (["sweep_lines", "sweep_pareto"], [])
+    assert faults(sweep_figures.FIGURES, shipped_table(VOLTAGE, "voltage"), size) == (
+        ["sweep_lines", "sweep_pareto"],
+        [],
+    )
 
 
 @pytest.fixture(scope="module")
@@ -134,8 +137,8 @@ def test_sweeps_of_shipped_scenarios_have_no_faults(scenario: str, tmp_path: Pat
     if not table.metrics:
         table = replace(table, plotted=list(rows[0].numbers)[:2])
     for size in SIZES:
-        for one in (table, replace(table, grid=table.grid[:1])):
-            assert faults(sweep_figures.FIGURES, one, size)[1] == []
+        for drawn in (table, replace(table, grid=table.grid[:1])):
+            assert faults(sweep_figures.FIGURES, drawn, size)[1] == []
 
 
 def plannable() -> Iterator[str]:

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon
 from support.messages import mentions
 
-from dynsim.draw.figures.plan import Corner, PlanPicture, Pose, heat_by_set, posture, robustness, single_braces
+from dynsim.draw.figures.plan import CornerRun, PlanPicture, Pose, heat_by_set, posture, robustness, single_braces
 
 
 def picture(aside: float) -> PlanPicture:
@@ -73,8 +73,8 @@ def test_an_arm_without_braces_has_no_names() -> None:
 def compared() -> PlanPicture:
     """Plans of no brace and of one that does not survive, with two corners."""
     corners = {
-        0: [Corner("as planned", 1.0, 1.05, 0.1, 5.0, False), Corner("up", 1.0, 1.5, 0.1, 10.0, False)],
-        1: [Corner("as planned", 0.8, 1.05, 0.2, 5.0, False), Corner("up", 18.0, 1.5, 12.0, 10.0, True)],
+        0: [CornerRun("as planned", 1.0, 1.05, 0.1, 5.0, False), CornerRun("up", 1.0, 1.5, 0.1, 10.0, False)],
+        1: [CornerRun("as planned", 0.8, 1.05, 0.2, 5.0, False), CornerRun("up", 18.0, 1.5, 12.0, 10.0, True)],
     }
     return replace(
         picture(0.0),

@@ -59,7 +59,7 @@ class Pose:
 
 
 @dataclass(frozen=True)
-class Corner:
+class CornerRun:
     """Simulated run of a plan with errors of friction and surfaces.
 
     Attributes
@@ -108,7 +108,7 @@ class PlanPicture:
         Whether each answer survives verification.
     singles : mapping of str to float
         Heat of single braces by candidate [W].
-    corners : mapping of int to sequence of Corner
+    corners : mapping of int to sequence of CornerRun
         Simulated runs of each answer, by number of braces; the first run is as planned.
     """
 
@@ -122,7 +122,7 @@ class PlanPicture:
     sets: Mapping[int, Sequence[tuple[str, float]]]
     survives: Mapping[int, bool | None]
     singles: Mapping[str, float]
-    corners: Mapping[int, Sequence[Corner]]
+    corners: Mapping[int, Sequence[CornerRun]]
 
 
 def posture(picture: PlanPicture) -> Figure | None:
@@ -219,13 +219,13 @@ def _draw_scale(axes: Axes, picture: PlanPicture, largest: float, length: float)
     force = next(step * power for step in (5.0, 2.0, 1.0) if step * power <= largest)
     (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
     tip = high - 0.05 * (high - low)
-    places = [np.array([left + share * (right - left), tip]) for share in (0.03, 0.9)]
+    corners = [np.array([left + share * (right - left), tip]) for share in (0.03, 0.9)]
     drawn = np.vstack([*(line for pose in picture.poses for line in pose.lines), picture.path])[:, [0, 2]]
-    place = max(places, key=lambda point: np.linalg.norm(drawn - point, axis=1).min())
-    _arrow(axes, place - [0.0, length * force / largest], place)
+    corner = max(corners, key=lambda point: np.linalg.norm(drawn - point, axis=1).min())
+    _arrow(axes, corner - [0.0, length * force / largest], corner)
     axes.annotate(
         f"{force:g} N",
-        (place[0], place[1]),
+        (corner[0], corner[1]),
         xytext=(5.0, -1.0),
         textcoords="offset points",
         va="top",

@@ -17,7 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap, LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import LogLocator, MaxNLocator
 
 from dynsim.draw.figures import style
 from dynsim.draw.figures.look import Look
@@ -36,8 +36,10 @@ _WIDE, _WIDE_GRID = 8.0, 20.0
 _PANEL, _BAR, _ROOM, _COLOURS = 2.1, 0.1, 0.9, 0.6
 # Minimum width of panels that are side by side; many panels may be narrower in a narrow figure [inch].
 _ACROSS, _ACROSS_MANY = 2.3, 1.6
-# Maximum number of panels of a narrow figure that are below each other.
-_STACKED = 4
+# Maximum number of panels of a narrow figure that are below each other; more panels than _MANY are always narrower.
+_STACKED, _MANY = 4, 8
+# Maximum number of variants whose maps are drawn.
+_MAPS = 6
 # Maximum number of distributions below each other, and the height of one [inch].
 _ROWS, _LOW = 5, 1.6
 # Markers of variants; maximum number of runs that are labelled with their number, and size of these numbers [point].
@@ -181,22 +183,10 @@ def lines(sweep: Sweep) -> Figure | None:
     elif style.narrow():
         panels[-1].xaxis.set_major_locator(MaxNLocator(5, steps=_STEPS))
     if len(sweep.variants) > 1:
-        _legend_of_all(list(panels))
+        style.legend_below(figure, list(panels), 4)
     if shaded:
         figure.note(f"Lines: means over {_listed(sweep, sweep.sampled)}; shaded: 95 % of the runs.")
     return figure
-
-
-def _legend_of_all(panels: Sequence[Axes]) -> None:
-    """Place one legend for all panels above the first, also for variants that only another panel shows."""
-    first = {line.get_label() for line in panels[0].lines}
-    for axes in panels[1:]:
-        for drawn in axes.lines:
-            if drawn.get_label() not in first:
-                first.add(drawn.get_label())
-                look = {key: getattr(drawn, f"get_{key}")() for key in ("color", "linestyle", "linewidth", "marker")}
-                panels[0].plot([], [], label=drawn.get_label(), markersize=3.5, **look)
-    style.legend_above(panels[0], columns=4)
 
 
 def heat_map(sweep: Sweep) -> Figure | None:
@@ -207,12 +197,12 @@ def heat_map(sweep: Sweep) -> Figure | None:
     metrics = sweep.metrics
     # A variant without a contact, for example, lacks the force of this contact.
     variants = {
-        metric: [v for v in sweep.variants if any(_failed(r) or r.get(metric) is not None for r in sweep.of(v))]
+        metric: [v for v in sweep.variants if any(_failed(r) or r.get(metric) is not None for r in sweep.of(v))][:_MAPS]
         for metric in metrics
     }
     xs, ys = _levels(sweep.rows, x), _levels(sweep.rows, y)
     grid = _Grid([len(drawn) for drawn in variants.values()], _ACROSS)
-    panel = (0.75 if grid.rows > 3 or style.narrow() else 1.0) * _PANEL
+    panel = (0.6 if grid.rows > 4 else 0.75 if grid.rows > 3 or style.narrow() else 1.0) * _PANEL
     height = panel * grid.rows + _ROOM + _COLOURS * len(grid.bands)
     figure = sweep.figure(height, f"effect of {sweep.varied(x).name} and {sweep.varied(y).name}")
     panels = grid.subplots(figure)
@@ -258,15 +248,23 @@ def heat_map(sweep: Sweep) -> Figure | None:
         # Place the colour bar below its panels; next to them, the label would be at the next column.
         name = style.broken(drawn.label, 0.85 * grid.width * grid.columns)
         bar = figure.colorbar(image, ax=row, label=name, location="bottom", aspect=30 * grid.columns, pad=0.02)
-        if isinstance(norm, LogNorm):
+        ticks = max(int(1.8 * grid.width * grid.columns), 2)
+        if not isinstance(norm, LogNorm):
+            bar.locator = MaxNLocator(min(ticks, 8), steps=_STEPS)
+        elif high > 200.0 * low:
+            bar.ax.xaxis.set_major_locator(LogLocator(numticks=ticks))
+        else:
             style.log_axis(bar.ax, "x")
         if not written and min(tables.shape[1:]) > 1 and high > low:
             levels = [tick for tick in bar.ax.get_xticks() if low < tick < high]
             for axes, table in zip(row, tables, strict=False):
                 axes.contour(table, levels=levels, colors="white", linewidths=0.7)
             contours = True
-        if lacking := [variant for variant in sweep.variants if variant not in variants[metric]]:
+        lacking = [v for v in sweep.variants if all(row.get(metric) is None for row in sweep.of(v))]
+        if lacking := [v for v in lacking if v not in variants[metric]]:
             figure.note(f"{drawn.name}: does not exist for {', '.join(lacking)}.")
+    if len(sweep.variants) > _MAPS:
+        figure.note(f"Maps of at most {_MAPS} of {len(sweep.variants)} variants; --variants selects others.")
     if contours:
         figure.note("White lines: contours at the ticks of the colour bar.")
     for text, colour in notes.items():
@@ -297,13 +295,15 @@ class _Grid:
     def fit(self) -> int:
         """Number of panels that fit side by side."""
         few = style.narrow() and sum(self.members) <= _STACKED
-        return 1 if few else max(1, int(style.width() / (_ACROSS_MANY if style.narrow() else self.across)))
+        across = _ACROSS_MANY if style.narrow() or sum(self.members) > _MANY else self.across
+        return 1 if few else max(1, int(style.width() / across))
 
     @property
     def beside(self) -> int:
-        """Number of metrics that are side by side, without gaps in the figure."""
-        count = len(self.members)
-        return max(k for k in range(1, self.fit + 1) if k == 1 or (count % k == 0 and len(set(self.members)) == 1))
+        """Number of metrics that are side by side, without gaps, so that the figure has few rows."""
+        equal = len(set(self.members)) == 1
+        counts = [k for k in range(self.fit, 0, -1) if k == 1 or (equal and len(self.members) % k == 0)]
+        return min(counts, key=lambda k: -(-max(self.members) // (self.fit // k)) * (len(self.members) // k))
 
     @property
     def columns(self) -> int:
@@ -403,7 +403,7 @@ def pareto(sweep: Sweep) -> Figure | None:
     axes.set(xlabel=right.label, ylabel=up.label)
     _scale(axes, "x", points[:, 0])
     _scale(axes, "y", points[:, 1])
-    style.legend_above(axes, columns=len(sweep.variants) + 1)
+    style.legend_below(figure, [axes], 5)
     front_note = f"{len(rows)} runs. Pareto front: no run is better in both."
     if len(front) <= _NUMBERED and all("run" in row for row in rows):
         figure.note(f"{front_note} Numbers: runs as in the table, the first of equal runs.")
