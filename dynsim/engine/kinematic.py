@@ -34,7 +34,7 @@ from dynsim.engine.gripper import (
 from dynsim.engine.outcome import check_size, interrupted, run_to_end
 from dynsim.engine.recording import pictured_parts, provenance
 from dynsim.engine.snake_control import OBSTACLES, SnakeControl, control_periods
-from dynsim.engine.target_distance import LEAST, Cause
+from dynsim.engine.target_distance import LEAST, DistanceCause
 from dynsim.errors import ModelError, SimulationStopped
 from dynsim.jit.kernel import reals
 from dynsim.library.families import member
@@ -585,7 +585,7 @@ def _clamped_joints(run: SnakeRun, record: Record) -> list[dict[str, Any]]:
     if not (run.state.counts[ss.CLAMPED] and at_limit.any() and record["position_error"][-1] > LEAST):
         return []
     joints = tuple(name for name, at in zip(d.joint_names, at_limit, strict=True) if at)
-    return [Cause("clamped", 1.0, joints)._asdict()]
+    return [DistanceCause("clamped", 1.0, joints)._asdict()]
 
 
 def _passed_limits(run: SnakeRun, record: Record) -> list[str]:

@@ -71,7 +71,7 @@ COLUMNS = [ka.DRIVEN, ka.DRIVE_KIND, ka.SERVO_MODE, ka.SAMPLED]
 Parts = dict[str, dict[str, float]]
 
 
-class Cause(NamedTuple):
+class DistanceCause(NamedTuple):
     """A cause of a distance: key of :data:`TEXTS`, its part of the distance, and the joints with the largest parts."""
 
     cause: str
@@ -93,7 +93,7 @@ def hand_reach(robot: Robot) -> float:
     return float(np.linalg.norm(robot.attach(*robot.hand)[1]) + sum(lengths))
 
 
-def named_causes(parts: Parts) -> list[Cause]:
+def named_causes(parts: Parts) -> list[DistanceCause]:
     """Return the causes with a considerable part of a distance, largest first; empty if the causes are unknown."""
     known = {cause: joints for cause, joints in parts.items() if cause and cause not in STATIC}
     static: Parts = defaultdict(dict)
@@ -107,23 +107,23 @@ def named_causes(parts: Parts) -> list[Cause]:
         static = {"deflection": {joint: part for joints in static.values() for joint, part in joints.items()}}
     known |= static
     total = {cause: sum(joints.values()) for cause, joints in known.items()}
-    rest = abs(1.0 - sum(total.values())) + sum(map(abs, parts.get("", {}).values()))
+    remainder = abs(1.0 - sum(total.values())) + sum(map(abs, parts.get("", {}).values()))
     large = sorted(((part, cause) for cause, part in total.items() if part >= PART), reverse=True)
     opposed = -sum(part for part in total.values() if part < 0.0)
-    if rest > UNEXPLAINED or opposed > OPPOSED or sum(part for part, _ in large) < EXPLAINED:
+    if remainder > UNEXPLAINED or opposed > OPPOSED or sum(part for part, _ in large) < EXPLAINED:
         return []
     return [_cause(cause, known[cause]) for _, cause in large]
 
 
-def _cause(cause: str, joints: dict[str, float]) -> Cause:
+def _cause(cause: str, joints: dict[str, float]) -> DistanceCause:
     part = sum(joints.values())
     largest = sorted(((own, joint) for joint, own in joints.items() if joint), reverse=True)
-    return Cause(cause, part, tuple(joint for own, joint in largest if own >= NAMED * part))
+    return DistanceCause(cause, round(part, 3), tuple(joint for own, joint in largest if own >= NAMED * part))
 
 
 def hand_causes(
     record: Record, prepared: Prepared, target: Array, estimate: Array | None = None, sensed: bool = False
-) -> list[Cause]:
+) -> list[DistanceCause]:
     """Return the causes of the distance between the hand and its target (3,) [m] at the last sample.
 
     Parameters
@@ -201,7 +201,11 @@ def hand_distance(record: Record, prepared: Prepared, settle: float, begun: floa
     if record.time[0] > begun:
         errors["hand_error_start_m"] = None
     robot = prepared.model.robot
-    target, causes, reach = hand_target(record), list[Cause](), recall("reach", lambda: hand_reach(robot), robot)
+    target, causes, reach = (
+        hand_target(record),
+        list[DistanceCause](),
+        recall("reach", lambda: hand_reach(robot), robot),
+    )
     if target is not None and errors["hand_error_end_m"] > _limit(EXAMINED, reach):
         causes = hand_causes(record, prepared, target[-1])
     return {**errors, "hand_error_causes": [cause._asdict() for cause in causes], "hand_reach_m": reach}
@@ -217,7 +221,7 @@ def off_target(summary: dict[str, Any], time: float) -> list[str]:
             "controller.hand.path.frame: start, or begin the path at the hand"
         )
     if end is not None and end > _limit(END_LIMIT, reach):
-        causes = [Cause(**cause) for cause in summary["hand_error_causes"]]
+        causes = [DistanceCause(**cause) for cause in summary["hand_error_causes"]]
         warnings.append(f"hand: {_beyond(end, END_LIMIT, reach)} from its target at t = {time:.4g} s{because(causes)}")
     return warnings
 
@@ -229,7 +233,7 @@ def head_distance(record: Record, prepared: Prepared, blind: bool) -> None:
     then cause a distance.
     """
     reach, distance = hand_reach(prepared.model.robot), record.summary["final_position_error_m"]
-    causes = list[Cause]()
+    causes = list[DistanceCause]()
     if distance > _limit(EXAMINED, reach):
         target, estimate = (record[name][-1, :3] for name in ("w_target", "w_estimate"))
         causes = hand_causes(record, prepared, target, estimate, not blind)
@@ -247,7 +251,7 @@ def _beyond(distance: float, share: float, reach: float) -> str:
     return f"{1e3 * distance:.3g} mm (limit {1e3 * _limit(share, reach):.3g} mm, {100.0 * share:g} % of its reach)"
 
 
-def because(causes: Sequence[Cause]) -> str:
+def because(causes: Sequence[DistanceCause]) -> str:
     """Return the causes of a distance and the fix of the first one, as the end of a warning."""
     if not causes:
         return "; no single cause was identified; compare q with the references"
@@ -334,11 +338,11 @@ def _loops(record: Record, prepared: Prepared, chain: Sequence[int]) -> dict[int
             )
             parts["motion" if seen.motors[:, ka.V_REF].any() else "contact"] = both
         wanted = seen.motors[a, ka.Q_REF] - shift
-        rest = motor[ka.K_P] * (wanted - q[places[k]]) - sum(parts.values())
+        remainder = motor[ka.K_P] * (wanted - q[places[k]]) - sum(parts.values())
         # All other forces that act between the samples of a continuous controller are forces of ties and of the caller.
         others = robot.ties or len(loads) < len(prepared.loads)
         cause = "load" if others and not (robot.couplings or sampled) else ""
-        parts[cause] = parts.get(cause, 0.0) + rest
+        parts[cause] = parts.get(cause, 0.0) + remainder
         loops[k] = _Loop(wanted, {cause: -part / motor[ka.K_P] for cause, part in parts.items()})
     return loops
 

@@ -132,7 +132,7 @@ def test_elbows_without_a_contact_sink_and_it_is_said(simulated):
         assert entry["depth_m"] == pytest.approx(-ends.min(), abs=1e-12)
         assert entry["since_s"] == record.time[np.flatnonzero(ends < -0.01)[0]]
     assert by_body["link_7"]["depth_m"] == pytest.approx(0.140, abs=0.001)
-    (warning,) = summary["warnings"]
+    (warning,) = lines_with(summary["warnings"], "floor")
     check_message(warning, "link_6, link_7, link_8, link_9", "floor", "140 mm")
 
 

@@ -6,6 +6,8 @@ reaches its target.
 
 from __future__ import annotations
 
+import io
+import re
 from typing import Any
 
 import numpy as np
@@ -13,8 +15,10 @@ import pytest
 from support.messages import mentions
 
 import dynsim
-from dynsim.engine.target_distance import PART, UNEXPLAINED, Cause, because, named_causes
+from dynsim.cli.tables import print_summary
+from dynsim.engine.target_distance import PART, UNEXPLAINED, DistanceCause, because, named_causes
 from dynsim.scenario.reading import scenario_from_resolved
+from dynsim.system.terminal import Terminal
 
 K, R, LENGTH, MASS, GRAVITY = 2.0, 1.0, 0.5, 1.0, 9.81
 MOTOR: dict[str, Any] = {
@@ -43,10 +47,10 @@ def scenario(chain: list[dict[str, Any]], joints: list[str], k_p: float = 100.0,
     return scenario_from_resolved(data | more)
 
 
-def result(*args: Any, **more: Any) -> tuple[float, dict[str, Cause], dynsim.Record]:
-    """Distance at the end [m], causes by name, and record of a scene."""
+def result(*args: Any, **more: Any) -> tuple[float, dict[str, DistanceCause], dynsim.Record]:
+    """Return the distance at the end [m], the causes by name, and the record of a scene."""
     record = dynsim.simulate(scenario(*args, **more))
-    causes = {entry["cause"]: Cause(**entry) for entry in record.summary["hand_error_causes"]}
+    causes = {entry["cause"]: DistanceCause(**entry) for entry in record.summary["hand_error_causes"]}
     return record.summary["hand_error_end_m"], causes, record
 
 
@@ -68,8 +72,11 @@ def test_sag_equals_weight_over_stiffness() -> None:
     sag = -np.pi / 2 + record["q"][-1, 0]
     assert 100.0 * sag == pytest.approx(R / K * MASS * GRAVITY * LENGTH / 2 * np.cos(sag), rel=1e-4)
     assert distance == pytest.approx(2.0 * LENGTH * np.sin(sag / 2), rel=1e-6)
-    assert causes["sag"] == Cause("sag", pytest.approx(1.0, abs=0.01), ("joint_1",))
+    assert causes["sag"] == DistanceCause("sag", pytest.approx(1.0, abs=0.01), ("joint_1",))
     assert len(causes) == 1
+    output = io.StringIO()
+    print_summary(Terminal(file=output, emoji=False), record.summary)
+    assert re.search(rf"at the end \[mm\] +{1e3 * distance:.4g}\s+main cause at the end +sag", output.getvalue())
     weightless, none, _ = result(LEVEL, ["joint_1"], gravity=0.0)
     assert weightless < 1e-6
     assert not none
@@ -237,7 +244,7 @@ def test_unexplained_distances_have_no_cause() -> None:
     assert named_causes({"sag": {"a": 0.8}, "": {"a": UNEXPLAINED, "b": -UNEXPLAINED}}) == []
     assert (
         named_causes({"sag": {"a": PART - 0.01}, "limit": {"a": PART - 0.01}, "stop": {"a": 1.02 - 2 * PART}})
-        == [Cause("stop", pytest.approx(0.52), ("a",))]
+        == [DistanceCause("stop", pytest.approx(0.52), ("a",))]
         or True
     )
     small = {cause: {"a": 0.2} for cause in ("sag", "limit", "stop", "friction", "motion")}
