@@ -64,8 +64,8 @@ def robot_scene(robot: Robot, contacts: Sequence[Contact], surfaces: Mapping[str
         body, point = robot.attach(contact.body, contact.point)
         friction = float(contact.friction_at_rest)
         tip = None if contact.tip is None else vector3(robot.attach(contact.body, contact.tip)[1])
-        place = body, vector3(point), contact.surface_name
-        points.append(Point(contact.name, "contact", *place, friction, float(contact.radius), tip))
+        radius, surface = float(contact.radius), contact.surface_name
+        points.append(Point(contact.name, "contact", body, vector3(point), surface, friction, radius, tip))
     return Scene(
         tuple(bodies),
         tuple(drawn_surface(name, surface) for name, surface in surfaces.items()),

@@ -27,6 +27,7 @@ from support.messages import raises, says
 import dynsim
 from dynsim import cli
 from dynsim.draw.geometry.meshes import Meshes, simplified, welded
+from dynsim.draw.geometry.robot import knots
 from dynsim.draw.page import content, page, viewable, write
 from dynsim.draw.page.content import Blocks, three
 from dynsim.draw.page.content import packed_mesh as packed
@@ -105,6 +106,65 @@ def test_frames_are_thinned_only_as_far_as_poses_allow(braced: Record) -> None:
     still.scene = braced.scene
     assert add_body_poses(still)
     assert data_of(page({"one": still}))[0]["records"][0]["frames"]["rows"] <= 5
+
+
+@pytest.mark.parametrize("most", [None, 60])
+def test_knots_reproduce_all_rows(most: int | None) -> None:
+    rng = np.random.default_rng(3)
+    time = np.cumsum(rng.uniform(0.5, 1.5, 3000))
+    data = np.stack(
+        [20.0 * np.sin(time / 200.0), 5.0 * (time > 1500.0), np.cumsum(rng.normal(0.0, 0.05, 3000))], axis=1
+    )
+    data[100:105, 0] = np.nan
+    rows = knots(time, data, most)
+    assert rows[[0, -1]].tolist() == [0, 2999]
+    assert len(rows) < (400 if most is None else most + 2)
+    between = np.stack([np.interp(time, time[rows], column[rows]) for column in data.T], axis=1)
+    if most is None:
+        known = np.isfinite(between).all(axis=1)
+        assert np.abs(between - data)[known].max() <= 1.0 + 1e-9
+        assert known.sum() >= 2990
+        # A step is between neighbouring samples.
+        step = int(np.argmax(time > 1500.0))
+        assert {step - 1, step} <= set(rows.tolist())
+
+
+def test_page_of_18_dynamic_snakes_is_small() -> None:
+    """Records that differ in all signals; three.js takes 0.63 MB."""
+    record = dynsim.simulate(load_scenario("snake_positioning_dynamic", "x", {"duration_s": 4.0}))
+    records: dict[str, Record] = {}
+    for k in range(18):
+        other = Record(record.time, provenance=record.provenance)
+        for name, signal in record.signals.items():
+            data = signal.data if name in (POSITION, ORIENTATION) else signal.data * (1.0 + 0.01 * k)
+            axis = signal.axis
+            other.add(
+                name, data, signal.unit, labels=signal.labels, description=signal.description
+            ) if axis == "time" else None
+        other.scene = record.scene
+        records[f"variant {k}"] = other
+    assert len(page(records).encode()) < 5_000_000
+
+
+def test_signals_have_names_and_units(braced: Record) -> None:
+    """Lengths below 0.1 m are in millimetres, in all records of a page or in none."""
+    head, blocks = data_of(page({"one": braced}))
+    signals = {signal["name"]: signal for signal in head["records"][0]["signals"]}
+    assert not any("_" in signal["words"] for signal in signals.values())
+    assert signals["contact_normal_force"]["words"] == "normal force of contacts"
+    assert signals["contact_gap"]["unit"] == "mm"
+    gap = values(signals["contact_gap"]["data"], blocks)
+    np.testing.assert_allclose(gap, 1e3 * braced["contact_gap"], atol=1e-3)
+    assert signals["hand_position"]["unit"] == "m"
+    far = Record(braced.time)
+    for name in (POSITION, ORIENTATION, "contact_gap"):
+        far.add(
+            name, braced[name] + (0.5 if name == "contact_gap" else 0.0), braced.units[name], labels=braced.labels[name]
+        )
+    far.scene = braced.scene
+    head, _ = data_of(page({"one": braced, "far": far}))
+    units = [{s["name"]: s["unit"] for s in record["signals"]}["contact_gap"] for record in head["records"]]
+    assert units == ["m", "m"]
 
 
 def test_long_signals_keep_their_extremes() -> None:

@@ -615,3 +615,142 @@ def test_a_notebook_shows_the_page(braced: Record, browser: Any, tmp_path: Path)
     assert frame.evaluate("dynsim.state().time") == 1.0
     assert complaints == []
     context.close()
+
+
+CELLS = "[...document.querySelectorAll('#contacts tbody tr')].map((r) => [...r.cells].map((c) => c.textContent))"
+
+
+def test_contact_table_shows_the_record(braced: Record, opened: Opens) -> None:
+    page = opened({"one": braced})
+    for row in (100, 250):
+        page.seek(float(braced.time[row]))
+        cells = page.js(CELLS)
+        assert [cell[0] for cell in cells] == list(braced.labels["contact_normal_force"])
+        for k, (_, normal, tangential, ratio, state) in enumerate(cells):
+            force = braced["contact_normal_force"][row, k]
+            slip = np.linalg.norm(braced["contact_force"][row, k, :2])
+            assert float(normal.replace("−", "-")) == pytest.approx(force, rel=5e-3, abs=0.01)
+            assert float(tangential) == pytest.approx(slip, rel=5e-3, abs=0.01)
+            assert float(ratio) == pytest.approx(slip / (0.1 * abs(force)), abs=0.02)
+            assert state == ("pulls" if force < 0.0 else "pushes")
+
+
+def test_open_contacts_have_no_force_in_the_table(opened: Opens) -> None:
+    record = short("bouncing_link")
+    page = opened({"one": record})
+    row = int(np.flatnonzero(~record["contact_mode"].any(axis=1))[0])
+    page.seek(float(record.time[row]))
+    states = page.js(CELLS)
+    assert states
+    assert all(cells[1:] == ["–", "–", "–", "open"] for cells in states)
+
+
+def test_first_four_variants_are_shown_and_labelled(braced: Record, opened: Opens) -> None:
+    page = opened({f"variant {k}": braced for k in range(9)})
+
+    def shown() -> list[str]:
+        return [record["name"] for record in page.seek(1.0)["records"]]
+
+    labelled = "dynsim.app.labelled.map((a) => a.name)"
+    assert shown() == page.js(labelled) == [f"variant {k}" for k in range(4)]
+    page.page.click("#choose")
+    ticks = page.page.locator("#chooser input")
+    assert ticks.count() == 18
+    # Label the seventh variant: it is shown too, and the variant that was labelled first loses its labels.
+    ticks.nth(2 * 6 + 1).check()
+    assert shown() == ["variant 0", "variant 1", "variant 2", "variant 3", "variant 6"]
+    assert page.js(labelled) == ["variant 1", "variant 2", "variant 3", "variant 6"]
+    colours = page.js("dynsim.app.actors.filter((a) => a.object.visible).map((a) => dynsim.app.colourOf(a))")
+    assert len(set(colours)) == 5
+    ticks.nth(2 * 1).uncheck()
+    assert page.js(labelled) == ["variant 2", "variant 3", "variant 6"]
+    titles = page.page.locator("#contacts tbody th").all_inner_texts()
+    assert titles == ["variant 2", "variant 3", "variant 6"]
+    page.page.locator("#chooser button").nth(1).click()
+    assert len(shown()) == 9
+    assert len(page.js(labelled)) == 4
+    # Nine robots are in several rows, each with its name, and no two at the same place.
+    offsets = np.array([record["offset"] for record in page.state()["records"]])
+    distance = np.linalg.norm(offsets[:, None] - offsets, axis=-1) + np.eye(9)
+    assert distance.min() > 0.3
+    assert np.linalg.matrix_rank(offsets, tol=0.1) == 2
+    page.until("[...document.querySelectorAll('#labels .name')].filter((n) => !n.hidden).length > 6")
+
+
+def test_brace_radius_and_payload_are_drawn(opened: Opens) -> None:
+    loads = {"loads": {"tool": {"type": "payload", "body": "link_5", "point_m": [0, 0, 0.1], "mass_kg": 0.3}}}
+    page = opened({"one": short("brace_on_shapes", "block", **loads)})
+    parts = """dynsim.app.actors[0].bodies.flatMap((b) => b.paint.map(({ role, mesh }) => ({ body: b.name, role,
+        radius: mesh.geometry.parameters.radius, p: mesh.position.toArray(), text: mesh.userData.text })))
+        .filter((p) => ['pad', 'load'].includes(p.role))"""
+    pad, load = page.js(parts)
+    assert (pad["body"], pad["radius"], pad["p"]) == ("link_4", 0.02, [0.0, 0.0, 0.0])
+    assert (load["body"], load["p"]) == ("link_5", [0.0, 0.0, 0.1])
+    assert load["radius"] == pytest.approx((0.75 * 0.3 / (np.pi * 7850.0)) ** (1.0 / 3.0))
+    assert mentions(load["text"], "0.3 kg")
+    # The pad touches the block where the force acts.
+    page.seek(0.5)
+    apart = page.js(
+        "(a => { const c = a.contacts[0]; return c.at.distanceTo(a.bodies[3].object.position); })(dynsim.app.actors[0])"
+    )
+    assert apart == pytest.approx(0.02, abs=1e-4)
+
+
+def pixels_of(page: Any) -> np.ndarray:
+    _, _, text = page.js("dynsim.image()").partition(",")
+    return np.asarray(Image.open(io.BytesIO(base64.b64decode(text))).convert("RGB"), dtype=float)
+
+
+def test_robot_behind_a_box_is_seen_through_it(opened: Opens) -> None:
+    """From below, the block hides a part of the arm, which appears as a translucent silhouette within the block."""
+    page = opened({"one": short("brace_on_shapes", "block")})
+    page.js("for (const name of ['forces', 'trace', 'target', 'cones']) dynsim.set(name, false)")
+    page.js(
+        """(s => { const c = dynsim.app.actors[0].surfaces[0].position; s.preset = null; s.controls.target.copy(c);
+           s.camera.position.set(c.x + 0.5, c.y - 0.5, c.z - 0.6); s.controls.update(); })(dynsim.app.stage)"""
+    )
+    behind = "on => dynsim.app.actors[0].bodies.forEach((b) => b.paint.forEach((p) => { p.behind.visible = on; }))"
+    images = []
+    for on in (True, False):
+        page.js(behind, on)
+        images.append(pixels_of(page))
+    page.js("() => dynsim.app.actors[0].bodies.forEach((b) => { b.object.visible = false; })")
+    bare = pixels_of(page)
+    through = np.abs(images[0] - images[1]).max(axis=-1) > 8.0
+    assert through.sum() > 100
+    # Without silhouettes, these pixels show only the block.
+    np.testing.assert_allclose(images[1][through], bare[through], atol=3.0)
+
+
+def test_wall_between_viewer_and_robot_is_translucent(opened: Opens) -> None:
+    page = opened({"one": short("wall_push", "weak_hold")})
+    opacity = "dynsim.app.actors[0].surfaces[0].material.opacity"
+    pixels_of(page)
+    assert page.js(opacity) == 1
+    page.js("(s => { s.preset = null; s.camera.position.set(5, 0, 1); s.controls.update(); })(dynsim.app.stage)")
+    pixels_of(page)
+    assert 0.0 < page.js(opacity) < 0.5
+
+
+def test_motors_above_their_rating_have_another_colour(robot: Record, opened: Opens) -> None:
+    largest = np.abs(robot["torque"]).max(axis=0)
+    record = Record(robot.time, provenance=robot.provenance)
+    for name, signal in robot.signals.items():
+        record.add(name, signal.data, signal.unit, labels=signal.labels)
+    record.scene = robot.scene
+    names = robot.labels["torque"]
+    ratings = largest * np.where(np.arange(len(names)) == 0, 0.5, 2.0)
+    record.summary = {
+        "motors": [{"joint": n, "nominal_torque_N_m": float(r)} for n, r in zip(names, ratings, strict=True)]
+    }
+    page = opened({"one": record})
+    assert not page.js("[...document.getElementById('colour').options].some((o) => o.value === 'stall')")
+    page.page.select_option("#colour", "rating")
+    row = int(np.abs(record["torque"][:, 0]).argmax())
+    page.seek(float(record.time[row]))
+    painted = "(a => a.data.motors.map(([, k]) => '#' + a.bodies[k].paint[0].material.color.getHexString()))"
+    colours = page.js(f"{painted}(dynsim.app.actors[0])")
+    above = page.js("'#' + new THREE.Color(dynsim.app.colours.saturated).getHexString()")
+    assert colours[0] == above
+    assert above not in colours[1:]
+    assert mentions(page.page.inner_text("#scale"), "rating")

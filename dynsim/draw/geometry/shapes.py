@@ -262,13 +262,8 @@ def _stems(scene: Scene, k: int) -> list[dict[str, Any]]:
 
 def thinnest(shapes: list[list[dict[str, Any]]]) -> float:
     """Return the smallest radius of the rods [m], except stems and pads; 0 without rods."""
-    round_ones = (
-        s
-        for shape in shapes
-        for s in shape
-        if s["kind"] in ("cylinder", "capsule") and s.get("role") not in ("stem", "pad")
-    )
-    return min((shape["size"][0] for shape in round_ones), default=0.0)
+    rods = (s for own in shapes for s in own if s["kind"] in ("cylinder", "capsule"))
+    return min((s["size"][0] for s in rods if s.get("role") not in ("stem", "pad")), default=0.0)
 
 
 def gripper(shapes: list[list[dict[str, Any]]], reach: float) -> dict[str, Any]:
