@@ -14,6 +14,7 @@ SITE = Path(__file__).parent
 ROOT = SITE.parents[1]
 sys.path[:0] = [str(ROOT), str(SITE)]
 
+import figures  # noqa: E402
 import gallery  # noqa: E402
 import reference  # noqa: E402
 
@@ -43,8 +44,9 @@ def on_files(files: Files, config: Any) -> Files:
     files.append(File.generated(config, "reference/commands.md", content=reference.cli_page()))
     files.append(File.generated(config, WORKER, abs_src_path=str(SITE / WORKER)))
     files.append(File.generated(config, "gallery.md", content=gallery.page()))
-    for built in sorted(gallery.BUILT.glob("*/*.*")):
-        name = f"gallery/{built.parent.name}/{built.name}"
+    files.append(File.generated(config, "reference/figures.md", content=figures.page()))
+    for built in sorted([*gallery.BUILT.glob("*/*.*"), *figures.BUILT.glob("*.png")]):
+        name = built.relative_to(ROOT / "build").as_posix()
         files.append(File.generated(config, name, abs_src_path=str(built)))
     for source, target in OUTSIDE.items():
         files.append(File.generated(config, target, content=(ROOT / source).read_text(encoding="utf-8")))

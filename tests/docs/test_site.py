@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import importlib.util
 import os
 import re
@@ -12,6 +13,7 @@ from typing import Any
 from urllib.parse import unquote, urlsplit
 
 import pytest
+from PIL import Image
 from support.messages import lines_with, says
 
 import dynsim
@@ -25,7 +27,7 @@ pytest.importorskip("mkdocstrings")
 
 ROOT = Path(__file__).parents[2]
 OPENED = (
-    "index", "gallery", "getting-started", "python", "how-to/export", "reference/scenario-keys",
+    "index", "gallery", "reference/figures", "getting-started", "python", "how-to/export", "reference/scenario-keys",
     "reference/servo-map-keys", "reference/python", "physics", "validation", "notebooks/sweep",
 )  # fmt: skip
 
@@ -34,16 +36,16 @@ pytestmark = pytest.mark.long
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The site as the command builds it; a warning is an error, but with --quiet it would pass unseen."""
+    """The site as the command builds it, with stills, figures and notebooks; a warning is an error."""
     folder = tmp_path_factory.mktemp("site")
-    gallery = [sys.executable, "docs/site/gallery.py", "--short", "single_pendulum"]
-    subprocess.run(gallery, cwd=ROOT, check=True, timeout=600, capture_output=True)
+    gallery = [sys.executable, "docs/site/gallery.py", "single_pendulum"]
+    subprocess.run(gallery, cwd=ROOT, check=True, timeout=1800, capture_output=True)
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "-f", "docs/site/mkdocs.yml"]
     package = str(Path(dynsim.__file__).parents[1])
     environment = {**os.environ, "NO_MKDOCS_2_WARNING": "1", "PYTHONPATH": package}
     done = subprocess.run(
         [*command, "-d", str(folder)],
-        cwd=ROOT, capture_output=True, text=True, timeout=600, check=False, env=environment,
+        cwd=ROOT, capture_output=True, text=True, timeout=1800, check=False, env=environment,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     return folder
@@ -76,9 +78,57 @@ def test_the_reference_has_every_command_and_every_key(site: Path) -> None:
     gallery = (site / "gallery.html").read_text(encoding="utf-8")
     for file in shipped_scenarios():
         assert f'id="{file.stem}"' in gallery
-    for kept in ("still.png", "view.html"):
+        with Image.open(site / "gallery" / file.stem / "still.png") as still:
+            assert still.size == (480, 300)
+            assert len(still.getcolors(still.width * still.height)) > 20
+    for kept in ("film.gif", "view.html"):
         assert (site / "gallery" / "single_pendulum" / kept).is_file()
     assert says(gallery, "ledger row")
+
+
+def figure_names() -> set[str]:
+    """The names of all figures in the sources: keys of the mappings from file names to drawing functions."""
+    names: set[str] = set()
+    for file in (ROOT / "dynsim" / "draw" / "figures").glob("*.py"):
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            target = node.targets[0] if isinstance(node, ast.Assign) else getattr(node, "target", None)
+            named = getattr(node, "name", getattr(target, "id", ""))
+            if named not in ("figures", "comparisons", "makers", "figures_of_run", "FIGURES", "COMPARISONS"):
+                continue
+            for part in ast.walk(node):
+                if isinstance(part, ast.Dict):
+                    names |= {key.value for key in part.keys if isinstance(key, ast.Constant)}
+                if isinstance(part, ast.Subscript) and isinstance(part.ctx, ast.Store):
+                    names.add(part.slice.value)
+    return names
+
+
+def test_the_catalogue_has_every_figure_with_a_picture(site: Path) -> None:
+    page = (site / "reference" / "figures.html").read_text(encoding="utf-8")
+    shown = re.findall(r'<img alt="(\w+)" src="\.\./(figures/\d+_\w+\.png)"', page)
+    assert {"energy", "compare_energy", "fig_13", "table_iii", "sweep_pareto", "plan_heat"} <= figure_names()
+    assert figure_names() - {name for name, _ in shown} == set()
+    for name, file in shown:
+        assert f"<code>{name}</code>" in page
+        assert (site / file).stat().st_size > 5000, file
+
+
+def test_notebooks_have_their_results(site: Path) -> None:
+    """Pictures and printed results of the last cells, and no warning, which would contain paths of this machine."""
+    for name, result in (("urdf_arm", "link_4 on floor: 0."), ("pressing", "optimal"), ("sweep", "standard deviation")):
+        page = (site / "notebooks" / f"{name}.html").read_text(encoding="utf-8")
+        assert page.count("data:image/png;base64") >= 1, name
+        outputs = "".join(
+            re.findall(r'<div class="jp-Cell-outputWrapper">.*?(?=<div class="jp-Cell |$)', page, re.DOTALL)
+        )
+        assert result in outputs, name
+        assert str(ROOT) not in page
+
+
+def test_the_picture_of_all_scenarios_has_them_all() -> None:
+    """Drawn again with ``python docs/site/gallery.py --sheet``."""
+    with Image.open(ROOT / "docs" / "images" / "scenarios.png") as picture:
+        assert picture.info["scenarios"].split() == [file.stem for file in shipped_scenarios()]
 
 
 @pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
