@@ -23,7 +23,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from dynsim.cli.tables import print_comparison
+from dynsim.cli.comparison import print_comparison
 from dynsim.scenario.combinations import LAWS, METHODS, RESTRICTIONS
 from dynsim.snake.published import TABLE_III
 from dynsim.system.terminal import Terminal
@@ -511,8 +511,8 @@ def between_snakes(k: int, coordinate: int) -> float:
 def comparison() -> str:
     """Return some rows of the table that `dynsim compare elbow_comparison` prints."""
     output = io.StringIO()
-    print_comparison(Terminal(file=output, width=120, emoji=False), validation()["elbow_summaries"])
-    kept = ("electrical energy", "hand error", "deepest", "ledger", "two_elbows", "───")
+    print_comparison(Terminal(file=output, width=120, emoji=False), validation()["elbow_summaries"], every=True)
+    kept = ("electrical energy", "hand error, rms", "deepest", "ledger", "two_elbows", "───")
     text = [line[1:].rstrip() for line in output.getvalue().split("warning: ")[0].splitlines()]
     rows = [row for row in text if any(label in row for label in kept) and "times the minimum" not in row]
     return "```\n" + "\n".join(rows) + "\n```\n"

@@ -19,7 +19,7 @@ from PIL import Image, ImageDraw
 from PIL.PngImagePlugin import PngInfo
 
 import dynsim
-from dynsim.cli.tables import print_comparison, print_summary
+from dynsim.cli.comparison import print_comparison, print_summary
 from dynsim.draw.film.film import HEAD, Film
 from dynsim.draw.film.painter import font
 from dynsim.errors import RecordError, SimulationStopped

@@ -10,7 +10,7 @@ from typing import Annotated, Any, TextIO
 import typer
 
 from dynsim._version import __version__
-from dynsim.cli.tables import console
+from dynsim.cli.output import console
 from dynsim.config import completion
 
 app = typer.Typer(
@@ -54,6 +54,16 @@ TrustOption = Annotated[
     typer.Option(
         "--trust", help="Accept records whose digest is missing or wrong (written or changed by another program)."
     ),
+]
+
+
+class Rows(StrEnum):
+    screen = "screen"
+    all = "all"
+
+
+RowsOption = Annotated[
+    Rows, typer.Option("--rows", help="Rows and warnings to print: as many as fit on a screen, or all.")
 ]
 FiguresOption = Annotated[bool, typer.Option("--no-figures", help="Skip the figures and view.html.")]
 

@@ -17,6 +17,8 @@ from dynsim.cli.app import (
     FormatOption,
     QuietOption,
     RecordsArgument,
+    Rows,
+    RowsOption,
     ScenarioArgument,
     SetOption,
     SizeOption,
@@ -28,6 +30,7 @@ from dynsim.cli.app import (
     option,
     parsed_overrides,
 )
+from dynsim.cli.comparison import print_comparison, print_summary
 from dynsim.cli.drawing import (
     Figures,
     Page,
@@ -42,27 +45,23 @@ from dynsim.cli.drawing import (
 )
 from dynsim.cli.export import export
 from dynsim.cli.hardware import EXAMPLE, IMPORT_EXAMPLE, hw, hw_drive, import_recording
+from dynsim.cli.output import (
+    console,
+    errors,
+    print_error,
+    print_line,
+    print_warning,
+    print_written,
+    progress,
+    show_compilation,
+)
 from dynsim.cli.plan import EXAMPLE as PLAN_EXAMPLE
 from dynsim.cli.plan import plan
 from dynsim.cli.pose import EXAMPLE as POSE_EXAMPLE
 from dynsim.cli.pose import pose, view_starts
+from dynsim.cli.records import labelled, record_files
 from dynsim.cli.sweep import sweep
-from dynsim.cli.tables import (
-    console,
-    errors,
-    labelled,
-    print_choices,
-    print_comparison,
-    print_error,
-    print_line,
-    print_starts,
-    print_summary,
-    print_warning,
-    print_written,
-    progress,
-    record_files,
-    show_compilation,
-)
+from dynsim.cli.tables import print_choices, print_starts
 from dynsim.cli.teleop import teleop
 from dynsim.config import completion
 from dynsim.errors import DynsimError, RecordError, SimulationInterrupted, SimulationStopped
@@ -83,6 +82,7 @@ def run(
     no_figures: FiguresOption = False,
     format_: FormatOption = FigureFormat.png,
     view: Annotated[bool, typer.Option("--view", help="Open the 3D page in a browser when the run is done.")] = False,
+    rows: RowsOption = Rows.screen,
     quiet: QuietOption = False,
 ) -> None:
     """Simulate one scenario; write its record, summary, figures and a 3D page.
@@ -118,7 +118,7 @@ def run(
         elif view:
             page = shown.draw()
     if not quiet:
-        print_summary(console, record.summary)
+        print_summary(console, record.summary, rows is Rows.all)
         print_written(folder)
     print_page(page, quiet)
     if view and page is not None:
@@ -136,6 +136,7 @@ def compare(
     size: SizeOption = None,
     font: FontOption = None,
     style: StyleOption = None,
+    rows: RowsOption = Rows.screen,
     quiet: QuietOption = False,
 ) -> None:
     """Simulate all variants of a scenario and compare them in a table and figures."""
@@ -191,7 +192,7 @@ def compare(
                 together = Figures(records, folder, format_, look, together=True)
                 page = draw_all([together, *wanted], Page(records, folder), quiet)
         if not quiet:
-            print_comparison(console, {name: record.summary for name, record in records.items()})
+            print_comparison(console, {name: record.summary for name, record in records.items()}, rows is Rows.all)
             print_written(folder)
         if not no_figures:
             print_page(page, quiet)

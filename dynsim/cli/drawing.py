@@ -15,17 +15,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from dynsim.cli.app import QuietOption, RecordsArgument, TrustOption, option
-from dynsim.cli.tables import (
-    console,
-    drawing,
-    errors,
-    film_progress,
-    labelled,
-    print_line,
-    print_warning,
-    print_written,
-    record_files,
-)
+from dynsim.cli.output import console, drawing, errors, film_progress, print_line, print_warning, print_written
+from dynsim.cli.records import labelled, record_files
 from dynsim.errors import RecordError
 from dynsim.system import interruption
 from dynsim.system.terminal import escaped

@@ -14,7 +14,7 @@ from typing import Any
 import typer
 
 from dynsim.cli.commands import app
-from dynsim.cli.tables import print_error, print_warning
+from dynsim.cli.output import print_error, print_warning
 from dynsim.errors import DynsimError, SimulationInterrupted
 from dynsim.system import interruption
 from dynsim.system.terminal import lenient_streams

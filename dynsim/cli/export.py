@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 import typer
 
 from dynsim.cli.app import SetOption, TrustOption, VariantOption, parsed_overrides
-from dynsim.cli.tables import console, print_line, print_warning
+from dynsim.cli.output import console, print_line, print_warning
 from dynsim.errors import DynsimError, RecordError, ScenarioError, first_few
 from dynsim.system.terminal import escaped
 

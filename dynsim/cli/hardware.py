@@ -14,7 +14,7 @@ from rich.table import Table
 
 from dynsim.cli.app import QuietOption, ScenarioArgument, SetOption, TrustOption, parsed_overrides
 from dynsim.cli.drawing import write_view
-from dynsim.cli.tables import print_error
+from dynsim.cli.output import print_error
 from dynsim.cli.teleop import (
     BaseSpeedOption,
     HttpPortOption,

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich import box
 
 from dynsim.cli.app import (
     FigureFormat,
@@ -22,9 +23,13 @@ from dynsim.cli.app import (
     option,
     parsed_overrides,
 )
-from dynsim.cli.tables import plan_progress, print_line, print_plan, print_written
+from dynsim.cli.output import console, plan_progress, print_line, print_written
+from dynsim.cli.tables import new_table
 from dynsim.errors import ScenarioError, UnreachableReference
 from dynsim.system.terminal import escaped
+
+if TYPE_CHECKING:
+    from dynsim.planner.answer import BracePlan, Size
 
 EXAMPLE = "Example: dynsim plan pressing --count 0:3 --candidates link_3:link_9"
 
@@ -174,3 +179,79 @@ def _gains(text: str) -> tuple[float, ...]:
     if not values or not all(0.0 < gain < float("inf") for gain in values):
         raise ScenarioError(f"--gains {escaped(text)}: must be comma-separated positive numbers, such as 500,100,20")
     return values
+
+
+# Table of a brace plan. A brace counts as lifted off if it is in contact for less than this fraction of the time.
+LIFTED = 0.999
+
+
+def print_plan(plan: BracePlan) -> None:
+    """Print a table row for each number of braces, then the reasons why plans were rejected or not found."""
+    table = new_table(f"{plan.task.scenario.title}: braces", box=box.HEAVY_HEAD)
+    heads = (
+        "braces", "on", "heat [W]", "simulated [W]", "all energy [J]", "k_p [V/rad]", "forces [N]", "rounds",
+        "survives",
+    )  # fmt: skip
+    for head in heads:
+        table.add_column(head, justify="left" if head in ("on", "survives") else "right")
+    for size in plan.sizes:
+        table.add_row(*_cells(size))
+    console.print(table)
+    if any(size.planned is not None and size.agreed == 0 for size in plan.sizes):
+        print_line("rounds: search rounds that found this heat independently; 0 if it was found by exchanging braces")
+    best = plan.best
+    if best is not None:
+        label = escaped(best.label) if best.braces else "no braces"
+        print_line(f"best: {label}{' (rejected)' if best.survives is False else ''}")
+    for size in plan.sizes:
+        for text in _notes(size):
+            print_line(f"{size.count} brace{'' if size.count == 1 else 's'}: {escaped(text)}")
+    missed, reached = len(plan.tally.missed), len(plan.tally.reached)
+    if missed:
+        print_line(
+            f"no posture found for {missed} of {missed + reached} sets tried; this does not prove that none exists"
+        )
+
+
+def _cells(size: Size) -> tuple[str, ...]:
+    if size.planned is None:
+        return str(size.count), "not found", "–", "–", "–", "–", "–", f"0/{size.rounds}", "–"
+    dense, nominal = size.planned.dense, size.nominal
+    forces = f"{dense.forces.min():.3g} … {dense.forces.max():.3g}" if size.count else "–"
+    survives = {True: "yes", False: "no", None: "not verified"}[size.survives]
+    return (
+        str(size.count),
+        escaped(size.label),
+        f"{size.heat:.4g}",
+        "–" if nominal is None else f"{nominal.heat_W:.4g}",
+        "–" if nominal is None else f"{nominal.electrical_energy_J:.4g}",
+        f"{size.k_p:g}",
+        forces,
+        f"{size.agreed}/{size.rounds}",
+        survives,
+    )
+
+
+def _tolerated(shift_m: float | None, friction: float | None) -> list[str]:
+    """Return a text about the errors that a rejected plan tolerates, within the tested range."""
+    texts = []
+    if shift_m is not None:
+        texts.append(f"{1e3 * shift_m:.2g} mm surface error" if shift_m else "no tested surface error")
+    if friction is not None:
+        texts.append(f"{100 * friction:.2g} % friction error" if friction else "no tested friction error")
+    return [f"tolerates, one at a time and in both directions: {' and '.join(texts)}"] if texts else []
+
+
+def _notes(size: Size) -> list[str]:
+    notes = [f"rejected, {size.reason}"] if size.planned is not None and size.reason else []
+    if size.planned is None:
+        notes.append(size.reason)
+    if size.verdict is not None and not size.verdict.sound:
+        notes.append(f"rejected as planned with k_p = {size.k_p:g} V/rad: errors were not tested")
+    for brace, share in ({} if size.nominal is None else size.nominal.closed_fraction).items():
+        if share < LIFTED:
+            notes.append(f"{brace} lifts off for {100.0 * (1.0 - share):.2g} % of the time in the run without errors")
+    if size.tolerance is not None:
+        notes += _tolerated(*size.tolerance)
+    notes += [f"{label} would need less heat, but: {why}" for label, why in size.cheaper]
+    return notes

@@ -10,7 +10,7 @@ import typer
 
 from dynsim.cli.app import ScenarioArgument, SetOption, VariantOption, parsed_overrides
 from dynsim.cli.drawing import open_page, print_page
-from dynsim.cli.tables import console, print_line
+from dynsim.cli.output import console, print_line
 from dynsim.cli.teleop import HttpPortOption, OpenOption, UntilClosedOption, print_address, require
 from dynsim.system import interruption
 

@@ -24,7 +24,7 @@ from dynsim.cli.app import (
     option,
     parsed_overrides,
 )
-from dynsim.cli.tables import drawing, errors, print_line, print_warning, sweep_progress
+from dynsim.cli.output import drawing, errors, print_line, print_warning, sweep_progress
 from dynsim.errors import ScenarioError, SimulationStopped
 from dynsim.system.terminal import escaped
 

@@ -19,7 +19,7 @@ from dynsim.cli.app import (
     parsed_overrides,
 )
 from dynsim.cli.drawing import open_address, write_view
-from dynsim.cli.tables import console, errors, print_line, print_written
+from dynsim.cli.output import console, errors, print_line, print_written
 from dynsim.errors import DynsimError
 from dynsim.system import interruption
 from dynsim.system.terminal import escaped

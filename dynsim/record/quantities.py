@@ -18,12 +18,14 @@ SMALL_M = 0.1
 _QUALIFIERS = ("rms", "max", "min", "mean", "final", "initial")
 # Names that the words of a key do not give.
 _NAMES = {
-    "electrical_energy_supply": "electrical energy, one supply",
-    "electrical_energy_drawn": "electrical energy, separate supplies",
+    "electrical_energy_supply": "energy, one supply",
+    "electrical_energy_drawn": "energy, separate supplies",
     "joule_heat": "Joule heat",
     "impact_loss": "impact loss, all contacts",
     "scheme_loss": "loss of time stepping",
     "hand_error_z_rms": "hand error, vertical, rms",
+    "hand_error_start": "hand error, at the start",
+    "hand_error_end": "hand error, at the end",
     "hand_turn_error_rms": "hand orientation error, rms",
     "hand_turn_error_max": "hand orientation error, max",
     "joint_limit_violation_max": "joint limit exceeded by",

@@ -6,7 +6,10 @@ Transactions on Robotics 35(1), 2019.
 
 from __future__ import annotations
 
+import csv
+import io
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -14,6 +17,7 @@ import numpy as np
 from dynsim.record import Record
 from dynsim.snake.description import COORDINATES
 from dynsim.snake.lifting import snake_geometry
+from dynsim.system.files import write_text
 
 Table = list[list[str]]  # the first row has the headings
 
@@ -435,3 +439,20 @@ def tables(scenario: str, records: Mapping[str, Record]) -> dict[str, Table]:
         results = {}
     # A table that has only a heading row or column has no simulated variant.
     return {name: rows for name, rows in results.items() if len(rows) > 1 and len(rows[0]) > 1}
+
+
+def write_tables(records: Mapping[str, Record], folder: Path) -> list[Path]:
+    """Write the tables that compare the variants of a scenario with [T] as CSV files; return the files.
+
+    Raises
+    ------
+    RecordError
+        If a file cannot be written.
+    """
+    scenarios = {record.summary["scenario"] for record in records.values()}
+    written = []
+    for name, rows in tables(scenarios.pop(), records).items() if len(scenarios) == 1 else ():
+        stream = io.StringIO()
+        csv.writer(stream, lineterminator="\n").writerows(rows)
+        written.append(write_text(folder / f"{name}.csv", stream.getvalue()))
+    return written

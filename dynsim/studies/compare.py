@@ -137,21 +137,21 @@ def _combined_stop(stops: Mapping[str, SimulationStopped], left: list[str], inte
 
 
 def save_comparison(records: Mapping[str, Record], folder: Path) -> None:
-    """Write ``comparison.json`` and ``comparison.csv``."""
+    """Write ``comparison.json``, ``comparison.csv``, and the tables that compare a shipped snake scenario with [T].
+
+    Raises
+    ------
+    RecordError
+        If a file cannot be written.
+    """
     summaries = {name: record.summary for name, record in records.items()}
-    runs = [flat(summary) for summary in summaries.values()]
     # Variants may have different entries, because the entries of contacts depend on the contact law.
-    scalars = (
-        key for run in runs for key, value in run.items() if value is None or isinstance(value, (int, float, str))
-    )
-    names = dict.fromkeys(["variant", *scalars])
-    contacts = dict.fromkeys(c["name"] for run in runs for c in run.get("contacts", ()))
-    entries = [entry for run in runs for contact in run.get("contacts", ()) for entry in contact.items()]
-    keys = dict.fromkeys(key for key, value in entries if not isinstance(value, str))
-    rows = []
-    for name, run in zip(summaries, runs, strict=True):
-        touching = {f"{c['name']}.{key}": c.get(key) for c in run.get("contacts", ()) for key in keys}
-        rows.append({key: run.get(key) for key in names} | touching | {"variant": name})
-    table = csv_table([*names, *(f"{name}.{key}" for name in contacts for key in keys)], rows)
+    runs = [flat(summary) | {"variant": name} for name, summary in summaries.items()]
+    names = dict.fromkeys(["variant", *(key for run in runs for key in run if key != "warnings")])
+    table = csv_table([*names, "warnings"], runs)
     content = json_text({"variants": summaries})
     replace_together(folder, {"comparison.json": content.encode("utf-8"), "comparison.csv": table.encode("utf-8")})
+    if all("mode" in record for record in records.values()):
+        from dynsim.snake.published import write_tables  # the import takes 0.15 s
+
+        write_tables(records, folder)

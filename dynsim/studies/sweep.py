@@ -24,23 +24,37 @@ from dynsim.studies.processes import WorkerError
 from dynsim.studies.sweep_plan import Plan, SweepPoint
 from dynsim.system.files import check_writable, held_folder, json_text, replacing, write_text
 
-# Entries that do not count as numbers of a run: names, which have separate columns, and computing times, which are not
-# reproducible.
-_EXCLUDED = ("scenario", "variant", "dynsim_version", "integration_wall_s", "real_time_factor")
+# Entries that do not count as numbers of a run: names, which have separate columns, computing times, which are not
+# reproducible, and numbers of the model, which do not depend on the motion.
+_EXCLUDED = ("scenario", "variant", "dynsim_version", "integration_wall_s", "real_time_factor", "model")
+# Lists whose entries are named after their parts; the keys of an entry that contain the names.
+_NAMED = {"motors": ("joint",), "contacts": ("name",), "joint_stops": ("joint",), "sinking": ("body", "surface")}
 
 
-def flat(summary: dict[str, Any]) -> dict[str, Any]:
-    """Return a summary in which the numbers of base and motors are at the top level, as ``base.…`` and ``JOINT.…``."""
-    base = dict(summary.get("base", {}))
-    for key in [key for key, value in base.items() if isinstance(value, dict)]:
-        base.update({f"{key}.{name}": value for name, value in base.pop(key).items()})
-    motors = {
-        f"{motor['joint']}.{key}": value
-        for motor in summary.get("motors", ())
-        for key, value in motor.items()
-        if key != "joint"
-    }
-    return summary | {f"base.{key}": value for key, value in base.items()} | motors
+def flat(summary: Mapping[str, Any]) -> dict[str, Any]:
+    """Return all entries of a summary in one mapping by dotted key: ``base.…``, ``JOINT.…``, ``CONTACT.…``."""
+    sections = {key: value for key, value in summary.items() if isinstance(value, (dict, list))}
+    values = {key: value for key, value in summary.items() if key not in sections}
+    order: list[str] = [key for key in ("base", "motors") if key in sections]
+    order += sorted(sections.keys() - order, key=lambda key: (key in _NAMED, list(sections).index(key)))
+    return values | dict(entry for key in order for entry in _entries(key, sections[key]))
+
+
+def _entries(key: str, value: Any) -> Iterator[tuple[str, Any]]:
+    if isinstance(value, list) and key in _NAMED:
+        for entry in value:
+            name = ".".join(entry[part] for part in _NAMED[key])
+            if key == "joint_stops":
+                name += f".stop_{1e3 * entry['limit']:.0f}_m{entry['unit']}"
+            yield from _entries(name, {part: number for part, number in entry.items() if part not in _NAMED[key]})
+    elif isinstance(value, list) and all(isinstance(entry, str) for entry in value):
+        yield key, "; ".join(value)
+    elif isinstance(value, (dict, list)):
+        entries = value if isinstance(value, dict) else dict(enumerate(value))
+        for part, entry in entries.items():
+            yield from _entries(f"{key}.{part}", entry)
+    else:
+        yield key, value
 
 
 def is_finite(value: Any) -> bool:
@@ -49,14 +63,9 @@ def is_finite(value: Any) -> bool:
 
 
 def numbers(summary: dict[str, Any]) -> dict[str, Any]:
-    """Return all finite numbers of a summary that do not depend on the machine; keys of contacts are ``CONTACT.…``."""
-    values = flat(summary)
-    for key, value in summary.items():
-        if isinstance(value, dict) and key != "base":
-            values |= {f"{key}.{name}": entry for name, entry in value.items()}
-    for contact in summary.get("contacts", ()):
-        values |= {f"{contact['name']}.{key}": value for key, value in contact.items()}
-    return {key: value for key, value in values.items() if is_finite(value) and key not in _EXCLUDED}
+    """Return all finite numbers of a summary that do not depend on the machine, by the keys of :func:`flat`."""
+    counted = {key: value for key, value in summary.items() if key not in _EXCLUDED}
+    return {key: value for key, value in flat(counted).items() if is_finite(value)}
 
 
 # The journal of a sweep has one line per completed run; an interrupted sweep is resumed from it.

@@ -85,8 +85,36 @@ def test_compare_prints_the_table_and_writes_the_comparison(tmp_path: Path):
     assert {"elbow_4.closed_fraction", "elbow_4.slip_distance_m"} <= set(rows[0].split(","))
 
 
+def test_comparison_table_contains_all_entries_and_warnings(tmp_path: Path):
+    result = dynsim("compare", "elbow_comparison", "--no-figures", "-q", *SHORT, folder=tmp_path)
+    assert result.returncode == 0, result.stderr
+    folder = tmp_path / "results" / "elbow_comparison"
+    summaries = json.loads((folder / "comparison.json").read_text())["variants"]
+    with (folder / "comparison.csv").open(newline="") as stream:
+        rows = {row["variant"]: row for row in csv.DictReader(stream)}
+    for variant, summary in summaries.items():
+        row = rows[variant]
+        assert row["warnings"] == "; ".join(summary["warnings"])
+        assert [row[key] for key in ("method", "steps")] == [summary["method"], str(summary["steps"])]
+        for motor in summary["motors"]:
+            assert float(row[f"{motor['joint']}.torque_rms_N_m"]) == motor["torque_rms_N_m"]
+        for sunk in summary["sinking"]:
+            assert float(row[f"{sunk['body']}.{sunk['surface']}.depth_m"]) == sunk["depth_m"]
+    assert any(summary["sinking"] for summary in summaries.values())
+
+
+def test_tables_of_the_paper_are_written_without_figures(tmp_path: Path):
+    result = dynsim("compare", "snake_positioning", "--no-figures", folder=tmp_path)
+    assert result.returncode == 0, result.stderr
+    folder = tmp_path / "results" / "snake_positioning"
+    assert not list(folder.glob("*.png"))
+    rows = list(csv.reader((folder / "table_iii.csv").read_text().splitlines()))
+    assert len(rows) == 1 + 4 * 6
+    assert "rows" not in result.stdout  # the table fits on the screen
+
+
 def test_compare_says_what_real_contacts_did(tmp_path: Path):
-    result = dynsim("compare", "elbow_comparison_floor", "--no-figures", *SHORT, folder=tmp_path)
+    result = dynsim("compare", "elbow_comparison_floor", "--no-figures", "--rows", "all", *SHORT, folder=tmp_path)
     assert result.returncode == 0, result.stderr
     said = result.stdout.splitlines()
     for heading, _, real in _CONTACT_ROWS:

@@ -14,7 +14,7 @@ from support.messages import check_message, lines_with, mentions, says
 from typer.testing import CliRunner
 
 from dynsim.cli.app import app
-from dynsim.cli.tables import _notes
+from dynsim.cli.plan import _notes
 from dynsim.errors import ModelError, ScenarioError, UnreachableReference
 from dynsim.planner.answer import Size
 from dynsim.planner.verify import Corner, Verdict

@@ -19,7 +19,7 @@ from support.messages import mentions, raises
 import dynsim
 from dynsim import cli
 from dynsim.cli import commands
-from dynsim.cli.tables import record_files
+from dynsim.cli.records import record_files
 from dynsim.draw.figures.style import BLUE, DEEP, PULLING
 from dynsim.draw.film import Film, write
 from dynsim.draw.film.film import Strip

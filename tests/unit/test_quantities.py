@@ -95,7 +95,7 @@ def numeric_keys(value: Any, path: tuple[str, ...]) -> Iterator[str]:
     ("key", "label"),
     [
         ("electrical_energy_J", "electrical energy [J]"),
-        ("electrical_energy_drawn_J", "electrical energy, separate supplies [J]"),
+        ("electrical_energy_drawn_J", "energy, separate supplies [J]"),
         ("hand_error_z_rms_m", "hand error, vertical, rms [mm]"),
         ("final_position_error_m", "final position error [m]"),
         ("joint_rate_max_rad_s", "joint rate, max [rad/s]"),

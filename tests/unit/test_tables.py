@@ -1,4 +1,4 @@
-"""Tables of summaries: complete in files and pipes, with joint stops, and warnings of references beyond these."""
+"""Tables of summaries: at most one screen unless all rows are wanted; joint stops, and references beyond these."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ import pytest
 from support.messages import check_message, lines_with, mentions, says
 
 import dynsim
-from dynsim.cli.tables import print_comparison, print_starts, print_summary
+from dynsim.cli.comparison import print_comparison, print_summary
+from dynsim.cli.tables import print_starts
 from dynsim.record import Record
 from dynsim.system.terminal import Terminal
 
@@ -40,13 +41,13 @@ def beyond(tmp_path_factory: pytest.TempPathFactory) -> Record:
     return reached(tmp_path_factory.mktemp("stops"), 52.0)
 
 
-def shown(summaries: dict[str, dict], width: int | None = None, monkeypatch: pytest.MonkeyPatch | None = None) -> str:
+def shown(summaries: dict[str, dict], width: int | None = None, every: bool = False) -> str:
     output = io.StringIO()
     terminal = Terminal(file=output, width=width, emoji=False)
     if len(summaries) == 1:
-        print_summary(terminal, next(iter(summaries.values())))
+        print_summary(terminal, next(iter(summaries.values())), every)
     else:
-        print_comparison(terminal, summaries)
+        print_comparison(terminal, summaries, every)
     return output.getvalue()
 
 
@@ -127,21 +128,81 @@ def test_joint_stops_have_rows(beyond: Record, tmp_path: Path) -> None:
     assert row.split()[-2:] == ["–", str(stop["hits"])]
 
 
-def test_tables_that_nobody_looks_at_are_whole(beyond: Record, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tables_of_all_rows_are_whole_in_pipes(beyond: Record, monkeypatch: pytest.MonkeyPatch) -> None:
     """In a pipe all variants are in one table, no name is cut off and no warning broken; COLUMNS is handled."""
     monkeypatch.delenv("COLUMNS", raising=False)
     names = [f"a_variant_with_quite_a_long_name_{k}" for k in range(9)]
-    text = shown(dict.fromkeys(names, beyond.summary))
+    text = shown(dict.fromkeys(names, beyond.summary), every=True)
     assert len(lines_with(text, phrase="energy row")) == 1
     header = next(line for line in text.splitlines() if names[0] in line)
     assert header.split() == names
     assert "…" not in text
     for warning in beyond.summary["warnings"]:
-        assert f"warning: {names[0]}: {warning}" in text.splitlines()
+        assert f"warning: {', '.join(names)}: {warning}" in text.splitlines()
     monkeypatch.setenv("COLUMNS", "100")
-    narrow = shown(dict.fromkeys(names, beyond.summary))
+    narrow = shown(dict.fromkeys(names, beyond.summary), every=True)
     assert len(lines_with(narrow, phrase="energy row")) > 1
     assert max(map(len, narrow.splitlines())) <= 100
+
+
+def snake(k: int, wheels: int = 14) -> dict:
+    """Return a summary like that of a dynamic snake, with numbers that depend on ``k``."""
+    contacts = [
+        {
+            "name": f"wheel{i}{'LR'[i % 2]}", "normal_force_min_N": 1.0 + i, "normal_force_mean_N": 5.0 + i + k,
+            "normal_force_max_N": 40.0 + i + k, "closed_fraction": 1.0, "pulling_fraction": 0.0,
+            "sticking_fraction": 0.5, "lift_offs": i, "landings": k, "bounces": 0, "slip_starts": i,
+            "impact_loss_J": 0.0,
+        }
+        for i in range(1, wheels + 1)
+    ]  # fmt: skip
+    motors = [{"joint": f"psi{i}", "torque_rms_N_m": 0.1 * i + k, "nominal_torque_N_m": 2.0} for i in range(1, 9)]
+    slipping = [f"wheel{i}: slips for {k + i} % of the run" for i in range(1, 4)]
+    return {
+        "scenario": "snake", "variant": f"v{k}", "electrical_energy_J": 100.0 + k, "mechanical_work_J": 1.0 + k,
+        "final_position_error_m": 0.01 * k, "mode_switches": 0, "cost_final": 2.0 * k, "method": "time_stepping",
+        "contacts": contacts, "motors": motors, "warnings": [*slipping, "the head sags; lift it"] if k % 2 else [],
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("count", [1, 2, 6, 18, 60])
+@pytest.mark.parametrize("width", [None, 80, 120, 200])
+def test_tables_fit_on_a_screen(count: int, width: int | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("COLUMNS", raising=False)
+    text = shown({f"v{k}": snake(k) for k in range(1, count + 1)}, width)
+    assert sum(-(-max(len(line), 1) // (width or 120)) for line in text.splitlines()) <= 38
+    assert count == 1 or {f"v{k}" for k in range(1, min(count, 12) + 1)} <= set(text.split())
+
+
+def test_all_rows_are_printed_on_request() -> None:
+    every = shown({f"v{k}": snake(k) for k in (1, 2)}, every=True)
+    assert all(lines_with(every, f"wheel{i}{'LR'[i % 2]}", "mean") for i in range(1, 15))
+    assert all(lines_with(every, f"psi{i}") for i in range(1, 9))
+
+
+def test_contacts_of_a_kind_are_folded_to_their_extremes_means_and_sums() -> None:
+    text = shown({"v1": snake(1), "v2": snake(2)})
+    (mean,) = lines_with(text, "wheel × 14", "mean")
+    assert mean.split()[-2:] == ["13.50", "14.50"]
+    assert lines_with(text, "force, max")[0].split()[-2:] == ["55.00", "56.00"]
+    assert "105, 14" in lines_with(text, "lift-offs, landings")[0]
+    assert lines_with(text, "psi × 8")[0].split()[-6:] == ["55…90,", "mean", "72", "105…140,", "mean", "122"]
+
+
+def test_rows_that_are_equal_in_all_variants_are_in_one_line() -> None:
+    text = shown({f"v{k}": snake(k, wheels=1) for k in (1, 2)})
+    (equal,) = lines_with(text, re.compile("equal in all variants"))
+    for part in ("mode switches 0", "integration method time_stepping", "wheel1R: loss at impacts 0 J"):
+        assert part in equal
+    assert not lines_with(text, re.compile(r"^  mode switches"))
+    same = shown(dict.fromkeys(("a", "b"), snake(1, wheels=1)))
+    assert "electrical energy 101 J" in same
+
+
+def test_warnings_of_a_kind_are_grouped_with_their_number_and_variants() -> None:
+    text = shown({f"v{k}": snake(k) for k in range(1, 19)})
+    assert lines_with(text, "9 of 18 variants: wheel1: slips for 2 % of the run (the first of 27)")
+    assert lines_with(text, "9 of 18 variants: the head sags; lift it (the first of 9)")
 
 
 def test_impact_losses_that_are_rounding_are_zero(beyond: Record) -> None:

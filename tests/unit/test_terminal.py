@@ -6,7 +6,7 @@ import pytest
 from rich.table import Table
 from support.messages import lines_with
 
-from dynsim.cli.tables import print_comparison, print_summary
+from dynsim.cli.comparison import print_comparison, print_summary
 from dynsim.system.terminal import Terminal, escaped, escaped_line, plain, shortened
 
 EVIL = "a\x1b]0;title\x07[red]b[/red][link=http://x]c[/link]\x9b2Jd\u202ee\x00\r\ud800\\"

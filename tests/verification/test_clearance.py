@@ -12,7 +12,7 @@ from support.messages import check_message, lines_with, raises
 from support.random_robots import random_positions, random_robot, random_robot_of, random_unit
 
 import dynsim
-from dynsim.cli.tables import print_comparison, print_summary
+from dynsim.cli.comparison import print_comparison, print_summary
 from dynsim.compile.clearance import poses, sinking
 from dynsim.compile.model import Model
 from dynsim.engine import check

@@ -15,7 +15,7 @@ import pytest
 from support.messages import mentions
 
 import dynsim
-from dynsim.cli.tables import print_summary
+from dynsim.cli.comparison import print_summary
 from dynsim.engine.target_distance import PART, UNEXPLAINED, DistanceCause, because, named_causes
 from dynsim.scenario.reading import scenario_from_resolved
 from dynsim.system.terminal import Terminal

@@ -39,6 +39,7 @@ from dynsim.draw.figures.snake_view import (
 )
 from dynsim.record import Record
 from dynsim.snake.lifting import snake_geometry
+from dynsim.snake.published import write_tables
 
 # Number of postures in an animation, in a row, and overlaid in one picture.
 FRAMES, IN_A_ROW, IN_A_PICTURE = 50, 6, 7
@@ -52,9 +53,7 @@ def draw(record: Record, folder: Path, kind: str = "png") -> list[Path]:
 
 def draw_comparison(records: Mapping[str, Record], folder: Path, kind: str = "png") -> list[Path]:
     """Draw overlays of variants and, for experiments of [T], comparisons with the paper; return the files."""
-    scenarios = {record.summary["scenario"] for record in records.values()}
-    written = tanaka2019.write_tables(scenarios.pop(), records, folder) if len(scenarios) == 1 else []
-    return written + style.save_all(comparisons(records), records, folder, kind)
+    return write_tables(records, folder) + style.save_all(comparisons(records), records, folder, kind)
 
 
 def figures(record: Record) -> dict[str, Callable[[Record], Figure]]:

@@ -1,4 +1,4 @@
-"""Figures and tables in the layout of [T], for comparison with the paper.
+"""Figures in the layout of [T], for comparison with the paper.
 
 [T]: M. Tanaka et al., "Task-Space Control of Articulated Mobile Robots With a Soft Gripper for Operations", IEEE
 Transactions on Robotics 35(1), 2019. Its curves are not reproduced; numbers that its text states are shown.
@@ -6,11 +6,8 @@ Transactions on Robotics 35(1), 2019. Its curves are not reproduced; numbers tha
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Callable, Mapping
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -42,9 +39,7 @@ from dynsim.snake.published import (
     displacement,
     mode_sequence,
     opening,
-    tables,
 )
-from dynsim.system.files import write_text
 
 STOPPED = "joint at its limit"
 # Scenarios of Fig 13: without and with a pipe.
@@ -79,16 +74,6 @@ def figures(scenario: str, records: Mapping[str, Record]) -> dict[str, Maker]:
 def figures_of_run(record: Record) -> dict[str, Callable[[Record], Figure]]:
     """Return the drawing functions of comparisons with [T] that require only one run."""
     return {"fig_13": picking_up} if record.summary["scenario"] in PICK_UPS and record["gripper"].any() else {}
-
-
-def write_tables(scenario: str, records: Mapping[str, Record], folder: Path) -> list[Path]:
-    """Write the comparison tables with [T] as CSV; return the files."""
-    written = []
-    for name, rows in tables(scenario, records).items():
-        stream = io.StringIO()
-        csv.writer(stream, lineterminator="\n").writerows(rows)
-        written.append(write_text(folder / f"{name}.csv", stream.getvalue()))
-    return written
 
 
 # Names of the sources of a displacement, and their markers, by the keys of ``SOURCES``.

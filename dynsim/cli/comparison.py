@@ -1,0 +1,190 @@
+"""Summaries and comparisons of runs on at most one screen: rows, columns and warnings are folded until they fit."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from difflib import SequenceMatcher
+from functools import cache
+
+from rich.cells import cell_len
+from rich.console import Console, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from dynsim.cli import screen
+from dynsim.cli.tables import Row, Summary, new_table, rows_of, warning_text
+from dynsim.system.terminal import escaped_line
+
+# Rows that are printed first if not all fit on the screen: keys, or headings of rows of contacts.
+_CHIEF = (
+    "electrical_energy_J", "hand_error_rms_m", "final_position_error_m", "final_attitude_error_rad", "worst_joint",
+    "base.tip_margin_min_settled", "base.overturns_settled_at_s", "sinking", "force, max [N]", "hand_error_max_m",
+    "position_error_max_m", "attitude_error_max_rad", "joint_limit_violation_max_rad", "cost_final", "mode_switches",
+    "base.wheel_load_min_N", "pulling [% of time]", "lift-offs, landings", "torque", "joule_heat_J", "friction_heat_J",
+    "closed [% of time]", "sticking [% of time]", "energy_residual_relative",
+)  # fmt: skip
+# Space between the columns of a table, and at its edges [characters].
+_PADDING, _EDGES = 3, 4
+# Maximum part of the screen for grouped warnings, and their minimum number.
+_WARNINGS, _LEAST = 0.3, 3
+# Lines of title, headings and notes of a table with a line for each variant.
+_HEADER = 14
+# Fraction of equal words above which two warnings are of the same kind.
+_ALIKE = 0.5
+# Last line of a table without some of the variants.
+_MORE = "… and {} more"
+# Maximum number of variants that a warning names.
+_NAMED = 3
+
+
+def print_summary(console: Console, summary: Summary, every: bool = False) -> None:
+    """Print the numbers, contacts and warnings of one run, on at most one screen unless ``every`` row is wanted."""
+    _print(console, f"{summary['scenario']} {summary['variant']}".strip(), {"": summary}, every)
+
+
+def print_comparison(console: Console, summaries: Mapping[str, Summary], every: bool = False) -> None:
+    """Print the summaries of variants side by side, on at most one screen unless ``every`` row is wanted.
+
+    Rows that are equal in all variants become one line. As long as the result is longer than the screen, warnings of
+    the same kind are grouped, then contacts and joints whose names differ only in a number are folded, and finally only
+    the most important rows are printed, with one line per variant if the variants do not fit side by side.
+    """
+    _print(console, next(iter(summaries.values()))["scenario"], summaries, every)
+
+
+def _print(console: Console, title: str, summaries: Mapping[str, Summary], every: bool) -> None:
+    names, runs = list(summaries), list(summaries.values())
+    rows, warnings = rows_of(runs), _warnings(summaries)
+    if every:
+        screen.show(console, [*_side_by_side(title, names, rows, console.width), *warnings])
+        return
+    width, height = screen.size(console)
+    folded = rows_of(runs, folded=True)
+    grouped, short = _grouped(summaries), _grouped(summaries, width)
+    forms = ((rows, warnings), (rows, grouped), (rows, short), (folded, grouped), (folded, short))
+    parts: list[RenderableType]
+    for shown, texts in forms:
+        different, equal = _without_equal(shown)
+        tables = _side_by_side(title, names, different, width)
+        parts = [*tables, *equal, *texts]
+        # Do not render long tables to count their lines.
+        if sum(table.row_count for table in tables) < height and screen.lines(console, parts) <= height:
+            screen.show(console, parts)
+            return
+    # The rows of contacts would make this line too long.
+    equal = _without_equal([row for row in folded if not row.owner])[1]
+    most = max(_LEAST, min(int(_WARNINGS * height), height - len(names) - _HEADER))
+    if len(short) > most:
+        short[most - 1 :] = [f"… and {len(short) - most + 1} more kinds of warnings"]
+    parts = [*equal, "other rows: --rows all; all numbers: comparison.csv or summary.json", *short]
+    table = _chief(console, title, names, different, width, height - screen.lines(console, parts))
+    screen.show(console, [table, *parts])
+
+
+def _without_equal(rows: Sequence[Row]) -> tuple[list[Row], list[str]]:
+    """Return the rows that differ between variants, and a line with all others, if there are several variants."""
+    equal = [row for row in rows if len(row.cells) > 1 and len(set(row.cells)) == 1]
+    texts = []
+    for row in equal:
+        name, _, unit = row.label.partition(" [")
+        texts.append(f"{escaped_line(name)} {row.cells[0]} {escaped_line(unit.removesuffix(']'))}".strip())
+    return [row for row in rows if row not in equal], [f"equal in all variants: {'; '.join(texts)}"] if equal else []
+
+
+def _side_by_side(title: str, names: Sequence[str], rows: Sequence[Row], width: int) -> list[Table]:
+    """Return a table with a column per variant, or several tables if the columns do not fit into the width."""
+    if not rows:
+        return [new_table(title)]
+    headings = [
+        f"  {row.heading}" if row.owner and k and rows[k - 1].owner == row.owner else row.label
+        for k, row in enumerate(rows)
+    ]
+    room = width - max(map(cell_len, ["", *headings])) - _EDGES
+    blocks: list[list[int]] = []
+    left = 0
+    for k, name in enumerate(names):
+        across = max(map(_width, [escaped_line(name), *(row.cells[k] for row in rows)])) + _PADDING
+        if not blocks or left < across:
+            blocks.append([])
+            left = room
+        blocks[-1].append(k)
+        left -= across
+    tables = []
+    for block in blocks:
+        tables.append(table := new_table(title, show_header=len(names) > 1))
+        table.add_column("", no_wrap=True)
+        for k in block:
+            table.add_column(escaped_line(names[k]), justify="right", no_wrap=True)
+        for heading, row in zip(headings, rows, strict=True):
+            table.add_row(escaped_line(heading), *(row.cells[k] for k in block))
+    return tables
+
+
+@cache
+def _width(cell: str) -> int:
+    """Return the width of a text with markup."""
+    return Text.from_markup(cell).cell_len
+
+
+def _chief(console: Console, title: str, names: Sequence[str], rows: Sequence[Row], width: int, height: int) -> Table:
+    """Return a table of the most important rows; one line per variant if the variants do not fit side by side."""
+    ranked = sorted(rows, key=lambda row: _CHIEF.index(row.key) if row.key in _CHIEF else len(_CHIEF))
+    for count in range(len(ranked), 0, -1):
+        tables = _side_by_side(title, names, [row for row in rows if row in ranked[:count]], width)
+        if len(tables) == 1 and screen.lines(console, tables) <= height:
+            return tables[0]
+    table = new_table(title)
+    table.add_column("variant", no_wrap=True)
+    left = width - _EDGES - max(map(cell_len, [_MORE.format(len(names)), *names]))
+    columns = []
+    for row in ranked:
+        across = max(map(_width, [*row.cells, *map(escaped_line, row.label.split())]))
+        if across + _PADDING <= left:
+            left -= across + _PADDING
+            columns.append(row)
+            table.add_column(escaped_line(row.label), justify="right", width=across)
+    fitting = len(names)
+    if screen.lines(console, [table]) + len(names) > height:
+        fitting = max(height - screen.lines(console, [table]) - 1, 1)
+    for k, name in enumerate(names[:fitting]):
+        table.add_row(escaped_line(name), *(row.cells[k] for row in columns))
+    if fitting < len(names):
+        table.add_row(_MORE.format(len(names) - fitting))
+    return table
+
+
+def _warnings(summaries: Mapping[str, Summary]) -> list[str]:
+    """Return all warnings; equal warnings of several variants are one."""
+    variants: dict[str, list[str]] = {}
+    for name, summary in summaries.items():
+        for warning in dict.fromkeys(summary.get("warnings", ())):
+            variants.setdefault(warning, []).append(name)
+    return [warning_text(warning, ", ".join(names)) for warning, names in variants.items()]
+
+
+def _grouped(summaries: Mapping[str, Summary], width: int | None = None) -> list[str]:
+    """Return the first warning of each kind, with its variants and the number of such warnings, cut to ``width``."""
+    groups: list[list[tuple[str, str]]] = []
+    for name, summary in summaries.items():
+        for warning in summary.get("warnings", ()):
+            group = next((group for group in groups if _alike(warning, group[0][1])), [])
+            if not group:
+                groups.append(group)
+            group.append((name, warning))
+    texts = []
+    for group in sorted(groups, key=lambda group: -len({name for name, _ in group})):
+        names = list(dict.fromkeys(name for name, _ in group))
+        several = f"{len(names)} of {len(summaries)} variants" if len(names) > _NAMED else ", ".join(names)
+        times = f" (the first of {len(group)})" if len(group) > 1 else ""
+        text = Text.from_markup(warning_text(group[0][1], several))
+        if width is not None:
+            text.truncate(width - len(times), overflow="ellipsis")
+        texts.append(text.markup + times)
+    return texts
+
+
+def _alike(*warnings: str) -> bool:
+    """Return whether two warnings are equal in most words, without numbers and names with digits or underscores."""
+    a, b = (re.sub(r"\S*[\d_]\S*", "", warning).split() for warning in warnings)
+    return SequenceMatcher(None, a, b).ratio() > _ALIKE
