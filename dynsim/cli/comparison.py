@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from difflib import SequenceMatcher
-from functools import cache
 
 from rich.cells import cell_len
 from rich.console import Console, RenderableType
@@ -13,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from dynsim.cli import screen
-from dynsim.cli.tables import Row, Summary, new_table, rows_of, warning_text
+from dynsim.cli.tables import Row, Summary, rows_of, warning_text
 from dynsim.system.terminal import escaped_line
 
 # Rows that are printed first if not all fit on the screen: keys, or headings of rows of contacts.
@@ -24,16 +23,12 @@ _CHIEF = (
     "base.wheel_load_min_N", "pulling [% of time]", "lift-offs, landings", "torque", "joule_heat_J", "friction_heat_J",
     "closed [% of time]", "sticking [% of time]", "energy_residual_relative",
 )  # fmt: skip
-# Space between the columns of a table, and at its edges [characters].
-_PADDING, _EDGES = 3, 4
 # Maximum part of the screen for grouped warnings, and their minimum number.
 _WARNINGS, _LEAST = 0.3, 3
 # Lines of title, headings and notes of a table with a line for each variant.
 _HEADER = 14
 # Fraction of equal words above which two warnings are of the same kind.
 _ALIKE = 0.5
-# Last line of a table without some of the variants.
-_MORE = "… and {} more"
 # Maximum number of variants that a warning names.
 _NAMED = 3
 
@@ -95,16 +90,16 @@ def _without_equal(rows: Sequence[Row]) -> tuple[list[Row], list[str]]:
 def _side_by_side(title: str, names: Sequence[str], rows: Sequence[Row], width: int) -> list[Table]:
     """Return a table with a column per variant, or several tables if the columns do not fit into the width."""
     if not rows:
-        return [new_table(title)]
+        return [screen.new_table(title)]
     headings = [
         f"  {row.heading}" if row.owner and k and rows[k - 1].owner == row.owner else row.label
         for k, row in enumerate(rows)
     ]
-    room = width - max(map(cell_len, ["", *headings])) - _EDGES
+    room = width - max(map(cell_len, ["", *headings])) - screen.EDGES
     blocks: list[list[int]] = []
     left = 0
     for k, name in enumerate(names):
-        across = max(map(_width, [escaped_line(name), *(row.cells[k] for row in rows)])) + _PADDING
+        across = max(map(screen.cell_width, [escaped_line(name), *(row.cells[k] for row in rows)])) + screen.PADDING
         if not blocks or left < across:
             blocks.append([])
             left = room
@@ -112,19 +107,13 @@ def _side_by_side(title: str, names: Sequence[str], rows: Sequence[Row], width: 
         left -= across
     tables = []
     for block in blocks:
-        tables.append(table := new_table(title, show_header=len(names) > 1))
+        tables.append(table := screen.new_table(title, show_header=len(names) > 1))
         table.add_column("", no_wrap=True)
         for k in block:
             table.add_column(escaped_line(names[k]), justify="right", no_wrap=True)
         for heading, row in zip(headings, rows, strict=True):
             table.add_row(escaped_line(heading), *(row.cells[k] for k in block))
     return tables
-
-
-@cache
-def _width(cell: str) -> int:
-    """Return the width of a text with markup."""
-    return Text.from_markup(cell).cell_len
 
 
 def _chief(console: Console, title: str, names: Sequence[str], rows: Sequence[Row], width: int, height: int) -> Table:
@@ -134,24 +123,8 @@ def _chief(console: Console, title: str, names: Sequence[str], rows: Sequence[Ro
         tables = _side_by_side(title, names, [row for row in rows if row in ranked[:count]], width)
         if len(tables) == 1 and screen.lines(console, tables) <= height:
             return tables[0]
-    table = new_table(title)
-    table.add_column("variant", no_wrap=True)
-    left = width - _EDGES - max(map(cell_len, [_MORE.format(len(names)), *names]))
-    columns = []
-    for row in ranked:
-        across = max(map(_width, [*row.cells, *map(escaped_line, row.label.split())]))
-        if across + _PADDING <= left:
-            left -= across + _PADDING
-            columns.append(row)
-            table.add_column(escaped_line(row.label), justify="right", width=across)
-    fitting = len(names)
-    if screen.lines(console, [table]) + len(names) > height:
-        fitting = max(height - screen.lines(console, [table]) - 1, 1)
-    for k, name in enumerate(names[:fitting]):
-        table.add_row(escaped_line(name), *(row.cells[k] for row in columns))
-    if fitting < len(names):
-        table.add_row(_MORE.format(len(names) - fitting))
-    return table
+    columns = [("variant", [*map(escaped_line, names)]), *((escaped_line(row.label), row.cells) for row in ranked)]
+    return screen.listing(console, title, columns, height)
 
 
 def _warnings(summaries: Mapping[str, Summary]) -> list[str]:

@@ -24,7 +24,7 @@ from dynsim.cli.app import (
     parsed_overrides,
 )
 from dynsim.cli.output import console, plan_progress, print_line, print_written
-from dynsim.cli.tables import new_table
+from dynsim.cli.screen import new_table
 from dynsim.errors import ScenarioError, UnreachableReference
 from dynsim.system.terminal import escaped
 

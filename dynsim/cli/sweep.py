@@ -6,10 +6,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from dynsim.cli import screen
 from dynsim.cli.app import (
     FigureFormat,
     FiguresOption,
@@ -24,18 +25,21 @@ from dynsim.cli.app import (
     option,
     parsed_overrides,
 )
-from dynsim.cli.output import drawing, errors, print_line, print_warning, sweep_progress
+from dynsim.cli.output import console, drawing, errors, print_line, print_warning, sweep_progress
 from dynsim.errors import ScenarioError, SimulationStopped
-from dynsim.system.terminal import escaped
+from dynsim.system.terminal import escaped, escaped_line
 
 if TYPE_CHECKING:
     from dynsim.draw.figures.look import Look
     from dynsim.draw.figures.sweep import Sweep
+    from dynsim.record.quantities import Quantity
     from dynsim.studies.sweep import SweepRow
     from dynsim.studies.sweep_plan import Plan
 
 # Number of failed runs whose reasons are printed.
 _SHOWN = 5
+# Results in the table, unless --plot selects others: energy and the first error that the runs have.
+_ENERGY, _ERRORS = "electrical_energy_J", ("hand_error_rms_m", "final_position_error_m")
 
 
 class KeepRecords(StrEnum):
@@ -141,11 +145,44 @@ def sweep(
     if not no_figures:
         _draw(name, rows, plan, folder, quiet, format_, look, plot or ())
     if not quiet:
+        _print_table(name, rows, plan, plot or ())
         if not has_parquet():
             print_line(escaped("Parquet file skipped: it requires pyarrow (pip install 'dynsim[tables]')."))
         print_line(f"{len(rows) - len(failed)} of {len(rows)} runs succeeded. Written to {escaped(folder)}")
     if len(failed) == len(rows):
         raise SimulationStopped(f"none of the {len(rows)} runs succeeded; {folder / TABLES[0]} lists the reasons")
+
+
+def _print_table(name: str, rows: Sequence[SweepRow], plan: Plan, plotted: Sequence[str]) -> None:
+    """Print the varied values and the results of all runs, or of the first runs and the first keys that fit."""
+    from dynsim.record.quantities import summary_quantity
+    from dynsim.scenario.quantities import quantity
+
+    scenario = plan.scenario(next(plan.points()))
+    numbers = {key for row in rows for key in row.numbers}
+    errors = [key for key in _ERRORS if key in numbers]
+    results = {key: summary_quantity(key) for key in plotted or [_ENERGY, *errors[:1]] if key in numbers}
+    columns = [("run", [str(row.run) for row in rows])]
+    if any(row.variant is not None for row in rows):
+        columns.append(("variant", [escaped_line(row.variant) for row in rows]))
+    grid = {axis.key: quantity(axis.key, scenario) for axis in plan.grid}
+    sampled = {key: quantity(key, scenario) for key in plan.sampled}
+    columns += [_column(grid[key], [row.values[key] for row in rows]) for key in grid]
+    columns += [_column(results[key], [row.numbers.get(key) for row in rows]) for key in results]
+    columns += [_column(sampled[key], [row.values[key] for row in rows]) for key in sampled]
+    console.print(screen.listing(console, name, columns, screen.size(console)[1] - _SHOWN - 1), highlight=False)
+
+
+def _column(described: Quantity, values: Sequence[Any]) -> tuple[str, list[str]]:
+    """Return heading and cells of a column of the table; a failed run has no results."""
+    described = described.fitted(values)
+    cells = [
+        "–" if value is None
+        else f"{value * described.scale:.4g}" if isinstance(value, (int, float)) and not isinstance(value, bool)
+        else escaped_line(value)
+        for value in values
+    ]  # fmt: skip
+    return escaped_line(described.label), cells
 
 
 def _variants(known: Sequence[str], wanted: str | None) -> tuple[str | None, ...]:

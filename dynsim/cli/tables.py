@@ -7,10 +7,9 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from rich import box
 from rich.console import Console
-from rich.table import Table
 
+from dynsim.cli import screen
 from dynsim.record.quantities import summary_quantity
 from dynsim.system.terminal import Terminal, escaped_line, plain
 
@@ -238,7 +237,7 @@ def _print_choice(
         # Do not print through the console, which would expand the tabs.
         print("\n".join(lines), file=console.file)
         return
-    table = new_table(title, show_header=bool(headings))
+    table = screen.new_table(title, show_header=bool(headings))
     for k, heading in enumerate(headings):
         table.add_column(heading, no_wrap=k == 0)
     for row in rows:
@@ -403,11 +402,6 @@ _RATED = (
     ("force", "N", "rms of nominal [N]"),
 )
 _MOST_MOTORS = 10
-
-
-def new_table(title: object, **options: Any) -> Table:
-    """Return an empty table without vertical lines."""
-    return Table(title=escaped_line(title), title_justify="left", **{"box": box.SIMPLE_HEAD, **options})
 
 
 def warning_text(text: str, name: str = "") -> str:

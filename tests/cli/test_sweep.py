@@ -2,12 +2,16 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from support.messages import lines_with, mentions
 
-from dynsim.scenario import find_scenario
+from dynsim.cli.sweep import _print_table
+from dynsim.scenario import find_scenario, read_scenario
+from dynsim.studies.sweep import OK, SweepRow
+from dynsim.studies.sweep_plan import Axis, Plan
 
 SHORT = ["--set", "duration_s=0.2", "--set", "metrics.settle_s=0.05"]
 LENGTH = "plant.chain.0.length_m"
@@ -101,3 +105,24 @@ def test_a_number_that_no_run_has_is_refused_and_others_are_drawn_without_runs(t
     assert {path.stem for path in (tmp_path / "out").glob("*.png")} == {"sweep_lines"}
     header = (tmp_path / "out" / "sweep.csv").read_text().splitlines()[0].split(",")
     assert "joint_2.current_rms_A" in header
+
+
+@pytest.mark.parametrize("count", [2, 60])
+def test_table_names_quantities_with_units_and_fits_on_a_screen(count: int, capsys: pytest.CaptureFixture[str]):
+    grid = Axis.parse(f"{LENGTH}=0.01:0.05:{count}")
+    plan = Plan(read_scenario("single_pendulum"), (None,), {}, (grid, Axis("integrator.method", ("dopri5",))))
+    rows = [
+        SweepRow(point.run, None, point.values, OK, "", {"electrical_energy_J": 2.5, "hand_error_rms_m": 0.004}, "")
+        for point in plan.points()
+    ]
+    rows[1] = replace(rows[1], status="failed", numbers={})
+    _print_table("swinging", rows, plan, ())
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) <= 40
+    rule = next(k for k, line in enumerate(lines) if "──" in line)
+    headings = " ".join(" ".join(lines[:rule]).split())
+    for word in ("run", "length", "link", "[mm]", "integration", "method", "electrical", "energy", "hand", "rms"):
+        assert word in headings, headings
+    assert lines[rule + 1].split() == ["0", "10", "dopri5", "2.5", "4"]
+    assert lines[rule + 2].split()[-2:] == ["–", "–"]
+    assert any(line.split()[:2] == ["…", "and"] for line in lines) == (count == 60)
