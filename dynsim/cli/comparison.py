@@ -12,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from dynsim.cli import screen
-from dynsim.cli.tables import Row, Summary, rows_of, warning_text
+from dynsim.cli.tables import Summary, SummaryRow, rows_of, warning_text
 from dynsim.system.terminal import escaped_line
 
 # Rows that are printed first if not all fit on the screen: keys, or headings of rows of contacts.
@@ -77,7 +77,7 @@ def _print(console: Console, title: str, summaries: Mapping[str, Summary], every
     screen.show(console, [table, *parts])
 
 
-def _without_equal(rows: Sequence[Row]) -> tuple[list[Row], list[str]]:
+def _without_equal(rows: Sequence[SummaryRow]) -> tuple[list[SummaryRow], list[str]]:
     """Return the rows that differ between variants, and a line with all others, if there are several variants."""
     equal = [row for row in rows if len(row.cells) > 1 and len(set(row.cells)) == 1]
     texts = []
@@ -87,7 +87,7 @@ def _without_equal(rows: Sequence[Row]) -> tuple[list[Row], list[str]]:
     return [row for row in rows if row not in equal], [f"equal in all variants: {'; '.join(texts)}"] if equal else []
 
 
-def _side_by_side(title: str, names: Sequence[str], rows: Sequence[Row], width: int) -> list[Table]:
+def _side_by_side(title: str, names: Sequence[str], rows: Sequence[SummaryRow], width: int) -> list[Table]:
     """Return a table with a column per variant, or several tables if the columns do not fit into the width."""
     if not rows:
         return [screen.new_table(title)]
@@ -116,7 +116,9 @@ def _side_by_side(title: str, names: Sequence[str], rows: Sequence[Row], width: 
     return tables
 
 
-def _chief(console: Console, title: str, names: Sequence[str], rows: Sequence[Row], width: int, height: int) -> Table:
+def _chief(
+    console: Console, title: str, names: Sequence[str], rows: Sequence[SummaryRow], width: int, height: int
+) -> Table:
     """Return a table of the most important rows; one line per variant if the variants do not fit side by side."""
     ranked = sorted(rows, key=lambda row: _CHIEF.index(row.key) if row.key in _CHIEF else len(_CHIEF))
     for count in range(len(ranked), 0, -1):

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich import box
 
+from dynsim.cli import screen
 from dynsim.cli.app import (
     FigureFormat,
     FiguresOption,
@@ -24,7 +24,6 @@ from dynsim.cli.app import (
     parsed_overrides,
 )
 from dynsim.cli.output import console, plan_progress, print_line, print_written
-from dynsim.cli.screen import new_table
 from dynsim.errors import ScenarioError, UnreachableReference
 from dynsim.system.terminal import escaped
 
@@ -186,8 +185,12 @@ LIFTED = 0.999
 
 
 def print_plan(plan: BracePlan) -> None:
-    """Print a table row for each number of braces, then the reasons why plans were rejected or not found."""
-    table = new_table(f"{plan.task.scenario.title}: braces", box=box.HEAVY_HEAD)
+    """Print a table row for each number of braces, then the reasons why plans were rejected or not found.
+
+    Reasons that do not fit on the screen are only in ``plan.json``.
+    """
+    width, height = screen.size(console)
+    table = screen.new_table(f"{plan.task.scenario.title}: braces")
     heads = (
         "braces", "on", "heat [W]", "simulated [W]", "all energy [J]", "k_p [V/rad]", "forces [N]", "rounds",
         "survives",
@@ -196,16 +199,25 @@ def print_plan(plan: BracePlan) -> None:
         table.add_column(head, justify="left" if head in ("on", "survives") else "right")
     for size in plan.sizes:
         table.add_row(*_cells(size))
-    console.print(table)
+    console.print(table, width=min(width, console.width))
     if any(size.planned is not None and size.agreed == 0 for size in plan.sizes):
         print_line("rounds: search rounds that found this heat independently; 0 if it was found by exchanging braces")
     best = plan.best
     if best is not None:
         label = escaped(best.label) if best.braces else "no braces"
         print_line(f"best: {label}{' (rejected)' if best.survives is False else ''}")
-    for size in plan.sizes:
-        for text in _notes(size):
-            print_line(f"{size.count} brace{'' if size.count == 1 else 's'}: {escaped(text)}")
+    notes = [
+        f"{size.count} brace{'' if size.count == 1 else 's'}: {escaped(text)}"
+        for size in plan.sizes
+        for text in _notes(size)
+    ]
+    # Three lines are above the notes, and two below.
+    left = height - screen.lines(console, [table]) - 5
+    fitting = [note for k, note in enumerate(notes) if screen.lines(console, notes[: k + 1]) <= left]
+    for note in fitting:
+        print_line(note)
+    if len(fitting) < len(notes):
+        print_line(f"… and {len(notes) - len(fitting)} more notes in plan.json")
     missed, reached = len(plan.tally.missed), len(plan.tally.reached)
     if missed:
         print_line(

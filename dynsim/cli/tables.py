@@ -134,7 +134,7 @@ _ROWS: tuple[tuple[str, Callable[[Summary, str], Any], Callable[[Any], str], str
 )
 
 
-class Row(NamedTuple):
+class SummaryRow(NamedTuple):
     """Row of a table of summaries.
 
     Attributes
@@ -160,7 +160,7 @@ class Row(NamedTuple):
         return f"{self.owner}: {self.heading}" if self.owner else self.heading
 
 
-def rows_of(summaries: Sequence[Summary], folded: bool = False) -> list[Row]:
+def rows_of(summaries: Sequence[Summary], folded: bool = False) -> list[SummaryRow]:
     """Return the rows that any of the runs has, with a cell for each run.
 
     If ``folded``, contacts, stops and motors whose names differ only in a number share their rows: see :func:`_merged`.
@@ -170,11 +170,11 @@ def rows_of(summaries: Sequence[Summary], folded: bool = False) -> list[Row]:
         values = [read(summary, key) for summary in summaries]
         if any(value is not None for value in values):
             cells = ["–" if value is None else show(value) for value in values]
-            rows.append(Row(key, "", heading or summary_quantity(key).label, cells))
+            rows.append(SummaryRow(key, "", heading or summary_quantity(key).label, cells))
     least = min(summary.get("electrical_energy_J") or 0.0 for summary in summaries)
     if len(summaries) > 1 and least > 0.0:
         cells = [f"{summary['electrical_energy_J'] / least:.3g}" for summary in summaries]
-        rows.append(Row("", "", "energy, times the minimum", cells))
+        rows.append(SummaryRow("", "", "energy, times the minimum", cells))
     rows += _contact_rows([{c["name"]: c for c in s.get("contacts", ())} for s in summaries], folded)
     rows += _stop_rows([{_stop_name(stop): stop for stop in s.get("joint_stops", ())} for s in summaries], folded)
     rows += _motor_rows(summaries, folded)
@@ -312,7 +312,7 @@ _CONTACT_ROWS: tuple[tuple[str, Callable[[Summary], str], bool | None], ...] = (
 )
 
 
-def _contact_rows(runs: Sequence[Mapping[str, Summary]], folded: bool) -> Iterator[Row]:
+def _contact_rows(runs: Sequence[Mapping[str, Summary]], folded: bool) -> Iterator[SummaryRow]:
     """Yield the rows of all contacts, for one mapping of names to contacts per run.
 
     A candidate contact that never closed has no rows; for a declared contact that never closed, the smallest gap is
@@ -330,11 +330,11 @@ def _contact_rows(runs: Sequence[Mapping[str, Summary]], folded: bool) -> Iterat
         contacts = [run.get(name) for run in runs]
         if not all(contact["closed_fraction"] > 0.0 for contact in having[name]):
             cells = [_number(c.get("gap_min_m"), 1e3, 3) if c and not c["closed_fraction"] else "–" for c in contacts]
-            yield Row("gap", name, "never touches, min gap [mm]", cells)
+            yield SummaryRow("gap", name, "never touches, min gap [mm]", cells)
         for heading, show, real in _CONTACT_ROWS if closing[name] else ():
             if real is None or any(_is_unilateral(contact) == real for contact in having[name]):
                 cells = [show(c) if c and real in (None, _is_unilateral(c)) else "–" for c in contacts]
-                yield Row(heading, name, heading, cells)
+                yield SummaryRow(heading, name, heading, cells)
 
 
 # Rows of a joint stop: heading and format.
@@ -346,13 +346,13 @@ _STOP_ROWS: tuple[tuple[str, Callable[[Summary], str]], ...] = (
 )
 
 
-def _stop_rows(runs: Sequence[Mapping[str, Summary]], folded: bool) -> Iterator[Row]:
+def _stop_rows(runs: Sequence[Mapping[str, Summary]], folded: bool) -> Iterator[SummaryRow]:
     """Yield the rows of all joint stops that were hit in any run, for one mapping of names to stops per run."""
     runs = _merged(runs) if folded else runs
     for name, stop in {name: stop for run in runs for name, stop in run.items()}.items():
         for heading, show in _STOP_ROWS:
             cells = [show(run[name]) if name in run else "–" for run in runs]
-            yield Row(heading, name, heading.format(**stop), cells)
+            yield SummaryRow(heading, name, heading.format(**stop), cells)
 
 
 def _stop_name(stop: Summary) -> str:
@@ -361,7 +361,7 @@ def _stop_name(stop: Summary) -> str:
     return f"{stop['joint']}, stop at {position}"
 
 
-def _motor_rows(summaries: Sequence[Summary], folded: bool) -> Iterator[Row]:
+def _motor_rows(summaries: Sequence[Summary], folded: bool) -> Iterator[SummaryRow]:
     """Yield the rows of motors with known ratings: rms and nominal value; if ``folded``, ratios of each kind of joint.
 
     If there are many motors, only the most heavily loaded ones are shown.
@@ -377,14 +377,14 @@ def _motor_rows(summaries: Sequence[Summary], folded: bool) -> Iterator[Row]:
         if folded:
             for kind, members in _kinds(joints).items():
                 cells = [_spread([100.0 * load[joint] for joint in members if joint in load]) for load in loads]
-                yield Row(quantity, kind, f"rms {quantity} [% of nominal]", cells)
+                yield SummaryRow(quantity, kind, f"rms {quantity} [% of nominal]", cells)
             continue
         largest = {joint: max(load.get(joint, 0.0) for load in loads) for joint in joints}
         heaviest = sorted(joints, key=lambda joint: -largest[joint])[:_MOST_MOTORS]
         for joint in (joint for joint in joints if joint in heaviest):
             motors = [motors.get(joint) for motors in rated]
             cells = [f"{_loaded(m[rms], m[nominal])} of {m[nominal]:g}" if m else "–" for m in motors]
-            yield Row(quantity, joint, label, cells)
+            yield SummaryRow(quantity, joint, label, cells)
 
 
 def _spread(values: Sequence[float]) -> str:
