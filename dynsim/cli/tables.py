@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from rich.console import Console
 
 from dynsim.cli import screen
-from dynsim.record.quantities import summary_quantity
 from dynsim.system.terminal import Terminal, escaped_line, plain
 
 if TYPE_CHECKING:
@@ -165,6 +164,8 @@ def rows_of(summaries: Sequence[Summary], folded: bool = False) -> list[SummaryR
 
     If ``folded``, contacts, stops and motors whose names differ only in a number share their rows: see :func:`_merged`.
     """
+    from dynsim.record.quantities import summary_quantity
+
     rows = []
     for key, read, show, heading in _ROWS:
         values = [read(summary, key) for summary in summaries]
