@@ -82,10 +82,6 @@ def _short(value: Any) -> str:
     return _number(value, digits=3)
 
 
-def _millimetres(value: Any) -> str:
-    return _number(value, 1e3)
-
-
 def _exponent(value: float) -> str:
     return _format(value, ".1e")
 
@@ -104,11 +100,11 @@ _ROWS: tuple[tuple[str, Callable[[Summary, str], Any], Callable[[Any], str], str
     ("impact_loss_J", _energy, _number, ""),
     ("stop_loss_J", lambda summary, key: summary.get(key) or None, _number, ""),
     ("scheme_loss_J", _energy, _number, ""),
-    ("hand_error_rms_m", _value, _millimetres, ""),
-    ("hand_error_max_m", _value, _millimetres, ""),
-    ("hand_error_z_rms_m", _value, _millimetres, ""),
-    ("hand_error_start_m", _value, _millimetres, ""),
-    ("hand_error_end_m", _value, _millimetres, ""),
+    ("hand_error_rms_m", _value, _number, ""),
+    ("hand_error_max_m", _value, _number, ""),
+    ("hand_error_z_rms_m", _value, _number, ""),
+    ("hand_error_start_m", _value, _number, ""),
+    ("hand_error_end_m", _value, _number, ""),
     ("hand_error_causes", _cause, str, "hand error, main cause"),
     ("initial_position_error_m", _value, _short, ""),
     ("final_position_error_m", _value, _short, ""),
@@ -170,8 +166,10 @@ def rows_of(summaries: Sequence[Summary], folded: bool = False) -> list[SummaryR
     for key, read, show, heading in _ROWS:
         values = [read(summary, key) for summary in summaries]
         if any(value is not None for value in values):
-            cells = ["–" if value is None else show(value) for value in values]
-            rows.append(SummaryRow(key, "", heading or summary_quantity(key).label, cells))
+            quantity = summary_quantity(key).fitted(values)
+            scaled = [value * quantity.scale if isinstance(value, float) else value for value in values]
+            cells = ["–" if value is None else show(value) for value in scaled]
+            rows.append(SummaryRow(key, "", heading or quantity.label, cells))
     least = min(summary.get("electrical_energy_J") or 0.0 for summary in summaries)
     if len(summaries) > 1 and least > 0.0:
         cells = [f"{summary['electrical_energy_J'] / least:.3g}" for summary in summaries]

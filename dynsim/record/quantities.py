@@ -12,10 +12,10 @@ _UNITS = {
 }  # fmt: skip
 # Units of time that follow a length or an angle are in the denominator: ``m_s`` is m/s, but ``N_s_per_m`` is N s/m.
 _RATES = {"m_s": "m/s", "m_s2": "m/s²", "rad_s": "rad/s", "rad_s2": "rad/s²", "kg_m3": "kg/m³"}
-# Lengths that are all below this value are shown in millimetres [m].
-SMALL_M = 0.1
+# Lengths are shown in millimetres if the largest is in this range [m].
+SMALL_M = 1e-5, 0.1
 # Last words of keys that qualify the quantity before them.
-_QUALIFIERS = ("rms", "max", "min", "mean", "final", "initial")
+_QUALIFIERS = ("rms", "max", "min", "mean", "initial", "final", "start", "end")
 # Names that the words of a key do not give.
 _NAMES = {
     "electrical_energy_supply": "energy, one supply",
@@ -76,9 +76,9 @@ class Quantity:
         return f"{self.name} [{self.unit}]" if self.unit else self.name
 
     def fitted(self, values: Iterable[object]) -> Quantity:
-        """Return the quantity in millimetres if it is a length and all ``values`` [m] are below 0.1 m."""
+        """Return the quantity in millimetres if it is a length and the largest of ``values`` is 0.01 to 100 mm."""
         sizes = [abs(value) for value in values if isinstance(value, (int, float))]
-        small = self.unit == "m" and 0.0 < max(sizes, default=0.0) < SMALL_M
+        small = self.unit == "m" and SMALL_M[0] <= max(sizes, default=0.0) < SMALL_M[1]
         return replace(self, unit="mm", scale=1e3) if small else self
 
 

@@ -113,7 +113,14 @@ def test_number_of_summary_has_name_and_unit(key: str, label: str) -> None:
 
 @pytest.mark.parametrize(
     ("values", "unit", "scale"),
-    [([0.01, -0.09], "mm", 1e3), ([0.01, 0.1], "m", 1.0), ([0.0], "m", 1.0), ([None, 0.02], "mm", 1e3), ([], "m", 1.0)],
+    [
+        ([0.01, -0.09], "mm", 1e3),
+        ([0.01, 0.1], "m", 1.0),
+        ([0.0], "m", 1.0),
+        ([1e-9], "m", 1.0),
+        ([None, 0.02], "mm", 1e3),
+        ([], "m", 1.0),
+    ],
 )
 def test_small_lengths_are_in_millimetres(values: list[float | None], unit: str, scale: float) -> None:
     fitted = Quantity("gap", unit="m").fitted(values)
