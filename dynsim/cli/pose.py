@@ -10,11 +10,13 @@ import typer
 
 from dynsim.cli.app import ScenarioArgument, SetOption, VariantOption, parsed_overrides
 from dynsim.cli.drawing import open_page, print_page
-from dynsim.cli.output import console, print_line
+from dynsim.cli.output import console, print_line, print_warning
 from dynsim.cli.teleop import HttpPortOption, OpenOption, UntilClosedOption, print_address, require
+from dynsim.errors import DynsimError
 from dynsim.system import interruption
 
 if TYPE_CHECKING:
+    from dynsim.record import Record
     from dynsim.scenario import Scenario
 
 EXAMPLE = "Example: dynsim pose elbow_comparison --variant elbow_4"
@@ -63,7 +65,14 @@ def view_starts(variants: Sequence[Scenario]) -> None:
     from dynsim.draw.page import Inline, page
     from dynsim.teleop.posture import open_posture
 
-    shown = {loaded.variant or loaded.name: open_posture(loaded).picture() for loaded in variants}
+    shown: dict[str, Record] = {}
+    for loaded in variants:
+        try:
+            shown[loaded.variant or loaded.name] = open_posture(loaded).picture()
+        except DynsimError as error:
+            print_warning(f"no picture of the start: {error}")
+    if not shown:
+        return
     path = Path("results", variants[0].name, "start.html")
     path.parent.mkdir(parents=True, exist_ok=True)
     Inline(page(shown, scripts=[_NO_TIME])).save(path)

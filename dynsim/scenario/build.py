@@ -182,7 +182,7 @@ def _posed(scenario: Scenario, built: Robot, touching: Sequence[Contact]) -> Rob
     points = {contact.name: contact for contact in touching}
     for name in initial.on_surface:
         if name in points:
-            _check_body(scenario, built, points[name])
+            check_body(scenario, built, points[name])
     try:
         return replace(built, q0=on_surfaces(Model(built), points, initial.on_surface, initial.keep))
     except ModelError as error:
@@ -528,7 +528,7 @@ def check_start(
     off: list[tuple[Contact, bool, tuple[str, ...], float]] = []
     for contact in touching:
         declared, keys = _keys_of(scenario, contact)
-        _check_body(scenario, model.robot, contact)
+        check_body(scenario, model.robot, contact)
         gap = gap_at(model, contact, q)
         if scenario.config.contacts.law == "unilateral" and gap > (-PRESSED if contact.stiffness > 0.0 else 0.0):
             continue
@@ -562,7 +562,7 @@ def _keys_of(scenario: Scenario, contact: Contact) -> tuple[bool, tuple[str, ...
     return declared, ("contacts", "points", contact.name) if declared else ("contacts", "candidates")
 
 
-def _check_body(scenario: Scenario, robot: Robot, contact: Contact) -> None:
+def check_body(scenario: Scenario, robot: Robot, contact: Contact) -> None:
     """Raise ModelError if a contact is on a body that does not exist or does not move."""
     with errors_at(*_keys_of(scenario, contact)[1], "body"):
         robot.attach(contact.body, contact.point)

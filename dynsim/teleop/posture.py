@@ -23,7 +23,7 @@ from dynsim.engine.recording import drawn_scene, pictured_parts, provenance
 from dynsim.errors import DynsimError, ModelError, ScenarioError
 from dynsim.library import families
 from dynsim.model.base_pose import base_pose, base_row
-from dynsim.model.description import Array, Link, Load, Robot
+from dynsim.model.description import Array, Contact, Link, Load, Robot
 from dynsim.model.drives import Servo, TorqueSource
 from dynsim.model.urdf.reader import rotation
 from dynsim.record import Record
@@ -326,12 +326,16 @@ class ArmPosture(StartPosture):
     def _apply(self, q: Array, scenario: Scenario) -> None:
         """Use a posture, and the contact points of a scenario that are on the robot, enabled or disabled."""
         if scenario is not self.scenario or not hasattr(self, "points"):
-            bodies = {*self.robot.bodies, *(f.name for f in self.robot.frames if f.body in self.robot.bodies)}
-            contacts = [c for c in build.contacts(scenario, self._whole) if c.body in bodies]
-            disabled = [c for c in build.disabled_points(scenario, self._whole) if c.body in bodies]
-            self._enabled, self._disabled = contacts, {contact.name for contact in disabled}
-            self.points = {contact.name: contact for contact in [*contacts, *disabled]}
+            contacts, disabled = build.contacts(scenario, self._whole), build.disabled_points(scenario, self._whole)
+            self._enabled = [contact for contact in contacts if self._is_own(scenario, contact)]
+            self.points = {c.name: c for c in [*self._enabled, *disabled] if self._is_own(scenario, c)}
+            self._disabled = {contact.name for contact in disabled}
         super()._apply(q, scenario)
+
+    def _is_own(self, scenario: Scenario, contact: Contact) -> bool:
+        """Return whether a contact is on the robot, and not on an object; raise ModelError for an unknown body."""
+        build.check_body(scenario, self._whole, contact)
+        return self._whole.attach(contact.body, contact.point)[0] < len(self.robot.links)
 
     def _all_sliders(self) -> list[Slider]:
         sliders: list[Slider] = []
@@ -726,7 +730,9 @@ class SnakePosture(StartPosture):
         if scenario.plant.level != "kinematic":
             drawn = tuple(drawn_surface(name, surface) for name, surface in surfaces.items())
             self.scene = replace(self.scene, surfaces=drawn)
-        limits = np.rad2deg([description.lower, description.upper]).T.tolist()
+        # Angles at a limit must not exceed it after they are rounded.
+        scale = 10.0 ** DECIMALS["_rad"]
+        limits = np.rad2deg(np.trunc(scale * np.array([description.lower, description.upper])) / scale).T.tolist()
         joints = [
             Slider(name, "deg", low, high, (low, high), index=k)
             for k, (name, (low, high)) in enumerate(zip(self._names, limits, strict=True))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from dynsim.errors import DynsimError
 from dynsim.scenario import SHIPPED, shipped_scenarios, variant_names
 from dynsim.teleop.posture import ArmPosture, StartPosture, open_posture, yaml_text
 from dynsim.teleop.web.pilot import Refused
-from dynsim.teleop.web.posing import parse_change
+from dynsim.teleop.web.posing import LivePosture, parse_change
 
 # A copied angle is rounded to 1e-8 deg.
 EXACT_M = 2e-9
@@ -236,6 +237,7 @@ def test_values_are_limited_and_undone_in_order() -> None:
     posture.set("base.x", 3.0)
     assert posture.frame()["values"]["theta1"] == pytest.approx(65.0)
     assert posture.frame()["undo"] == 2
+    assert check(posture.posed()).hand == pytest.approx(posture.frame()["hand"], abs=1e-6)
     posture.undo()
     posture.undo()
     assert not posture.changed
@@ -251,6 +253,33 @@ def test_posture_opens_although_a_listed_point_cannot_touch() -> None:
     posture = opened("brace_on_shapes", "flat", **{"surfaces.ground.point_m": [0, 0, -5]})
     check_message(posture.frame()["note"], "elbow", "initial.keep")
     assert posture.frame()["values"]["joint_2"] == pytest.approx(60.0)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("name", "variant"), KINDS)
+def test_frames_stay_valid_under_random_changes(name: str, variant: str) -> None:
+    rng = np.random.default_rng(7)
+    live = LivePosture(opened(name, variant), name)
+    hello, frame = live.posture.hello(), live.posture.frame()
+    sliders = [slider["name"] for slider in hello["sliders"]]
+    for k in range(25):
+        points = [point["name"] for point in frame["points"]] or ["none"]
+        target = np.add(frame["hand"], rng.normal(0.0, 0.1, 3)).tolist()
+        change = [
+            {"do": "set", "name": str(rng.choice(sliders)), "value": float(rng.choice([-1e4, 1e4, 0.3, 25.0, -70.0]))},
+            {"do": "reach", "target": target, "braces": k % 2 == 0, "orientation": k % 3 == 0},
+            {"do": "snap", "name": str(rng.choice(points)), "hand": k % 2 == 0},
+            {"do": "brace", "body": (hello["bodies"] or ["none"])[-1], "surface": (hello["surfaces"] or ["none"])[0]},
+            {"do": str(rng.choice(["undo", "redo", "reset"]))},
+        ][rng.integers(5)]
+        live._execute(parse_change(json.dumps(change)))
+        frame = live._frame()
+        assert json.loads(json.dumps(frame, allow_nan=False)) == frame
+
+
+def test_contact_on_an_unknown_body_is_an_error() -> None:
+    with raises(DynsimError, "contacts.points.elbow_4.body", "link_99"):
+        opened("elbow_comparison", "two_elbows", **{"contacts.points.elbow_4.body": "link_99"})
 
 
 def test_check_reports_the_first_error_of_the_posture() -> None:

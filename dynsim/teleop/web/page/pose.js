@@ -20,7 +20,7 @@ class Pose {
   receive(message) {
     if (message.hello) this.build(message.hello);
     else if (message.over !== undefined) this.over = message.over;
-    else if (message.refused) console.warn(message.refused);
+    else if (message.refused) this.note.textContent = message.refused;
     else this.show(message);
   }
 
