@@ -46,7 +46,6 @@ def test_settings_of_matplotlib_are_respected(record: Record) -> None:
                 "axes.labelsize": 7.0,
                 "figure.figsize": (3.4, 2.9),
                 "lines.linewidth": 3.0,
-                "axes.grid": False,
                 "axes.prop_cycle": cycler(color=["#112233", "#445566", "#778899"]),
             }
         )
@@ -61,7 +60,6 @@ def test_settings_of_matplotlib_are_respected(record: Record) -> None:
     assert components.yaxis.get_ticklabels()[0].get_fontsize() == pytest.approx(0.88 * 6.0)
     assert [line.get_color() for line in components.get_lines()[:3]] == ["#112233", "#445566", "#778899"]
     assert distance.get_lines()[0].get_linewidth() == 3.0
-    assert not any(line.get_visible() for line in components.get_xgridlines())
 
 
 @pytest.mark.parametrize(

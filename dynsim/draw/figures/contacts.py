@@ -113,6 +113,8 @@ def explain(figure: style.Drawing, events: Sequence[Event]) -> None:
 
 # Maximum number of rows on a page; height of a row [inch].
 ROWS, ROW = 8, 1.75
+# Maximum number of variants whose legend entries have numbers.
+NUMBERED = 4
 # Maximum number of samples that are drawn as dots.
 DOTS = 150
 # Colours of the bands for the modes, by number.
@@ -141,9 +143,16 @@ def _forces(records: Mapping[str, Record], title: str) -> Figure | None:
     kind = "highest" if any(map(is_unilateral, runs)) else "lowest"
     note = "" if len(chosen) == len(names) else f", {len(chosen)} of {len(names)} contacts ({kind} forces)"
     having = {name: {v: r for v, r in records.items() if _touched(r, name)} for name in chosen}
-    # The legend of a row has one entry per variant and one for the shading.
-    more = sum(-(-(len(having[name]) + 1) // 2) - 1 for name in chosen) * style.legend_row() / 72.0
-    figure = style.new_figure(1.0 + ROW * len(chosen) + more, title + note)
+    labels = {
+        (name, v): f"{v or name}: {_share(r, name)}{_modes(r, name) * alone}{_within(r, name)}"
+        for name in chosen
+        for v, r in having[name].items()
+    }
+    # Many variants share one legend below the panels; otherwise the legend of a row has its numbers, and the shading.
+    many = max(map(len, having.values())) > NUMBERED
+    texts = [[*(text for (own, _), text in labels.items() if own == name), "surface pulls"] for name in chosen]
+    more = 0 if many else sum(style.fitted_legend(text, 2)[2] - 1 for text in texts)
+    figure = style.new_figure(1.0 + ROW * len(chosen) + more * style.legend_row() / 72.0, title + note)
     series = [[values for r in having[name].values() for values in _series(r, name)] for name in chosen]
     styles = style.variant_styles(list(records))
     rows = style.time_rows(figure, series, max(run.settle_time for run in runs))
@@ -153,9 +162,7 @@ def _forces(records: Mapping[str, Record], title: str) -> Figure | None:
         for axes in panels:
             for row, (variant, record) in enumerate(having[name].items()):
                 force, colour = _force(record, name), str(styles[variant]["color"])
-                label = (
-                    f"{variant or name}: {_share(record, name)}{_modes(record, name) * alone}{_within(record, name)}"
-                )
+                label = variant if many else labels[name, variant]
                 style.line(axes, record.time, force, label=label, **styles[variant])
                 for value in _extremes(record, name):
                     axes.axhline(value, color=colour, linestyle=(0, (5, 3)), linewidth=0.7)
@@ -171,8 +178,11 @@ def _forces(records: Mapping[str, Record], title: str) -> Figure | None:
             if not all(map(is_unilateral, having[name].values())):
                 style.shade_below_zero(axes, "surface pulls")
         panels[0].set_ylabel(f"{name}\nnormal force [N]")
-        style.legend_above(panels[-1], columns=2)
+        if not many:
+            style.legend_above(panels[-1], columns=2)
     _note_sampling(figure, rows, runs)
+    if many:
+        style.legend_below(figure, [panels[-1] for panels in rows], 5)
     bands = [bar for panels in rows for bar in panels[-1].collections if str(bar.get_label())[1:] in BANDS]
     figure.put_below({str(bar.get_label())[1:]: bar for bar in bands}, 4)
     explain(figure, [event for record in runs for event in marked(record, chosen)])

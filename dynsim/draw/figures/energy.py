@@ -80,10 +80,11 @@ def energy_comparison(records: Mapping[str, Record]) -> Figure | None:
         return None
     height = 4.6 + 2.0 * contacts.height_of_variants(shown)
     title = style.comparison_title(list(shown.values()), "electrical energy and mechanical work")
-    figure = style.new_figure(height + 2.2 * style.narrow(), title)
+    below = 0.8 + 0.2 * len(shown)
+    figure = style.new_figure(height + below * style.narrow(), title)
     # In a narrow figure, the totals are below the curves.
     if style.narrow():
-        grid = figure.add_gridspec(3, 1, height_ratios=[1.0, 1.0, 1.1])
+        grid = figure.add_gridspec(3, 1, height_ratios=[2.0, 2.0, below])
         cells = grid[0], grid[2], grid[1]
     else:
         grid = figure.add_gridspec(2, 2, width_ratios=[1.6, 1.0])
@@ -110,7 +111,7 @@ def energy_comparison(records: Mapping[str, Record]) -> Figure | None:
     _totals(total, list(shown), finals, [str(styles[name]["color"]) for name in shown], logarithmic)
     style.legend_below(figure, [over_time], 5)
     if logarithmic:
-        figure.note("Fractions at the totals: relative to the largest.")
+        figure.note("Fractions: relative to the largest energy.")
     return figure
 
 
@@ -224,29 +225,23 @@ def _totals(axes: Axes, names: Sequence[str], values: Array, colours: Sequence[s
 
     Dots are labelled with their ratio to the largest total.
     """
-    places, largest = np.arange(len(names)), float(values.max())
+    level, largest = np.arange(len(names)), float(values.max())
     if logarithmic:
-        axes.scatter(places, values, s=60, c=colours, zorder=3)
-        # Leave space for the numbers on a logarithmic axis.
-        axes.set_ylim(0.6 * float(values.min()), 2.0 * largest)
-        style.log_axis(axes)
-        axes.margins(x=0.2)
+        axes.scatter(values, level, s=40, c=colours, zorder=3)
+        # Leave space for the numbers to the right of the dots.
+        axes.set_xlim(0.6 * float(values.min()), largest * (largest / float(values.min())) ** 0.6)
+        style.log_axis(axes, "x")
     else:
-        axes.bar(places, values, color=colours, width=0.7)
-        axes.margins(x=0.05, y=0.08)
-    for x, value in zip(places.tolist(), values.tolist(), strict=True):
-        part = f"\n1/{style.number(largest / value, 3)}" if logarithmic and value < largest else ""
-        look: dict[str, Any] = {
-            "textcoords": "offset points",
-            "ha": "center",
-            "va": "bottom",
-            "fontsize": style.letters(7.5),
-        }
-        text = f"{style.number(value)}{part}"
-        axes.annotate(text, (x, max(value, 0.0)), xytext=(0, 6 if logarithmic else 2), **look)
-    axes.set_xticks(places, names, rotation=30 if len(names) <= 4 else 60, ha="right")
-    axes.grid(axis="x", visible=False)
-    axes.set_ylabel("electrical energy\nof the run, net [J]")
+        axes.barh(level, values, color=colours, height=0.7)
+        axes.set_xlim(min(0.0, 1.1 * float(values.min())), 1.3 * max(largest, 0.0) or 1.0)
+    for k, value in enumerate(values.tolist()):
+        part = f" (1/{style.number(largest / value, 3)})" if logarithmic and value < largest else ""
+        look: dict[str, Any] = {"textcoords": "offset points", "va": "center", "fontsize": style.letters(7.5)}
+        axes.annotate(f"{style.number(value)}{part}", (max(value, 0.0), k), xytext=(6 if logarithmic else 3, 0), **look)
+    axes.set_yticks(level, [style.broken(name, 0.9) for name in names])
+    axes.set_ylim(len(names) - 0.4, -0.6)
+    axes.grid(axis="y", visible=False)
+    axes.set_xlabel("net electrical energy [J]")
 
 
 def _joules(values: Array, largest: float = 0.0) -> str:
