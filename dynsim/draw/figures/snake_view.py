@@ -44,8 +44,8 @@ INTERVALS = 160
 SHARES = LinearSegmentedColormap.from_list("shares", [LIFT, GROUND])
 # Minimum height of a top view relative to its width, because a straight robot appears as a thin line.
 MIN_HEIGHT = 0.3
-# Font size of tick labels of postures [point]; greatest and smallest height of their panels [inch].
-SMALL, TALLEST, LOWEST = 6.5, 4.6, 0.5
+# Font size of tick labels of postures [point]; least width of their panels, greatest and smallest height [inch].
+SMALL, CELL, TALLEST, LOWEST = 6.5, 1.6, 4.6, 0.5
 # If a point of the body rises or sinks by more than this, there is a side view [m].
 RISES = 0.01
 # Errors below this are rounding errors [mm or °]; ratio of errors above which their axis is logarithmic.
@@ -131,10 +131,9 @@ def _side_box(clouds: list[Array]) -> Box:
     return x0, x1, min(low, -0.02), high
 
 
-def _columns(count: int, box: Box) -> int:
-    """Return how many of ``count`` panels fit next to each other: fewer if their contents are long and flat."""
-    flat = box[3] - box[2] < 0.6 * (box[1] - box[0])
-    most = max(int(style.width() / (1.6 if flat else 1.15)), 1)
+def _columns(count: int) -> int:
+    """Return how many of ``count`` panels are next to each other, so that rows are equally long."""
+    most = max(int(style.width() / CELL), 1)
     return -(-count // -(-count // most))
 
 
@@ -184,7 +183,7 @@ def _frame(axes: NDArray[Any], boxes: Sequence[Box], used: int, column: int, las
 def posture_grid(
     title: str, lines: Mapping[str, Sequence[tuple[View, str]]], *, side: bool = False, one_scale: bool = True
 ) -> Figure:
-    """Draw labelled lines of postures with their titles, and the path of the controlled point in green.
+    """Draw labelled lines of postures with their titles, and the path of the controlled point.
 
     Parameters
     ----------
@@ -204,7 +203,7 @@ def posture_grid(
         for label, line in views.items()
         for sides in [((_top_box, True), (_side_box, False))[: 1 + side]]
     }
-    columns = min(_columns(len(line), boxes[label][0]) for label, line in lines.items())
+    columns = min(_columns(len(line)) for line in lines.values())
     rows = [(label, line[k : k + columns]) for label, line in lines.items() for k in range(0, len(line), columns)]
     cell = (style.width() - 0.7) / columns
     size = style.letters(7.0)
@@ -216,12 +215,12 @@ def posture_grid(
         below = len(rows[k + 1][1]) if k + 1 < len(rows) else 0
         for column, (view, _) in enumerate(line):
             panels = _frame(row, boxes[label], len(line), column, last=column >= below)
-            panels[0].plot(*view.path.T, color=TARGET, lw=1.0, zorder=2)
+            panels[0].plot(*view.path.T, color=HEAD, lw=1.0, zorder=2)
             for panel, above in zip(panels, (True, False), strict=False):
                 view.draw(panel, above=above)
             first = column == 0 and label.strip() and view is lines[label][0][0]
             panels[0].set_title((f"{label}\n" if first else "") + texts[id(view)], fontsize=size)
-    _explain(figure, pooled, {"its path": Line2D([], [], color=TARGET, lw=1.0)})
+    _explain(figure, pooled, {"its path": Line2D([], [], color=HEAD, lw=1.0)})
     return figure
 
 
@@ -244,7 +243,7 @@ def overlaid(title: str, runs: Mapping[str, tuple[Record, Sequence[View]]]) -> F
     half = 0.5 * np.array([np.max(x1 - x0), max(np.max(y1 - y0), MIN_HEIGHT * np.max(x1 - x0))])
     low, top = np.min(np.array(sides)[:, [0, 2]], axis=0), np.max(np.array(sides)[:, [1, 3]], axis=0)
     profile = (float(low[0]), float(top[0]), float(low[1]), float(top[1]))
-    columns = _columns(len(runs), (0.0, 2.0 * half[0], 0.0, 2.0 * half[1]))
+    columns = _columns(len(runs))
     size = style.letters(7.0)
     labels = [style.broken(label, (style.width() - 0.7) / columns, size) if label else "" for label in runs]
     cells = []
