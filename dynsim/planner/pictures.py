@@ -12,7 +12,7 @@ from dynsim.draw.geometry.meshes import Meshes
 from dynsim.draw.geometry.projection import UP, Array, Projection
 from dynsim.draw.geometry.robot import placed
 from dynsim.draw.geometry.shapes import corners_of, drawn_shape, solid
-from dynsim.errors import SimulationStopped
+from dynsim.errors import ModelError, SimulationStopped
 from dynsim.planner.answer import BracePlan, Size
 from dynsim.planner.arm import axis_lines
 from dynsim.planner.problem import Task
@@ -48,6 +48,9 @@ def _records(plan: BracePlan) -> dict[str, Record]:
             continue
         try:
             shown[size.variant] = plan.record(size.count)
+        except ModelError:
+            # The verification reports why the plan cannot be simulated.
+            continue
         except SimulationStopped as stop:
             if stop.record is not None:
                 shown[size.variant] = stop.record

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -21,7 +21,6 @@ from dynsim.draw.figures import sweep as sweep_figures
 from dynsim.draw.figures.look import Look
 from dynsim.draw.figures.plan import PlanPicture
 from dynsim.draw.figures.sweep import Sweep
-from dynsim.errors import ModelError, ScenarioError
 from dynsim.planner import pictures
 from dynsim.scenario import read_scenario, shipped_scenarios, variant_names
 from dynsim.scenario.quantities import quantity
@@ -141,12 +140,14 @@ def test_sweeps_of_shipped_scenarios_have_no_faults(scenario: str, tmp_path: Pat
             assert faults(sweep_figures.FIGURES, drawn, size)[1] == []
 
 
-def plannable() -> Iterator[str]:
-    """Shipped scenarios for which braces can be planned."""
-    for path in shipped_scenarios():
-        scenario = dynsim.load_scenario(path, next(iter(variant_names(path)), None))
-        try:
-            dynsim.plan_braces(scenario, count=(0, 0), starts=1, verify=False)
-        except (ModelError, ScenarioError):
-            continue
-        yield path.stem
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("scenario", "most", "candidates"),
+    [("pressing", 2, ("link_6:link_9",)), ("brace_on_shapes", 1, ()), ("mobile_elbow_comparison", 1, ("link_8",))],
+)
+def test_verified_plans_have_no_faults(scenario: str, most: int, candidates: tuple[str, ...]) -> None:
+    picture = planned(scenario, True, most, *candidates)
+    for size in SIZES:
+        names, overlaps = faults(plan_figures.FIGURES, picture, size)
+        assert {"plan_posture", "plan_heat", "plan_robustness"} <= set(names)
+        assert overlaps == []

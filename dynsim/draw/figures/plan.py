@@ -298,7 +298,9 @@ def _dots(
         look: dict[str, Any] = {"marker": "X" if mark.startswith("rejected") else "o", "color": BLUE, "markersize": 6.0}
         face = "white" if mark.startswith("other") else BLUE
         axes.plot(value, y, linestyle="none", markerfacecolor=face, clip_on=False, zorder=3, label=mark, **look)
-        axes.text(1.02, y, f"{number(value, 3)} W", transform=axes.get_yaxis_transform(), va="center", fontsize=size)
+        axes.text(
+            1.02, y, f"{float(f'{value:.3g}'):g} W", transform=axes.get_yaxis_transform(), va="center", fontsize=size
+        )
     for y, run in enumerate(runs):
         if np.isfinite(run):
             axes.plot(run, y, "|", color=BLACK, markersize=11.0, clip_on=False, zorder=4, label="simulated run")
