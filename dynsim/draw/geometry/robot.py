@@ -329,7 +329,7 @@ def penetrations(record: Record, scene: Scene, rows: NDArray[np.intp] | slice = 
     excluded.
     """
     wheels = {k for k, body in enumerate(scene.bodies) if body.joint.signal == "rho"} | set(scene.base)
-    points = [(body.joint.name, k, HERE_POINT) for k, body in enumerate(scene.bodies) if k not in wheels]
+    points = [(scene.bodies[k].joint.name, k, HERE_POINT) for k in scene.rows if k not in wheels]
     if scene.hand is not None and scene.hand.body != WORLD:
         points.append((scene.hand.name, scene.hand.body, scene.hand.position))
     below = []

@@ -26,6 +26,7 @@ from dynsim.draw.geometry.robot import (
     FRAMES,
     POSE_ERROR,
     DrawnRobot,
+    Penetration,
     azimuth,
     bounds,
     contacts,
@@ -50,8 +51,8 @@ from dynsim.draw.geometry.shapes import (
 from dynsim.errors import RecordError
 from dynsim.record import TIME, Record, Signal
 from dynsim.record.measures import GRIPPER_STATES, hand_target
-from dynsim.record.poses import ORIENTATION, POSITION, TOUCHING, point_positions
-from dynsim.record.scene import WORLD, Scene
+from dynsim.record.poses import ORIENTATION, POSITION, TOUCHING, contact_positions, point_positions
+from dynsim.record.scene import WORLD, Scene, SceneSurface
 from dynsim.system.arguments import names_wrong_types
 from dynsim.system.files import replacing
 
@@ -74,7 +75,7 @@ class Blocks:
     def add(self, columns: ArrayLike, error: float = np.inf, step: float = 0.0) -> dict[str, Any]:
         """Add columns, (T,) or (T, …), quantised to 16 bits of their range, or to 32 bits if ``error`` requires it.
 
-        A quantisation step of at least ``step`` makes noise compressible.
+        A quantisation step of ``step``, but at most 1/500 of the range, makes noise compressible.
         """
         data = np.asarray(columns, dtype=np.float64)
         data = data.reshape(len(data), -1) if len(data) else data.reshape(0, 1)
@@ -84,7 +85,7 @@ class Blocks:
         some = np.isfinite(low)
         low, span = np.where(some, low, 0.0), np.where(some, high - low, 0.0)
         bits = 16 if 0.5 * span.max(initial=0.0) / _CODES[16] <= error else 32
-        scale = np.where(span > 0.0, np.maximum(span / _CODES[bits], step), 0.0)
+        scale = np.where(span > 0.0, np.maximum(span / _CODES[bits], np.minimum(span / 500.0, step)), 0.0)
         with np.errstate(all="ignore"):
             codes = np.rint((np.where(known, data, low) - low) / np.where(scale > 0.0, scale, 1.0))
         kind = _TYPES[bits]
@@ -93,8 +94,8 @@ class Blocks:
         planes = np.ascontiguousarray(steps).view(np.uint8).reshape(-1, bits // 8).T
         start = self._append(np.ascontiguousarray(planes).tobytes())
         header = {"at": start, "rows": len(data), "columns": int(codes.shape[1]), "bits": bits}
-        # Ten digits are more than the quantisation keeps.
-        return header | {name: [float(f"{x:.10g}") for x in v] for name, v in (("offset", low), ("scale", scale))}
+        # Twelve digits are more than the quantisation keeps.
+        return header | {name: [float(f"{x:.12g}") for x in v] for name, v in (("offset", low), ("scale", scale))}
 
     def raw(self, data: NDArray[Any]) -> dict[str, Any]:
         """Add an array of integers ≥ 0 unchanged (for meshes), little-endian, in 16 bits, or in 32 if necessary."""
@@ -253,6 +254,7 @@ def viewable(record: Record) -> bool:
 def _record(name: str, robot: DrawnRobot, blocks: Blocks, meshes: Meshes, low: Array, high: Array) -> dict[str, Any]:
     record, scene, rows = robot.record, robot.scene, robot.rows
     instants, touching = _contacts(robot, blocks)
+    sunk = penetrations(record, scene, rows)
     meshes.of_robot(record.scene)
     position, turn = record[POSITION][rows], record[ORIENTATION][rows]
     shapes = body_shapes(scene, robot.reach, meshes)
@@ -274,7 +276,7 @@ def _record(name: str, robot: DrawnRobot, blocks: Blocks, meshes: Meshes, low: A
         "bodies": bodies,
         "fixed": [shape_drawn for shape in scene.fixed if (shape_drawn := drawn_shape(shape, meshes)) is not None],
         "stands": _stands(scene),
-        "surfaces": [drawn_surface(surface, low, high) for surface in scene.surfaces],
+        "surfaces": [drawn_surface(surface, *_near(surface, robot, sunk, low, high)) for surface in scene.surfaces],
         "frames": blocks.add(record.time[rows], 1e-9),
         "position": blocks.add(position, 0.5 * POSE_ERROR),
         "orientation": blocks.add(turn, 2e-5),
@@ -284,12 +286,12 @@ def _record(name: str, robot: DrawnRobot, blocks: Blocks, meshes: Meshes, low: A
         "sunk": [
             {"name": point.name, "surface": point.surface, "body": point.body, "p": list(point.position)}
             | {"least": point.least, "depth": blocks.add(point.depth, 1e-5)}
-            for point in penetrations(record, scene, rows)
+            for point in sunk
         ],
         "wheels": None if groups.down is None else {"names": groups.names, "down": blocks.add(groups.down[instants])},
         "supports": supports(scene, groups),
         "motors": _motors(record, scene),
-        "limits": _torque_limits(record),
+        "limits": _limits(record),
         "names": scene.wheel_names,
         "limit": scene.voltage_limit,
         "resistance": resistance(record),
@@ -305,6 +307,20 @@ def _record(name: str, robot: DrawnRobot, blocks: Blocks, meshes: Meshes, low: A
     if scene.hand is not None:
         part["hand"] = {"body": scene.hand.body, "p": list(scene.hand.position), "name": scene.hand.name}
     return part
+
+
+def _near(
+    surface: SceneSurface, robot: DrawnRobot, sunk: Sequence[Penetration], low: Array, high: Array
+) -> tuple[Array, Array]:
+    """Return the box near which a surface is drawn: a plane through the robot is a plate at its contact points."""
+    record, deep = robot.record, 0.05 * robot.reach
+    touched = [contact_positions(record, point) for point in robot.scene.contacts if point.surface == surface.name]
+    through = any(point.surface == surface.name and point.depth.max() > deep for point in sunk)
+    if surface.kind != "plane" or not touched or not through:
+        return low, high
+    points = np.concatenate(touched)
+    points = points[(np.abs(surface.gap(points)) < deep) & np.isfinite(points).all(axis=1)]
+    return (points.min(axis=0) - 2.0 * deep, points.max(axis=0) + 2.0 * deep) if len(points) else (low, high)
 
 
 def _stands(scene: Scene) -> list[list[float]]:
@@ -368,13 +384,20 @@ def resistance(record: Record) -> float | None:
     return R if abs(loss - heat) <= HEAT_ERROR * abs(heat) else None
 
 
-def _torque_limits(record: Record) -> dict[str, dict[str, float]]:
-    """Return the torque rating and the stall torque of the motors for which they are known [N m or N]."""
+# Ratings of motors in the summary, by the name of their colouring.
+_RATINGS = {
+    "rating": ("nominal_torque_N_m", "nominal_force_N"),
+    "stall": ("stall_torque_N_m",),
+    "nominal_current": ("nominal_current_A",),
+}
+
+
+def _limits(record: Record) -> dict[str, dict[str, float]]:
+    """Return the ratings of the motors for which they are known, by colouring and joint [N m, N or A]."""
     motors = record.summary.get("motors", ())
-    keys = {"rating": ("nominal_torque_N_m", "nominal_force_N"), "stall": ("stall_torque_N_m",)}
     return {
-        name: {motor["joint"]: motor[key] for motor in motors for key in several if motor.get(key)}
-        for name, several in keys.items()
+        name: {motor["joint"]: motor[key] for motor in motors for key in keys if motor.get(key)}
+        for name, keys in _RATINGS.items()
     }
 
 

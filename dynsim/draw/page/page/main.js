@@ -218,7 +218,8 @@ class App {
   colourings() {
     const size = (x) => Math.abs(x), share = (x, limit) => Math.abs(x) / limit;
     const list = [["power", "electrical power |u i|", "W", size], this.heat(), ["torque", "torque", "", size], ["voltage", "voltage", "V", size],
-      ["phi_dot", "joint rate", "rad/s", size], ["rating", "torque over rating", "rating", share, "torque"], ["stall", "torque over stall torque", "stall torque", share, "torque"]];
+      ["phi_dot", "joint rate", "rad/s", size], ["rating", "torque over rating", "rating", share, "torque"], ["stall", "torque over stall torque", "stall torque", share, "torque"],
+      ["nominal_current", "current over rating", "rating", share, "current"]];
     return list.map(([name, text, unit, of, signal]) => ({ name, text, unit, of, signal: signal ?? name, limited: Boolean(signal) }))
       .filter((c) => this.actors.some((a) => a.signals.has(c.signal) && (!c.limited || Object.keys(a.data.limits[c.name] ?? {}).length)));
   }
