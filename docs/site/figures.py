@@ -30,8 +30,8 @@ INTRODUCTION = """# Figures
 
 Every figure that dynsim draws. `dynsim run`, `compare`, `sweep`, `plan` and `hw replay` write them to the folder of
 their results, and `dynsim plot RECORD` draws those of records again, as PNG, PDF or SVG. In Python,
-`dynsim.figure(record, NAME)` returns such a figure, and `dynsim.figure({"a": record_a, "b": record_b}, NAME)` a figure
-of several records; [Figures for a paper](../how-to/figures.md) has examples. [T] is the paper about the
+`dynsim.figure(record, NAME)` returns such a figure, and `dynsim.figure({"a": record_a, "b": record_b}, NAME)` returns
+a figure that compares records; [Figures for a paper](../how-to/figures.md) has examples. [T] is the paper about the
 [snake](../snake.md).
 
 """

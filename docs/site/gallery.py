@@ -82,7 +82,7 @@ def clean() -> None:
 
 @cache
 def run(name: str, variant: str | None) -> dynsim.Record:
-    """Return the record of a run; of a run that stops, such as a base that tips over, the record until then."""
+    """Return the record of a run, which ends early if the run stops."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
