@@ -203,7 +203,7 @@ TEARING = {"controller.joints": {"joint_3": {"times_s": [0, 2], "angles_deg": [9
 
 
 def test_references_that_tear_a_brace_off_are_refused():
-    """Joint 3 raises what lies beyond it by 10° within 2 s, as 3 s² − 2 s³ of the time; yaw does not change heights."""
+    """Joint 3 raises the links behind it by 10° within 2 s, as 3 s² − 2 s³ of the time; yaw does not change heights."""
     scenario = load_scenario("elbow_comparison", "two_elbows", TEARING)
     model = Model(build.robot(scenario))
 

@@ -112,7 +112,7 @@ def test_an_orientation_out_of_reach_says_when() -> None:
 
 @pytest.mark.parametrize(("tool", "named"), [("flange", True), ("hand", False)])
 def test_the_orientation_of_a_turned_frame_is_that_of_the_hand(tmp_path, tool, named) -> None:  # type: ignore[no-untyped-def]
-    """Of a frame behind a turned fixed joint, named as the hand or called so; it was that of its body."""
+    """A frame behind a turned fixed joint is the hand, by its name or by the key; dynsim used the frame of its body."""
     (tmp_path / "turned.urdf").write_text(TURNED.replace("TOOL", tool))
     plant = {"type": "urdf_arm", "file": str(tmp_path / "turned.urdf")} | ({"hand": {"body": tool}} if named else {})
     model = dynsim.build_model(scenario_from_resolved({"name": "turned", "duration_s": 1.0, "plant": plant}))

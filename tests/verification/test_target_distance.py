@@ -48,7 +48,7 @@ def scenario(chain: list[dict[str, Any]], joints: list[str], k_p: float = 100.0,
 
 
 def result(*args: Any, **more: Any) -> tuple[float, dict[str, DistanceCause], dynsim.Record]:
-    """Return the distance at the end [m], the causes by name, and the record of a scene."""
+    """Run a scene; return the record, the distance at the end [m] and the causes by name."""
     record = dynsim.simulate(scenario(*args, **more))
     causes = {entry["cause"]: DistanceCause(**entry) for entry in record.summary["hand_error_causes"]}
     return record.summary["hand_error_end_m"], causes, record
