@@ -40,7 +40,9 @@ if TYPE_CHECKING:
 END_LIMIT, START_LIMIT, EXAMINED, LEAST = 0.02, 0.05, 0.005, 1e-3
 # Smallest part of the distance that counts as a cause; smallest sum of the parts of all causes; largest part that may
 # remain unexplained; largest part by which other effects may reduce the distance. Otherwise the causes are unknown.
-PART, EXPLAINED, UNEXPLAINED, OPPOSED = 0.25, 0.6, 0.1, 0.5
+PART, EXPLAINED, UNEXPLAINED, OPPOSED = 0.25, 0.6, 0.1, 0.3
+# Deviation of a joint beyond which the parts depend on the posture, so that only a part above MAIN counts [rad or m].
+FAR, MAIN = 0.5, 0.75
 # Smallest part of a cause for which a joint is named.
 NAMED = 0.2
 # Nodes and weights on [0, 1] of the mean Jacobian (Gauss, third order).
@@ -50,7 +52,7 @@ NODES = ((0.5 - 0.15**0.5, 5.0 / 18.0), (0.5, 8.0 / 18.0), (0.5 + 0.15**0.5, 5.0
 TEXTS = {
     "sag": ("sag of {} under the weight", "raise the gains, brace the arm, or use controller.feed_forward: gravity"),
     "contact": ("contact forces on {}", "raise the gains, or move the path or the surface"),
-    "deflection": ("deflection of {} under the weight and contact forces", "raise the gains, or add a brace"),
+    "deflection": ("deflection of {} under forces that partly cancel", "raise the gains, or add a brace"),
     "load": ("forces of loads and ties on {}", "raise the gains"),
     "limit": ("motors of {} at their limits of voltage, current or torque", "use larger motors, or slow down"),
     "stop": ("joint stops of {}", "change the path or the limits"),
@@ -64,8 +66,6 @@ TEXTS = {
 }
 
 
-# Causes that are static forces.
-STATIC = ("sag", "contact", "load")
 COLUMNS = [ka.DRIVEN, ka.DRIVE_KIND, ka.SERVO_MODE, ka.SAMPLED]
 # Parts of a distance by cause and joint; the cause "" is unexplained.
 Parts = dict[str, dict[str, float]]
@@ -95,24 +95,30 @@ def hand_reach(robot: Robot) -> float:
 
 def named_causes(parts: Parts) -> list[DistanceCause]:
     """Return the causes with a considerable part of a distance, largest first; empty if the causes are unknown."""
-    known = {cause: joints for cause, joints in parts.items() if cause and cause not in STATIC}
-    static: Parts = defaultdict(dict)
-    for joint in dict.fromkeys(joint for cause in STATIC for joint in parts.get(cause, ())):
-        own = {cause: parts[cause].get(joint, 0.0) for cause in STATIC if cause in parts}
-        # Static forces on a joint partly cancel, like the weight and the force of a brace; the larger one counts.
-        deflection = sum(own.values())
-        static[max(own, key=lambda cause: own[cause] * deflection)][joint] = deflection
-    if min((sum(joints.values()) for joints in static.values()), default=0.0) < -PART:
-        # Joints deflect in opposite directions, under the weight and under forces of braces.
-        static = {"deflection": {joint: part for joints in static.values() for joint, part in joints.items()}}
-    known |= static
+    known: Parts = defaultdict(dict, {cause: dict(joints) for cause, joints in parts.items() if cause})
+    reaction = parts.get("contact", {})
+    for joint, force in reaction.items():
+        weight = known["sag"].get(joint, 0.0)
+        both = force + weight
+        # A smaller opposite contact force is the reaction of a brace to the weight; small sums count as the larger one.
+        if force * weight < 0.0 and (abs(force) < abs(weight) or abs(both) < PART):
+            larger = abs(force) < abs(weight)
+            known["sag"][joint], known["contact"][joint] = (both, 0.0) if larger else (0.0, both)
     total = {cause: sum(joints.values()) for cause, joints in known.items()}
-    remainder = abs(1.0 - sum(total.values())) + sum(map(abs, parts.get("", {}).values()))
-    large = sorted(((part, cause) for cause, part in total.items() if part >= PART), reverse=True)
-    opposed = -sum(part for part in total.values() if part < 0.0)
-    if remainder > UNEXPLAINED or opposed > OPPOSED or sum(part for part, _ in large) < EXPLAINED:
+    unexplained = abs(1.0 - sum(total.values())) + sum(map(abs, parts.get("", {}).values()))
+    large = [cause for cause in sorted(total, key=lambda cause: -total[cause]) if total[cause] >= PART]
+    if unexplained > UNEXPLAINED or sum(total[cause] for cause in large) < EXPLAINED:
         return []
-    return [_cause(cause, known[cause]) for _, cause in large]
+    if -sum(part for part in total.values() if part < 0.0) > OPPOSED:
+        static = [cause for cause in total if cause in ("sag", "contact", "load")]
+        if abs(1.0 - sum(total[cause] for cause in static)) > PART:
+            return []
+        large, joints = ["deflection"], {joint for cause in static for joint in known[cause]}
+        known["deflection"] = {joint: sum(known[cause].get(joint, 0.0) for cause in static) for joint in joints}
+    # Contacts would take over the forces of motors, stops and friction, in an unknown way.
+    if {"limit", "stop", "friction"} & set(large) and sum(map(abs, reaction.values())) > OPPOSED:
+        return []
+    return [_cause(cause, known[cause]) for cause in large]
 
 
 def _cause(cause: str, joints: dict[str, float]) -> DistanceCause:
@@ -187,7 +193,14 @@ def hand_causes(
         before, then = hand(referenced), before
         parts["base"][""] = float(weight @ (then - before))
     parts["reference"][""] = float(weight @ (before - target))
-    return named_causes(parts)
+    causes = named_causes(parts)
+    weights = model.bias_forces(referenced, np.zeros(model.n))
+    for k, loop in loops.items():
+        off = abs(float(q[robot.position_index[k]]) - loop.reference)
+        # The joint may have left a posture in which its weight was larger.
+        if causes and off > FAR and (causes[0].share < MAIN or loop.compliance * abs(weights[k]) > OPPOSED * off):
+            return []
+    return causes
 
 
 def hand_distance(record: Record, prepared: Prepared, settle: float, begun: float) -> dict[str, Any]:
@@ -263,9 +276,20 @@ def because(causes: Sequence[DistanceCause]) -> str:
 
 
 class _Loop(NamedTuple):
-    """Position loop of a joint: reference [rad or m], and parts of the deviation q − reference by cause [rad or m]."""
+    """Position loop of a joint.
+
+    Attributes
+    ----------
+    reference : float
+        Reference [rad or m].
+    compliance : float
+        Deviation per torque or force, R/(K k_p) [rad/(N m) or m/N].
+    parts : dict of str to float
+        Parts of the deviation q − reference by cause [rad or m].
+    """
 
     reference: float
+    compliance: float
     parts: dict[str, float]
 
 
@@ -343,7 +367,7 @@ def _loops(record: Record, prepared: Prepared, chain: Sequence[int]) -> dict[int
         others = robot.ties or len(loads) < len(prepared.loads)
         cause = "load" if others and not (robot.couplings or sampled) else ""
         parts[cause] = parts.get(cause, 0.0) + remainder
-        loops[k] = _Loop(wanted, {cause: -part / motor[ka.K_P] for cause, part in parts.items()})
+        loops[k] = _Loop(wanted, volts / motor[ka.K_P], {cause: -part / motor[ka.K_P] for cause, part in parts.items()})
     return loops
 
 
