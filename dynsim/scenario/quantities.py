@@ -36,17 +36,8 @@ _NAMED = (
     "torques", "initial_pose", "commands", "paths",
 )  # fmt: skip
 _GENERAL = (
-    "plant",
-    "arm",
-    "controller",
-    "contacts",
-    "integrator",
-    "record",
-    "metrics",
-    "motor",
-    "link",
-    "surface_error",
-)
+    "plant", "arm", "controller", "contacts", "integrator", "record", "metrics", "motor", "link", "surface_error",
+)  # fmt: skip
 # Keys of an entry of a chain that belong to the link; all others belong to the joint.
 _OF_LINK = ("length", "radius", "mass", "com", "inertia", "count")
 # Words that start the specification of a quantity after its name.
@@ -84,7 +75,6 @@ def quantity(key: str, scenario: Scenario | ScenarioConfig | None = None) -> Qua
     >>> quantity("contacts.friction", scenario)
     Quantity(name='coefficient of friction', symbol='μ', unit='', scale=1.0)
     """
-    config = scenario.config if isinstance(scenario, Scenario) else scenario
     parts = key.split(".")
     indices: list[str] = []
     while len(parts) > 1 and _is_index(parts[-1]):
@@ -99,7 +89,8 @@ def quantity(key: str, scenario: Scenario | ScenarioConfig | None = None) -> Qua
     described = "" if "motor" in sections else _head(text)
     if words == "friction" and unit:
         words = "dry_friction"
-    owner = entry or _owner(sections, config, "link" if words in _OF_LINK and sections[-1] != "motor" else "joint")
+    of_motor = sections[-1:] == ["motor"]
+    owner = entry or _owner(sections, config, "link" if words in _OF_LINK and not of_motor else "joint")
     if words in _PLACED:
         described = f"{_PLACED[words]} {'position' if unit == 'm' else 'angle'}"
         if indices and not owner:
@@ -109,7 +100,7 @@ def quantity(key: str, scenario: Scenario | ScenarioConfig | None = None) -> Qua
     name = _NAMES.get(words) or (_SPECIFICATION.split(described)[0] if owner else described) or words.replace("_", " ")
     if components == ["z"] and words in _POSITIONS and _in_world(sections):
         name, components = "height error of the surfaces" if words == "shift" else "height", []
-    if words == "mass" and sections[-1] == "motor":
+    if words == "mass" and of_motor:
         name = "motor mass"
     if owner:
         name = f"{name} of {owner}"
@@ -120,9 +111,8 @@ def quantity(key: str, scenario: Scenario | ScenarioConfig | None = None) -> Qua
 
 def _in_world(sections: Sequence[str]) -> bool:
     """Return whether positions in a section are in the axes of the world."""
-    return (
-        sections[0] in ("surfaces", "surface_error") or sections[-1] in ("base", "path") or sections[:-1] == ["objects"]
-    )
+    outer, inner = sections[:1], sections[-1:]
+    return outer in (["surfaces"], ["surface_error"]) or inner in (["base"], ["path"]) or sections[:-1] == ["objects"]
 
 
 def _is_index(part: str) -> bool:
@@ -164,7 +154,7 @@ def _owner(sections: Sequence[str], config: ScenarioConfig | None, kind: str) ->
     """Return the innermost named entry, e.g. a surface, a contact, or a joint or link (``kind``); "" if none."""
     for k in range(len(sections) - 1, 0, -1):
         section, name = sections[k - 1 : k + 1]
-        if section == "chain":
+        if section == "chain" and _is_index(name):
             return _numbered(name, kind, _part(config, sections[:k]))
         if section in _NAMED:
             return f"all {section}" if name == "*" else f"{section[:-1]} {name}" if name.isdecimal() else name
@@ -173,7 +163,7 @@ def _owner(sections: Sequence[str], config: ScenarioConfig | None, kind: str) ->
 
 def _numbered(index: str, kind: str, chain: Any) -> str:
     """Return the numbers of the joints or links of an entry of a chain, as in their names: joint 4, links 2 to 5."""
-    counts = [link.count for link in chain or ()]
+    counts = [getattr(link, "count", 1) for link in chain] if isinstance(chain, list) else []
     if index == "*" or int(index) >= len(counts):
         return f"all {kind}s" if index == "*" else f"entry {index} of the chain"
     first, count = 1 + sum(counts[: int(index)]), counts[int(index)]

@@ -79,6 +79,16 @@ def test_every_key_of_shipped_scenarios_is_readable() -> None:
             assert not unit or described.unit == unit, (key, described)
 
 
+@pytest.mark.parametrize(
+    "key", ["mass_kg", "point_m.2", "plant.chain.x.mass_kg", "plant.chain.99.mass_kg", "plant.chain.0", "", "..", "*.*"]
+)
+def test_unknown_keys_have_quantities_too(key: str) -> None:
+    config = dynsim.scenario.ScenarioConfig.model_validate(ARM)
+    assert isinstance(quantity(key, config), Quantity)
+    assert isinstance(quantity(key), Quantity)
+    assert isinstance(summary_quantity(key), Quantity)
+
+
 def numeric_keys(value: Any, path: tuple[str, ...]) -> Iterator[str]:
     """All dotted keys of numbers in plain values."""
     if isinstance(value, dict):

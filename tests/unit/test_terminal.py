@@ -59,6 +59,15 @@ def test_tables_show_names_as_they_are_written():
         assert all(c == "\n" or c.isprintable() for c in output.getvalue())
 
 
+def test_grouped_warnings_show_names_as_they_are_written():
+    warnings = [f"{EVIL}: slips for {k} % of the run, and so on for a whole line of text" for k in range(60)]
+    output = io.StringIO()
+    print_summary(Terminal(file=output, width=300, emoji=False), {"scenario": "a", "variant": "", "warnings": warnings})
+    (line,) = lines_with(output.getvalue(), "the first of 60")
+    assert line.startswith(f"warning: {SHOWN}: slips for 0 %")
+    assert all(c == "\n" or c.isprintable() for c in output.getvalue())
+
+
 def test_messages_have_a_limited_size():
     assert shortened("short\nlines") == "short\nlines"
     lines = shortened("\n".join(["beginning " + "x" * 10**6 + " end"] * 1000)).split("\n")
