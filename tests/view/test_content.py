@@ -12,6 +12,7 @@ import re
 import subprocess
 import sys
 import zipfile
+from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -35,6 +36,7 @@ from dynsim.errors import RecordError
 from dynsim.record import Record, meshes
 from dynsim.record.meshes import Mesh, read_mesh
 from dynsim.record.poses import ORIENTATION, POSITION, add_body_poses
+from dynsim.record.scene import SceneSurface
 from dynsim.scenario import build_model, load_scenario, variant_names
 
 pytestmark = pytest.mark.long
@@ -144,6 +146,24 @@ def test_page_of_18_dynamic_snakes_is_small() -> None:
         other.scene = record.scene
         records[f"variant {k}"] = other
     assert len(page(records).encode()) < 5_000_000
+
+
+def test_plane_through_the_robot_is_a_plate_at_its_contact_points(braced: Record) -> None:
+    record = Record(braced.time, provenance=braced.provenance)
+    for name in (POSITION, ORIENTATION):
+        record.add(name, braced[name], braced.units[name], labels=braced.labels[name])
+    assert braced.scene is not None
+    elbow = braced.scene.contacts[0]
+    x = float(braced[POSITION][0, elbow.body, 0])
+    sizes = []
+    for normal in ([0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]):
+        plane = SceneSurface.of_quadric(elbow.surface, np.zeros((3, 3)), normal, -x * normal[0])
+        record.scene = replace(braced.scene, surfaces=(plane,))
+        (part,) = data_of(page({"one": record}))[0]["records"]
+        sizes.append(max(part["surfaces"][0]["size"]))
+    reach = np.ptp(braced[POSITION][0, :, 0])
+    assert sizes[0] > reach
+    assert 0.05 * reach < sizes[1] < 0.4 * reach
 
 
 def test_signals_have_names_and_units(braced: Record) -> None:

@@ -675,6 +675,15 @@ def test_first_four_variants_are_shown_and_labelled(braced: Record, opened: Open
     assert distance.min() > 0.3
     assert np.linalg.matrix_rank(offsets, tol=0.1) == 2
     page.until("[...document.querySelectorAll('#labels .name')].filter((n) => !n.hidden).length > 6")
+    # No label covers another.
+    boxes = page.js(
+        """[...document.querySelectorAll('#labels div')].filter((n) => !n.hidden).map((n) => n.getBoundingClientRect())
+           .map((b) => [b.left, b.top, b.right, b.bottom])"""
+    )
+    left, top, right, bottom = np.array(boxes).T
+    wide = np.minimum(right[:, None], right) - np.maximum(left[:, None], left) > 3.0
+    high = np.minimum(bottom[:, None], bottom) - np.maximum(top[:, None], top) > 3.0
+    assert (wide & high).sum() == len(boxes) > 6
 
 
 def test_brace_radius_and_payload_are_drawn(opened: Opens) -> None:
