@@ -13,7 +13,7 @@ from dynsim.draw.geometry.shapes import round_patch, surface_grids
 from dynsim.errors import RecordError
 from dynsim.library.surfaces import cylinder, plane, sphere
 from dynsim.model.description import Quadric
-from dynsim.record.scene import Body, Joint, Point, Scene, SceneSurface, Shape, quaternion
+from dynsim.record.scene import Body, CarriedMass, Joint, Point, Scene, SceneSurface, Shape, quaternion
 
 CONTEXT = BuildContext(1.0)
 HINGE = Joint("j", "revolute", (0.0, 1.0, 0.0), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), "q", ("j",))
@@ -27,7 +27,11 @@ def test_round_trip_and_unknown_keys():
     scene = Scene(
         (Body("a", -1, HINGE), Body("b", 0, HINGE, (Shape("cylinder", (0.1, 1.0), colour=(1.0, 0.0, 0.0, 0.5)),))),
         (surface(plane.build(plane.Config(type="plane"), CONTEXT)),),
-        (Point("hand", "hand", 1, (0.0, 0.0, 1.0)), Point("e", "contact", 0, (0.0, 0.0, 0.5), "s")),
+        (
+            Point("hand", "hand", 1, (0.0, 0.0, 1.0)),
+            Point("e", "contact", 0, (0.0, 0.0, 0.5), "s", 0.3, 0.02, (0.0, 0.0, 0.6)),
+        ),
+        payloads=(CarriedMass("tool", 1, (0.0, 0.0, 0.9), 0.5, 0.03),),
     )
     assert Scene.from_json(scene.to_json()) == scene
     later = json.loads(scene.to_json()) | {"lights": []}

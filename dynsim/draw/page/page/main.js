@@ -369,7 +369,9 @@ class App {
   showStatus(pairs) {
     const lines = [];
     for (const [actor] of pairs) {
-      const parts = [];
+      // A live page has no table of contacts.
+      const parts = (this.live ? actor.contacts : []).map(({ state }) => state.force === null || state.state === "open" ? `${state.name}: open`
+        : `${state.name}: ${D.number(state.force, 3)} N, ${state.state}`);
       // For a live gripper, only open or closed is known.
       if (actor.data.states && !actor.live) parts.unshift(`gripper: ${actor.data.states[actor.shown.gripper]}`);
       actor.saturated = this.saturated(actor);
@@ -382,6 +384,7 @@ class App {
       const deep = actor.sunk.filter((one) => one.depth !== null).sort((a, b) => b.depth - a.depth);
       if (deep.length) parts.push(`below ${deep[0].point.surface}: ${deep.slice(0, 3).map((one) => `${one.point.name} ${D.number(1e3 * one.depth, 2)} mm`).join(", ")}${deep.length > 3 ? " …" : ""}`);
       if (actor.support?.inside === false) parts.push(`${actor.data.pressure.name} outside the support`);
+      if (parts.length > 6) parts.splice(6, parts.length, `… ${parts.length - 6} more`);
       if (parts.length && this.labelled.includes(actor)) lines.push([actor, parts.join(" · ")]);
     }
     this.table.show();
@@ -495,7 +498,7 @@ class ContactTable {
   }
 
   show() {
-    const actors = this.app.actors.filter((a) => this.app.labelled.includes(a) && a.contacts.length);
+    const actors = this.app.live ? [] : this.app.actors.filter((a) => this.app.labelled.includes(a) && a.contacts.length);
     this.box.hidden = !actors.length;
     const key = this.app.theme + actors.map((a) => `${a.index} ${a.slot}`).join();
     if (key !== this.key) this.build(actors);
