@@ -408,6 +408,8 @@ class Film:
             for x, y in self._places:
                 if x > 0:
                     draw.line([x, y, x, self._area[3]], fill=GREY)
+                if y > self._area[1]:
+                    draw.line([0, y, self.size[0], y], fill=GREY)
         if self._strip is not None and (strip := self._strip.frame(time)) is not None:
             image.paste(strip, (0, self._area[3]))
         return image

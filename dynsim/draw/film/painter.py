@@ -340,7 +340,8 @@ class Painter:
         for k, own in enumerate(shapes):
             for j, shape in enumerate(own):
                 wheel = wheels.get((k, j), -1)
-                plain = WHEEL if wheel >= 0 else self._hub if shape.get("role") == "hub" else BODY
+                role = "wheel" if wheel >= 0 else shape.get("role", "")
+                plain = {"wheel": WHEEL, "pad": WHEEL, "hub": self._hub}.get(role, BODY)
                 parts.append((k, shape, plain, wheel, np.zeros((2, 3))))
         parts += [(self._gripped, shape, self.tint, -1, moved) for shape, moved in self._fingers(shapes)]
         solids = [solid(shape, self._meshes) for _, shape, *_ in parts]
