@@ -626,6 +626,35 @@ def test_ten_motors_are_an_envelope_and_six(braced: Record) -> None:
     assert len(shown) == 1 + energy.LARGEST
 
 
+SERVOS = """\
+duration_s: 0.3
+plant:
+  type: serial_arm
+  link: {mass_kg: 0.2, length_m: 0.2, motor: {type: servo, voltage_V: 12, stall_torque_N_m: 0.9,
+    no_load_speed_rad_per_s: 5, k_p_V_per_rad: 40, nominal_torque_N_m: 0.5}}
+  chain: [{axis: z}, {axis: y, initial_deg: 40}, {axis: y, initial_deg: 20}]
+controller: {type: joint_pd}
+"""
+
+
+def test_limits_and_ratings_of_motors_are_drawn(tmp_path: Path) -> None:
+    (tmp_path / "servos.yaml").write_text(SERVOS)
+    record = dynsim.simulate(load_scenario(tmp_path / "servos.yaml"))
+    bars = drawn(energy.torques(record)).axes[0]
+    widths = [patch.get_width() for patch in bars.patches]
+    loads = record.summary["motors"]
+    assert widths == [motor[key] for key in ("torque_max_N_m", "torque_rms_N_m") for motor in loads]
+    marks = [tuple(line.get_xdata()) for line in bars.get_lines()]
+    assert marks == [(pytest.approx(0.9),) * 2] * 3 + [(0.5, 0.5)] * 3
+    assert bars.get_xlim()[1] > 0.9
+    figure = drawn(energy.motors(record))
+    levels = [abs(line.get_ydata()[0]) for line in figure.axes[0].get_lines() if line.get_linestyle() != "-"]
+    assert {round(level, 9) for level in levels} == {0.9, 0.5}
+    assert "limit of the torque" in texts(figure)
+    record["torque"][:] *= 0.1
+    assert "limit of the torque" in drawn(energy.motors(record)).caption
+
+
 def test_what_lies_below_a_surface_is_marked(braced: Record) -> None:
     body, _ = posture.skeleton(braced)
     assert body is not None

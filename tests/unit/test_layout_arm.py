@@ -42,9 +42,10 @@ def faults(name: str, label: str, records: Record | Mapping[str, Record], size: 
 
 
 def all_faults(records: Mapping[str, Record], *, every: bool) -> Iterator[str]:
-    """Yield the faults of all figures at both sizes, or alternately at one size for variants after the first."""
-    for k, (variant, record) in enumerate(records.items()):
-        for size in SIZES if every or not k else SIZES[k % 2 :][:1]:
+    """Yield the faults of all figures at both sizes, or those of two variants at one size each."""
+    few = len(records) > 1 and not every
+    for k, (variant, record) in enumerate(list(records.items())[: 2 if few else None]):
+        for size in SIZES[k : k + 1] if few else SIZES:
             for name in arm.FIGURES:
                 yield from faults(name, variant, record, size)
     for size in SIZES if len(records) > 1 else ():

@@ -53,7 +53,8 @@ def test_settings_of_matplotlib_are_respected(record: Record) -> None:
         before = dict(matplotlib.rcParams)
         drawn(record, "motors")
         assert dict(matplotlib.rcParams) == before
-    assert tuple(figure.get_size_inches()) == (3.4, 2.9)
+    assert figure.get_figwidth() == 3.4
+    assert figure.get_figheight() >= 2.9
     components, distance = figure.axes
     assert components.yaxis.label.get_family() == ["serif"]
     assert components.yaxis.label.get_fontsize() == 7.0
@@ -133,6 +134,12 @@ def test_unusable_option_is_an_error_and_leaves_files(
     assert ended.value.code
     assert option[1] in capsys.readouterr().err
     assert [path.read_text() for path in (tmp_path / "out").iterdir()] == ["before"]
+
+
+def test_height_without_space_is_an_error(record: Record) -> None:
+    figure = drawn(record, "motors", size=(3.4, 1.2))
+    with raises(RecordError, "size", "3.4x1.2", f"{figure.needed:.2g} in"):
+        figure.draw_without_rendering()
 
 
 def test_look_without_options_is_the_default() -> None:

@@ -259,8 +259,8 @@ TORQUES = {
 }
 # A limit above this multiple of the largest value is in the notes, because its line would compress the curves.
 FAR = 3.0
-LIMIT: dict[str, Any] = {"linestyle": "--", "linewidth": 0.9}
-RATING: dict[str, Any] = {"linestyle": (0, (1, 1.5)), "linewidth": 1.1}
+LIMIT: dict[str, Any] = {"linestyle": "--", "linewidth": 0.9, "color": style.PULLING}
+RATING: dict[str, Any] = {"linestyle": (0, (1, 1.5)), "linewidth": 1.3, "color": style.BLACK}
 
 
 def motors(record: Record) -> Figure | None:
@@ -283,12 +283,14 @@ def motors(record: Record) -> Figure | None:
     figure = style.new_figure(
         1.2 + 1.55 * len(signals), style.title(record, "torques, currents and voltages of the motors")
     )
+    looks = style.variant_styles(list(shown))
     series = [[(record.time, record[name][:, columns[name]])] for name in signals]
     rows = style.time_rows(figure, series, record.settle_time, compress=True)
     for (name, (label, entries, keys)), panels in zip(signals.items(), rows, strict=True):
         for axes in panels:
             _draw(axes, record, name, columns[name], shown)
-        draw_limits(figure, panels[-1], [entries.get(record.labels["current"][k], {}) for k in shown], keys, label)
+        limits = {looks[k]["color"]: entries.get(record.labels["current"][k], {}) for k in shown}
+        draw_limits(figure, panels[-1], limits, keys, label)
         panels[0].set_ylabel(label.replace(" [", "\n["))
     style.legend_below(figure, [panels[-1] for panels in rows], 4)
     contacts.mark_all(figure, rows, record)
@@ -334,7 +336,7 @@ def torques(record: Record) -> Figure | None:
 
 def limit_mark(axes: Axes, level: int, value: float, label: str, **look: Any) -> None:
     """Draw a limit across a horizontal bar."""
-    axes.plot([value, value], [level - 0.45, level + 0.45], color=style.PULLING, label=label, **{**LIMIT, **look})
+    axes.plot([value, value], [level - 0.45, level + 0.45], label=label, **(look or LIMIT))
 
 
 def _most_loaded(record: Record) -> list[int]:
@@ -363,20 +365,40 @@ def _draw(axes: Axes, record: Record, name: str, columns: Sequence[int], shown: 
 
 
 def draw_limits(
-    figure: style.Drawing, axes: Axes, motors: Sequence[Mapping[str, Any]], keys: Sequence[str], label: str
+    figure: style.Drawing,
+    axes: Axes,
+    motors: Mapping[str, Mapping[str, Any]],
+    keys: Sequence[str],
+    label: str,
 ) -> None:
-    """Draw limits and ratings of motors if their lines are near the curves; otherwise add a note."""
+    """Draw limits and ratings of motors if their lines are near the curves; otherwise add a note.
+
+    Parameters
+    ----------
+    motors : mapping
+        For the colour of each motor, its limits by key. Limits that differ have the colours of their motors.
+    keys : sequence of str
+        Keys of limit and rating.
+    label : str
+        Quantity and unit, such as "torque [N m]".
+    """
     quantity, _, unit = label.rstrip("]").partition(" [")
     for key, text, look in zip(keys, ("limit", "rating"), (LIMIT, RATING), strict=False):
-        for value in sorted({float(motor[key]) for motor in motors if motor.get(key) is not None}):
+        known = {colour: float(motor[key]) for colour, motor in motors.items() if motor.get(key) is not None}
+        alike = len(set(known.values())) == 1
+        for colour, value in list(known.items())[: 1 if alike else None]:
             low, high = axes.get_ylim()
             name = f"{text} of the {quantity}: {style.number(value)} {unit}"
             if value > FAR * max(-low, high):
-                figure.note(f"Beyond the axes: {name}.")
+                if alike:
+                    figure.note(f"Beyond the axes: {name}.")
                 continue
+            if not alike:
+                name = f"{text} of the {quantity}, in the colour of its motor"
             sides = [side for side in (-value, value) if FAR * max(side * low, side * high) > value * value]
             for side in sides:
-                axes.axhline(side, color=style.PULLING, label=name if side is sides[-1] else None, **look)
+                own = {**look, "color": look["color"] if alike else colour}
+                axes.axhline(side, label=name if side is sides[-1] else None, **own)
             axes.set_ylim(min(low, 1.08 * min(sides)), max(high, 1.08 * max(sides)))
 
 

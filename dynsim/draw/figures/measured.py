@@ -127,7 +127,7 @@ def servos(record: Record) -> Figure | None:
         _mark_replay(axes, record, named=axes is grid[0, 0])
     if rows[0][0] == "torque_estimate":
         limits = _limits(record, "torque_N_m")
-        motors = [{"limit": limits.get(joint)} for joint in shown]
+        motors = {look["color"]: {"limit": limits.get(joint)} for joint, look in style.variant_styles(shown).items()}
         energy.draw_limits(figure, grid[0, 0], motors, ("limit",), "torque [N m]")
     style.legend_below(figure, [grid[0, 0]], 4)
     if timed:

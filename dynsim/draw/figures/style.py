@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import textwrap
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -204,10 +205,13 @@ class Drawing(Figure):
         look has a caption.
     grows : bool
         Whether lines of title, legend and notes make the figure higher; False if the user set its height.
+    needed : float
+        Height that the contents require [inch].
     """
 
     caption = ""
     grows = True
+    needed = 0.0
     _note: Text | None = None
     _below: Legend | None = None
     _rows = 1
@@ -247,11 +251,18 @@ class Drawing(Figure):
 
     def grow(self, points: float) -> None:
         """Make the figure higher [point], unless the user set its height."""
+        self.needed += points / 72.0
         if self.grows:
             self.set_figheight(self.get_figheight() + points / 72.0)
 
     def draw(self, renderer: Any) -> None:
-        """Draw the figure, with notes at its lower edge, the legend above them, and the axes in the space above."""
+        """Draw the figure, with notes at its lower edge, the legend above them, and the axes in the space above.
+
+        Raises
+        ------
+        RecordError
+            If the height that the user set leaves no space for the axes.
+        """
         engine, gap, used = self.get_layout_engine(), 4.0 * self.dpi / 72.0, 0.0
         for below in (self._note, self._below):
             if below is None:
@@ -272,9 +283,17 @@ class Drawing(Figure):
             locator.set_params(nbins=int(np.clip(0.85 * axis.get_tick_space(), 1, 9)))
         if engine is not None and any(axes.get_aspect() != "auto" for axes in self.axes):
             engine.execute(self)  # the space for labels of axes with a fixed aspect is only known afterwards
-        super().draw(renderer)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            super().draw(renderer)
         for _, locator in automatic:
             locator.set_params(nbins="auto")
+        for warning in caught:
+            if "collapsed" in str(warning.message) and not self.grows:
+                size = f"size {self.get_figwidth():.3g}x{self.get_figheight():.3g}"
+                least = f"set the width only, or a height of {self.needed:.2g} in"
+                raise RecordError(f"{size}: no space for the axes of this figure; {least}")
+            warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
 
 
 def _lines(text: str) -> int:
@@ -288,7 +307,7 @@ def new_figure(height: float, title: str, *, page: float = WIDTH) -> Drawing:
     ----------
     height : float
         Height [inch], unless the user wants another, with one line of title and of legend; further lines and notes are
-        added to it.
+        added to it. The height in ``rcParams`` is used if it is larger.
     title : str
         Title; a long one has several lines.
     page : float, optional
@@ -296,9 +315,10 @@ def new_figure(height: float, title: str, *, page: float = WIDTH) -> Drawing:
     """
     wanted = _drawn.get() or Look()
     wide = width() if wanted.width is not None or _has_own_size() else page
-    own = float(matplotlib.rcParams["figure.figsize"][1]) if _has_own_size() and wanted.width is None else None
-    figure = Drawing(figsize=(wide, wanted.height or own or height), layout="constrained")
-    figure.grows = not (wanted.height or own)
+    own = float(matplotlib.rcParams["figure.figsize"][1]) if _has_own_size() and wanted.width is None else 0.0
+    figure = Drawing(figsize=(wide, wanted.height or max(own, height)), layout="constrained")
+    figure.grows = wanted.height is None
+    figure.needed = height
     FigureCanvasAgg(figure)
     if wanted.title and title:
         size = _size("figure.titlesize")
