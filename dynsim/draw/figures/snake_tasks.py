@@ -1,4 +1,4 @@
-"""Figures of a snake at work: servo torques, grasps, and motion of objects."""
+"""Figures of a snake at work: torques, power, wheel loads, slip, grasps, and motion of objects."""
 
 from __future__ import annotations
 
