@@ -150,29 +150,30 @@ def picture(rows: Sequence[Row]) -> Figure:
     base = shipped_base()
     shipped = {"mass_kg": base["mass_kg"], "track_m": base["track_m"], "caster_m": base["caster_m"][0]}
     styles = variant_styles(variant_names(SCENARIO))
-    figure = new_figure(3.4, f"{SCENARIO}, dynsim {__version__}: which base stands, once settled")
+    figure = new_figure(3.4, f"{SCENARIO}: bases that stand once settled")
     panels = figure.subplots(1, 3)
     for axes, (x, y) in zip(panels, combinations(AXES, 2), strict=True):
         third = next(key for key in AXES if key not in (x, y))
         _panel(axes, [row for row in rows if row[third] == shipped[third]], x, y, styles)
         axes.plot(shipped[x], shipped[y], "k*", markersize=9, zorder=6)
-        axes.set(xlabel=AXES[x][0], ylabel=AXES[y][0], title=f"{third.rsplit('_', 1)[0]} as shipped")
+        name, unit = third.rsplit("_", 1)
+        axes.set(xlabel=AXES[x][0], ylabel=AXES[y][0], title=f"{name} as shipped, {shipped[third]:g} {unit}")
     falling = [name for name in styles if any(row["variant"] == name and row["stands"] is False for row in rows)]
     handles: list[Any] = [
-        Line2D(
-            [], [], color=styles[name]["color"], path_effects=[_TICKS], label=f"{name} falls on the side of the ticks"
-        )
-        for name in falling
+        Line2D([], [], color=styles[name]["color"], path_effects=[_TICKS], label=f"limit of {name}") for name in falling
     ]
-    standing = [name for name in styles if name not in falling]
-    if standing:
-        handles.append(Line2D([], [], linestyle="", label=f"{', '.join(standing)}: stand in every run"))
     handles += [
-        Patch(color=SHADE, label="bracing decides: stands with two elbows, falls with none"),
+        Patch(color=SHADE, label="bracing decides"),
         Line2D([], [], color="k", marker="*", linestyle="", markersize=8, label="as shipped"),
         Line2D([], [], color="k", marker=".", linestyle="", markersize=3, label="run"),
     ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=3)
+    figure.put_below({handle.get_label(): handle for handle in handles}, 5)
+    standing = [name for name in styles if name not in falling]
+    stand = f"; with {' and '.join(standing)} it stands in every run" if standing else ""
+    figure.note(
+        f"The base tips over on the side of the ticks{stand}. Bracing decides: it stands with two elbows, but not with "
+        f"none. dynsim {__version__}."
+    )
     return figure
 
 
