@@ -117,14 +117,14 @@ Drawn = Iterator[tuple[str, str, Callable[[Path], Any]]]
 
 def _of_records(section: tuple[str, str, str, Variants]) -> tuple[str, str, list[str], Drawn]:
     title, whose, scenario, variants = section
-    one = variants is not None and len(variants) == 1
-    command = f"run {scenario} --variant {variants[0]}" if variants and one else f"compare {scenario}"
+    single = variants is not None and len(variants) == 1
+    command = f"run {scenario} --variant {variants[0]}" if variants and single else f"compare {scenario}"
 
     def drawn() -> Drawn:
         records = {variant: gallery.run(scenario, variant) for variant in variants or variant_names(scenario)}
-        shown = next(iter(records.values())) if one else records
+        shown = next(iter(records.values())) if single else records
         module = _module(next(iter(records.values())))
-        makers: Mapping[str, Any] = module.figures(shown) if one else module.comparisons(shown)
+        makers: Mapping[str, Any] = module.figures(shown) if single else module.comparisons(shown)
         for name, make in makers.items():
             try:
                 figure = dynsim.figure(shown, name)

@@ -34,6 +34,12 @@ def sinks(record: Record) -> tuple[str, ...]:
     return SINKS + tuple(name for name in MORE_SINKS if name in record)
 
 
+def servo_limits(record: Record, name: str) -> dict[str, float]:
+    """Return a limit of the servo map by joint, such as "torque_N_m"; empty for records of older versions."""
+    limits: dict[str, dict[str, float]] = record.provenance.get("limits", {})
+    return {joint: values[name] for joint, values in limits.items() if name in values}
+
+
 def percent(share: float) -> str:
     """Format a fraction of a run with one decimal, or with enough decimals to distinguish it from 0 % and 100 %."""
     least = min(share, 1.0 - share)

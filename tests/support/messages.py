@@ -18,7 +18,6 @@ PHRASES = {
     # Warnings and errors.
     "all silent": "is the supply or the line lost?",
     "busy": "the operating system delayed this program",
-    "fails": "does not survive",
     "incomplete": "incomplete",
     "interrupted": "interrupted at t",
     "late answers": "earlier requests",

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from dynsim.cli import tables
+from dynsim.cli import output
 from dynsim.cli.commands import app
 from dynsim.compile.references import inverse_kinematics
 from dynsim.engine import REFERENCES, simulate
@@ -52,7 +52,7 @@ def test_short_references_are_silent(monkeypatch):
 @pytest.mark.parametrize("quiet", [False, True])
 def test_the_terminal_shows_it_unless_quiet(monkeypatch, tmp_path: Path, quiet):
     shown = io.StringIO()
-    monkeypatch.setattr(tables, "console", Console(file=shown, force_terminal=True, width=120))
+    monkeypatch.setattr(output, "console", Console(file=shown, force_terminal=True, width=120))
     arguments = ["run", "elbow_comparison", "--no-figures", "--set", "duration_s=0.2", "--out", str(tmp_path)]
     app([*arguments, *(["-q"] if quiet else [])], standalone_mode=False)
     assert ("s references" in shown.getvalue()) is not quiet
@@ -61,10 +61,10 @@ def test_the_terminal_shows_it_unless_quiet(monkeypatch, tmp_path: Path, quiet):
 
 def test_eighty_columns_hold_the_times(monkeypatch):
     shown = io.StringIO()
-    monkeypatch.setattr(tables, "console", Console(file=shown, width=80, force_terminal=True, color_system=None))
+    monkeypatch.setattr(output, "console", Console(file=shown, width=80, force_terminal=True, color_system=None))
     scenario = load_scenario("elbow_comparison", overrides={"duration_s": 9999})
     scenario = replace(scenario, variant="a_variant_with_quite_a_long_name")
-    with tables.progress([scenario], quiet=False) as report:
+    with output.progress([scenario], quiet=False) as report:
         report(scenario.variant, 9998.99, REFERENCES)
         report(scenario.variant, 9998.99)
     text = "9998.99 / 9999 s {} 0:00:00 to go -:--:--"

@@ -48,7 +48,7 @@ def scenario(chain: list[dict[str, Any]], joints: list[str], k_p: float = 100.0,
 
 
 def result(*args: Any, **more: Any) -> tuple[float, dict[str, DistanceCause], dynsim.Record]:
-    """Run a scene; return the record, the distance at the end [m] and the causes by name."""
+    """Run a scene and return the final distance [m], a dictionary of the causes and the record."""
     record = dynsim.simulate(scenario(*args, **more))
     causes = {entry["cause"]: DistanceCause(**entry) for entry in record.summary["hand_error_causes"]}
     return record.summary["hand_error_end_m"], causes, record
@@ -264,7 +264,7 @@ def test_opposite_deflections_are_not_attributed_to_the_weight() -> None:
 
 
 def test_limits_are_not_the_cause_while_contacts_carry_the_arm() -> None:
-    """An arm with these parts is no closer to its target without the limit of its motor (0.069 instead of 0.067 m)."""
+    """Without the limit of its motor, an arm with these parts is 0.069 m from its target instead of 0.067 m."""
     assert named_causes({"sag": {"a": 1.2}, "contact": {"a": -0.8}, "limit": {"a": 0.6}}) == []
     assert named_causes({"sag": {"a": -0.7}, "contact": {"a": 0.6}, "friction": {"a": 1.1}}) == []
 

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from dynsim.draw.figures import energy, posture, style
 from dynsim.draw.figures.style import Array
 from dynsim.record import TIME, Record
+from dynsim.record.measures import servo_limits
 
 # Maximum number of joints on a page; the joints with the largest errors are drawn.
 JOINTS = 24
@@ -76,7 +77,7 @@ def following_error(record: Record) -> Figure | None:
     rms = [_finite(lambda e: np.sqrt(np.nanmean(e**2)), error) for error in errors]
     largest.barh(level, rms, color=style.BLUE, height=0.4, label="rms")
     for k, (label, *_) in enumerate(shown):
-        if (limit := _limits(record, "following_error_rad").get(label)) is not None:
+        if (limit := servo_limits(record, "following_error_rad").get(label)) is not None:
             energy.limit_mark(largest, k, MILLI * limit, "limit of the error")
     largest.set_yticks(level, [label for label, *_ in shown])
     largest.set(ylim=(len(shown) - 0.4, -0.6), xlabel=f"magnitude during the replay{one_unit}")
@@ -84,12 +85,6 @@ def following_error(record: Record) -> Figure | None:
     largest.grid(axis="y", visible=False)
     style.legend_below(figure, [over_time, largest], 4)
     return figure
-
-
-def _limits(record: Record, name: str) -> dict[str, float]:
-    """Return a limit of the servo map by joint, such as "torque_N_m"; empty for records of older versions."""
-    limits: dict[str, dict[str, float]] = record.provenance.get("limits", {})
-    return {joint: values[name] for joint, values in limits.items() if name in values}
 
 
 def servos(record: Record) -> Figure | None:
@@ -126,7 +121,7 @@ def servos(record: Record) -> Figure | None:
         style.at_least(axes, 0.5)
         _mark_replay(axes, record, named=axes is grid[0, 0])
     if rows[0][0] == "torque_estimate":
-        limits = _limits(record, "torque_N_m")
+        limits = servo_limits(record, "torque_N_m")
         motors = {look["color"]: {"limit": limits.get(joint)} for joint, look in style.variant_styles(shown).items()}
         energy.draw_limits(figure, grid[0, 0], motors, ("limit",), "torque [N m]")
     style.legend_below(figure, [grid[0, 0]], 4)
