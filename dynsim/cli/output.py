@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 # Maximum width of the title of a progress bar [characters].
 _TITLE_WIDTH = 22
+# Maximum number of progress bars that a terminal keeps.
+_KEPT = 6
 # Expected compilation time of the kernels if they have never been compiled before [s].
 _COMPILED_S = 90.0
 
@@ -56,8 +58,8 @@ def drawing(folder: Path, quiet: bool) -> Iterator[None]:
         yield
 
 
-def _bars(*columns: str | ProgressColumn, quiet: bool) -> Progress:
-    """Create progress bars with these columns and the elapsed and remaining time; a terminal keeps them at the end."""
+def _bars(*columns: str | ProgressColumn, quiet: bool, kept: bool = True) -> Progress:
+    """Create progress bars with these columns and elapsed and remaining time; a terminal keeps them if ``kept``."""
     from rich import progress
     from rich.table import Column
 
@@ -67,7 +69,7 @@ def _bars(*columns: str | ProgressColumn, quiet: bool) -> Progress:
         "to go",
         progress.TimeRemainingColumn(table_column=Column(no_wrap=True)),
         console=Console(quiet=True) if quiet else console,
-        transient=not console.is_terminal,
+        transient=not (kept and console.is_terminal),
         disable=quiet,
     )
 
@@ -117,7 +119,12 @@ def progress(scenarios: Sequence[Scenario], quiet: bool) -> Iterator[VariantProg
             kernels.append(bars.add_task("kernels", total=now.expected or _COMPILED_S, what="compiled"))
         bars.update(kernels[0], completed=now.elapsed, visible=True)
 
-    with _bars("{task.description}", BarColumn(), done, quiet=quiet) as bars, _compilation_shown(quiet, compiling):
+    # More bars would move the start of a table off the screen.
+    kept = len(scenarios) <= _KEPT
+    with (
+        _bars("{task.description}", BarColumn(), done, quiet=quiet, kept=kept) as bars,
+        _compilation_shown(quiet, compiling),
+    ):
 
         def add(scenario: Scenario, kind: str, visible: bool) -> TaskID:
             title = scenario.variant or scenario.name
