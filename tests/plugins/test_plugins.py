@@ -37,7 +37,7 @@ MOUND = f"""duration_s: 0.2
   type: joint_pd
   hand:
     joints: [joint_1, joint_4, joint_5]
-    path: {{type: helix, center_m: [1.31, 0, 0.18249], radius_m: 0.05, pitch_m: 0.01}}
+    path: {{type: helix, frame: start, center_m: [-0.05, 0, 0], radius_m: 0.05, pitch_m: 0.01}}
 surfaces:
   mound: {{type: ellipsoid, center_m: [0.69282032303, 0, -0.2], half_axes_m: [0.8, 0.5, 0.2], yaw_deg: 20}}
 contacts:
@@ -100,8 +100,8 @@ def test_a_scenario_of_parts_from_outside_runs(installed: Path, name: str, text:
         assert np.abs(record["contact_gap"]).max() < 1e-9
         path = resolved["controller"]["hand"]["path"]
         assert (path["type"], path["period_s"]) == ("helix", 10.0)
-        expected = [1.31 + 0.05 * np.cos(0.04 * np.pi), 0.05 * np.sin(0.04 * np.pi), 0.18249 + 0.01 * 0.02]
-        assert np.allclose(record["target_position"][-1], expected, rtol=0.0, atol=1e-12)
+        moved = [0.05 * np.cos(0.04 * np.pi) - 0.05, 0.05 * np.sin(0.04 * np.pi), 0.01 * 0.02]
+        assert np.allclose(record["target_position"][-1] - record["hand_position"][0], moved, rtol=0.0, atol=1e-12)
     # A resolved scenario gives the same simulation.
     again = dynsim(installed, "check", "out/scenario.yaml")
     assert (again.returncode, again.stderr) == (0, "")

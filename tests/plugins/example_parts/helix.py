@@ -7,12 +7,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from dynsim.compile.control import HandPath
+from dynsim.compile.control import HandPath, HandPathConfig
 from dynsim.compile.protocols import BuildContext
-from dynsim.config.base import Positive, StrictConfig, Vector3
+from dynsim.config.base import Positive, Vector3
 
 
-class Config(StrictConfig):
+class Config(HandPathConfig):
     """Counter-clockwise about the vertical through ``center_m``, rising ``pitch_m`` in a turn."""
 
     type: Literal["helix"]
