@@ -95,7 +95,7 @@ class Blocks:
         start = self._append(np.ascontiguousarray(planes).tobytes())
         header = {"at": start, "rows": len(data), "columns": int(codes.shape[1]), "bits": bits}
         # Twelve digits are more than the quantisation keeps.
-        return header | {name: [float(f"{x:.12g}") for x in v] for name, v in (("offset", low), ("scale", scale))}
+        return header | {"offset": low.tolist(), "scale": [float(f"{x:.12g}") for x in scale]}
 
     def raw(self, data: NDArray[Any]) -> dict[str, Any]:
         """Add an array of integers ≥ 0 unchanged (for meshes), little-endian, in 16 bits, or in 32 if necessary."""

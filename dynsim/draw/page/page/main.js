@@ -103,6 +103,7 @@ class App {
     const shown = this.actors.filter((a) => a.object.visible), first = shown[0];
     const { along, across, apart, beside, count } = this.ghost ? { along: "y", across: "x", apart: 0, beside: 0, count: shown.length }
       : this.spacing(shown, low, high);
+    this.stage.rows = shown.length > count;
     shown.forEach((actor, k) => {
       actor.object.position.set(0, 0, 0)[along] = (k % count) * apart;
       actor.object.position[across] = Math.floor(k / count) * beside;
@@ -119,7 +120,6 @@ class App {
     high[along] += apart * Math.max(Math.min(shown.length, count) - 1, 0);
     high[across] += beside * (Math.ceil(shown.length / count) - 1);
     this.stage.row = along === "x" && shown.length > 1;
-    this.stage.rows = shown.length > count;
     this.stage.settle(low, high, this.floor);
     this.stage.dress(D.palette[this.theme]);
   }
@@ -158,8 +158,9 @@ class App {
   // Whether a surface coincides with the same surface of the first variant: walls continue, and overlays share all surfaces.
   shared(one, first, offset) {
     const { surface, normal } = one.userData, same = JSON.stringify(surface);
-    if (!first.surfaces.some((other) => JSON.stringify(other.userData.surface) === same)) return false;
-    return this.ghost || (!this.stage.rows && surface.kind === "plane" && Math.abs(normal.dot(offset)) < 1e-6 * offset.length());
+    const has = (actor) => actor.surfaces.some((other) => JSON.stringify(other.userData.surface) === same);
+    if (!has(first)) return false;
+    return this.ghost || (!this.stage.rows && this.actors.every((a) => !a.object.visible || has(a)) && surface.kind === "plane" && Math.abs(normal.dot(offset)) < 1e-6 * offset.length());
   }
 
   dress() {
