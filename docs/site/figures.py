@@ -60,7 +60,7 @@ SECTIONS: tuple[tuple[str, str, str, Variants], ...] = (
     ("Joint limits, as in [T]", "All variants.", "snake_joint_limits", None),
     ("Door, as in [T]", "Variant `pull_switching`.", "snake_door_arc", ("pull", "pull_switching")),
 )
-SWEEP = "sweep elbow_comparison_floor --variants two_elbows,elbow_7 --set duration_s=2 --set metrics.settle_s=0.5"
+SWEEP = "sweep elbow_comparison_floor --variants elbow_7,elbow_4 --set duration_s=2 --set metrics.settle_s=0.5"
 # Sections with figures of commands, in the folder "figures": title, records that have the figures, and commands.
 COMMANDS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     (
