@@ -291,7 +291,7 @@ def motors(record: Record) -> Figure | None:
             _draw(axes, record, name, columns[name], shown)
         limits = {looks[k]["color"]: entries.get(record.labels["current"][k], {}) for k in shown}
         draw_limits(figure, panels[-1], limits, keys, label)
-        panels[0].set_ylabel(label.replace(" [", "\n["))
+        panels[0].set_ylabel(label.replace(" or ", "\nor ") if " or " in label else label.replace(" [", "\n["))
     style.legend_below(figure, [panels[-1] for panels in rows], 4)
     contacts.mark_all(figure, rows, record)
     if len(shown) < record["current"].shape[1]:

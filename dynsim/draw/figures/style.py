@@ -281,10 +281,10 @@ class Drawing(Figure):
         automatic = [(axis, locator) for axis, locator in vertical if isinstance(locator, AutoLocator)]
         for axis, locator in automatic:
             locator.set_params(nbins=int(np.clip(0.85 * axis.get_tick_space(), 1, 9)))
-        if engine is not None and any(axes.get_aspect() != "auto" for axes in self.axes):
-            engine.execute(self)  # the space for labels of axes with a fixed aspect is only known afterwards
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
+            if engine is not None and any(axes.get_aspect() != "auto" for axes in self.axes):
+                engine.execute(self)  # the space for labels of axes with a fixed aspect is only known afterwards
             super().draw(renderer)
         for _, locator in automatic:
             locator.set_params(nbins="auto")
