@@ -183,8 +183,8 @@ def _forces(records: Mapping[str, Record], title: str) -> Figure | None:
     _note_sampling(figure, rows, runs)
     if many:
         style.legend_below(figure, [panels[-1] for panels in rows], 5)
-    bands = [bar for panels in rows for bar in panels[-1].collections if str(bar.get_label())[1:] in BANDS]
-    figure.put_below({str(bar.get_label())[1:]: bar for bar in bands}, 4)
+    bands = {str(bar.get_label())[1:]: bar for panels in rows for bar in panels[-1].collections}
+    figure.put_below({text: bands[text] for text in BANDS if text in bands}, 4)
     explain(figure, [event for record in runs for event in marked(record, chosen)])
     return figure
 

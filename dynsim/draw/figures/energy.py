@@ -561,8 +561,9 @@ def _planes(low: Array, high: Array) -> tuple[Sequence[tuple[int, int]], str]:
     if len(flat) != 1:
         return PLANES, ""
     (k,) = flat
-    constant = f"{style.number(0.5 * (low[k] + high[k]), 3)} m, within {style.number(0.5 * MILLI * size[k], 2)} mm"
-    return [plane for plane in PLANES if k not in plane], f"Coordinate {'xyz'[k]}: {constant}."
+    constant = f"{style.number(0.5 * (low[k] + high[k]), 3)} m"
+    within = f", within {style.number(0.5 * MILLI * size[k], 2)} mm" if size[k] > HELD else ""
+    return [plane for plane in PLANES if k not in plane], f"Coordinate {'xyz'[k]}: {constant}{within}."
 
 
 def _frame(panels: Sequence[Axes], planes: Sequence[tuple[int, int]], low: Array, high: Array) -> None:

@@ -81,9 +81,11 @@ class Skeleton:
         return np.array(lines).reshape(-1, 2, 3)
 
     def solids(self, row: int) -> list[tuple[Array, Faces]]:
-        """Return corners, (n, 3) [m], and faces of the shapes of a mobile base, its wheels, and objects at a sample."""
-        bodies = (*self.scene.base, *self.objects)
-        return [solid for body in bodies for solid in corners_of(self.record, self.scene, body, row)]
+        """Return corners, (n, 3) [m], and faces of the shapes of a base, its wheels, and objects at a sample."""
+        drawn = {*self.scene.base, *self.objects}
+        # The root of a floating robot, to which no line leads.
+        drawn |= {k for k, body in enumerate(self.scene.bodies) if body.joint.part_of and body.shapes}
+        return [solid for body in sorted(drawn) for solid in corners_of(self.record, self.scene, body, row)]
 
     def bases(self) -> list[list[Array]]:
         """Return the corners of the solids of a mobile base and objects for each posture."""
@@ -583,9 +585,10 @@ def _space_view(axes: Any, body: Skeleton, bounds: tuple[Array, Array], wide: bo
         axes.plot(*position[:, None], linestyle="none", zorder=7, **_contact_mark(force))
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
     # The square of the axes is smaller than the space available for a long arm. Fill the space without clipping.
-    # A high scene must not extend into the view below it.
-    flat = float((high[2] - low[2]) / np.hypot(*(high - low)[:2]))
-    axes.set_box_aspect(tuple(high - low), zoom=float(np.clip(1.9 - 1.1 * flat, 1.2, 1.65)) if wide else 1.15)
+    # Seen along this direction (elevation 22°, azimuth −70°), a high scene must not extend into the view below.
+    sides = high - low
+    tall = float(0.93 * sides[2] + 0.37 * (0.34 * sides[0] + 0.94 * sides[1])) / float(np.hypot(*sides[:2]))
+    axes.set_box_aspect(tuple(sides), zoom=float(np.clip(2.6 - 2.0 * tall, 1.05, 1.65)) if wide else 1.15)
     for artist in axes.get_children():
         artist.set_clip_on(False)
         artist.set_in_layout(False)
