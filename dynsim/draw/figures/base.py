@@ -29,8 +29,8 @@ TRACTION_TOP, MARGIN_LOW = 2.5, -2.0
 # Colours and line widths for the left wheel, right wheel and caster; the line of the left wheel is wider, so that it
 # remains visible at equal loads.
 LOOKS = ((style.BLUE, 2.0), (style.GREEN, 1.0), (style.ORANGE, 1.2))
-# Tracking: minimum range of the position and heading axes [m, °], so that rounding errors are not magnified.
-MIN_POSITION_RANGE, MIN_HEADING_RANGE = 1e-3, 0.1
+# Tracking: minimum ranges of the axes, so that rounding errors are not magnified.
+MIN_RANGES = {"position [m]": 1e-3, "heading [°]": 0.1, "error [mm]": 5e-3, "heading error [°]": 5e-3}
 MILLI = 1e3
 # Values over time, and how they are drawn.
 Curve = tuple[Array, dict[str, Any]]
@@ -109,7 +109,8 @@ def tracking(record: Record) -> Figure | None:
     error = base_error(record)
     heading = np.degrees(np.stack([target[:, 2], pose[:, 2]], axis=1))
     is_stationary = (
-        _spread(np.hstack([target[:, :2], pose[:, :2]])) < MIN_POSITION_RANGE and _spread(heading) < MIN_HEADING_RANGE
+        _spread(np.hstack([target[:, :2], pose[:, :2]])) < MIN_RANGES["position [m]"]
+        and _spread(heading) < MIN_RANGES["heading [°]"]
     )
     # Round to a nanometre, because smaller differences of a stationary base are rounding errors.
     away, turned = np.round(MILLI * error[:, :2], 6), np.round(180.0 / np.pi * error[:, 2], 6)
@@ -131,7 +132,7 @@ def tracking(record: Record) -> Figure | None:
     rows = style.time_rows(figure, series, record.settle_time)
     for (name, drawn), panels in zip(curves.items(), rows, strict=True):
         values = np.stack([values for values, _ in drawn], axis=1)
-        least = {"position [m]": MIN_POSITION_RANGE, "heading [°]": MIN_HEADING_RANGE}.get(name, 0.0)
+        least = MIN_RANGES[name]
         for axes in panels:
             if _spread(values) < least:
                 middle = float(np.nanmean(values))
