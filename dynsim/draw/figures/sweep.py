@@ -255,6 +255,8 @@ def heat_map(sweep: Sweep) -> Figure | None:
             bar.ax.xaxis.set_major_locator(LogLocator(numticks=ticks))
         else:
             style.log_axis(bar.ax, "x")
+            if ticks < 4:
+                bar.ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
         if not written and min(tables.shape[1:]) > 1 and high > low:
             levels = [tick for tick in bar.ax.get_xticks() if low < tick < high]
             for axes, table in zip(row, tables, strict=False):
