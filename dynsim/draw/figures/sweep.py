@@ -119,7 +119,7 @@ class Sweep:
     def deviation(self, key: str) -> str:
         """Return the name of a sampled column with its standard deviation, e.g. "mass of link 2 ± 0.005 kg"."""
         varied = self.varied(key)
-        size = style.number(varied.scale * float(np.std(_values(self.rows, key), ddof=1)), 2)
+        size = f"{varied.scale * float(np.std(_values(self.rows, key), ddof=1)):#.2g}".rstrip(".")
         return f"{varied.name} ± {size}{f' {varied.unit}' if varied.unit else ''}"
 
     def _has(self, key: str) -> bool:
@@ -504,7 +504,7 @@ def _distribution(axes: Axes, values: Array, colour: str) -> str:
     bins = min(_BINS, len(np.histogram_bin_edges(values, "auto")) - 1)
     axes.hist(values, bins=bins, color=colour, alpha=0.7)
     axes.yaxis.set_major_locator(MaxNLocator(4, integer=True))
-    axes.xaxis.set_major_locator(MaxNLocator(4, steps=_STEPS))
+    axes.xaxis.set_major_locator(MaxNLocator(4 if style.narrow() else 7, steps=_STEPS))
     statistics = spread(values)
     axes.axvline(statistics.mean, color=style.BLACK, linewidth=1.0)
     for limit in (statistics.low, statistics.high):
