@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from dynsim.compile.clearance import SLACK, axis_ends, axis_gaps
-from dynsim.compile.control import HandPath
+from dynsim.compile.control import HandPath, MovedPath
 from dynsim.compile.hand_posture import hand_posture, hand_turns
 from dynsim.compile.model import Model
 from dynsim.compile.posture import HAND, Rest, holding_torques, load_forces, load_torques, on_surfaces, static_margin
@@ -635,7 +635,8 @@ class ArmPosture(StartPosture):
         return self._built(hand.path)
 
     def _built(self, path: Any) -> HandPath:
-        return families.build("path", path, BuildContext(self.scenario.duration_s), HandPath)
+        built = families.build("path", path, BuildContext(self.scenario.duration_s), HandPath)
+        return MovedPath(built, np.array(path.origin_m))
 
     def keys(self) -> dict[str, Any]:
         """Return the scenario keys of the posture: plant, path start, ``initial`` and contact points."""
@@ -671,10 +672,13 @@ class ArmPosture(StartPosture):
         if hand is None or getattr(hand.path, "frame", "world") == "start":
             return keys
         starting_at = getattr(families.member("path", hand.path.type), "starting_at", None)
-        keys["hand"] = {}
-        if starting_at is not None and np.linalg.norm(self._off_path()) > hand.tolerance_m:
-            at = self.model.point_position(*self.robot.hand, self.q)
-            keys["hand"]["path"] = rounded(starting_at(hand.path, at.tolist()))
+        keys["hand"], off, origin = {}, self._off_path(), np.array(hand.path.origin_m)
+        if np.linalg.norm(off) > hand.tolerance_m:
+            if starting_at is None:
+                keys["hand"]["path"] = rounded({"origin_m": (origin - off).tolist()})
+            else:
+                at = self.model.point_position(*self.robot.hand, self.q) - origin
+                keys["hand"]["path"] = rounded(starting_at(hand.path, at.tolist()))
         if hand.orientation is not None:
             rpy = np.rad2deg(roll_pitch_yaw(self._hand_axes())).tolist()
             if hand_turns(self.model, self.q[None], hand.orientation.matrix())[0] > SAME:

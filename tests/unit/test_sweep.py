@@ -533,7 +533,7 @@ def test_distributions_are_those_of_one_place():
     sweep = noisy(places=3, draws=20)
     figure = pictures.samples(sweep)
     assert figure is not None
-    energies = figure.axes[::2]
+    energies = [axes for axes in figure.axes if "energy" in axes.get_xlabel()]
     assert [axes.get_title().split("\n")[0] for axes in energies] == ["plant.a = 0", "plant.a = 1", "plant.a = 2"]
     for index, axes in enumerate(energies):
         here = spread(np.array([row["electrical_energy_J"] for row in sweep.rows if row["plant.a"] == index]))
@@ -545,8 +545,8 @@ def test_distributions_are_those_of_one_place():
 def test_of_many_places_some_are_shown_with_a_note():
     figure = pictures.samples(noisy(places=50, draws=3))
     assert figure is not None
-    heads = [axes.get_title().split("\n")[0] for axes in figure.axes[::2]]
-    assert heads == [f"plant.a = {k}" for k in (0, 12, 24, 37, 49)]
+    heads = [axes.get_title().split("\n")[0] for axes in figure.axes if axes.get_title()]
+    assert sorted(heads, key=heads.index) == [f"plant.a = {k}" for k in (0, 12, 24, 37, 49) for _ in range(2)]
     assert mentions(figure.caption, "5", "50", "statistics.json")
 
 

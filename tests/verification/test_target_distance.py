@@ -76,7 +76,7 @@ def test_sag_equals_weight_over_stiffness() -> None:
     assert len(causes) == 1
     output = io.StringIO()
     print_summary(Terminal(file=output, emoji=False), record.summary)
-    assert re.search(rf"at the end \[mm\] +{1e3 * distance:.4g}\s+main cause at the end +sag", output.getvalue())
+    assert re.search(rf"at the end \[mm\] +{1e3 * distance:.4g}\s+hand error, main cause +sag", output.getvalue())
     weightless, none, _ = result(LEVEL, ["joint_1"], gravity=0.0)
     assert weightless < 1e-6
     assert not none
