@@ -88,7 +88,7 @@ def test_labels_of_comparisons_of_arms_are_apart(size: float) -> None:
 
 
 @pytest.mark.parametrize(
-    "every", [pytest.param(False, marks=pytest.mark.long), pytest.param(True, marks=pytest.mark.slow)]
+    "every", [pytest.param(False, marks=pytest.mark.slow), pytest.param(True, marks=pytest.mark.slow)]
 )
 @pytest.mark.parametrize("name", arms())
 def test_labels_of_shipped_arm_figures_are_apart(name: str, every: bool) -> None:

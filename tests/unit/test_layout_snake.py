@@ -65,7 +65,7 @@ def test_figures_of_one_run_have_no_layout_faults(name: str, variant: str, size:
     assert faults([(maker, variant, record) for maker in snake.figures(record)], [size]) == []
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_figures_of_shipped_scenarios_have_no_layout_faults(name: str) -> None:
     """Comparisons of all variants on a page and in a column, and figures of the first variant in a column."""

@@ -126,7 +126,7 @@ def test_plan_of_a_mobile_arm_has_no_faults(size: str) -> None:
     assert faults(plan_figures.FIGURES, picture, size) == (["plan_posture", "plan_heat", "plan_single_braces"], [])
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("scenario", [path.stem for path in shipped_scenarios()])
 def test_sweeps_of_shipped_scenarios_have_no_faults(scenario: str, tmp_path: Path) -> None:
     """All variants, at two durations; the figures do not depend on the meaning of the numbers."""
@@ -140,7 +140,7 @@ def test_sweeps_of_shipped_scenarios_have_no_faults(scenario: str, tmp_path: Pat
             assert faults(sweep_figures.FIGURES, drawn, size)[1] == []
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("scenario", "most", "candidates"),
     [("pressing", 2, ("link_6:link_9",)), ("brace_on_shapes", 1, ()), ("mobile_elbow_comparison", 1, ("link_8",))],
