@@ -14,7 +14,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -92,11 +92,15 @@ class Linearization:
     error: float = 0.0
     basis: Array | None = None
 
+    @cached_property
+    def _projection(self) -> Array:
+        """Pseudo-inverse of the basis, (z, x); a controller needs it at each of its ticks."""
+        assert self.basis is not None
+        return np.asarray(np.linalg.pinv(self.basis))
+
     def reduced_state(self, x: Array) -> Array:
         """Return the state z of a reduced system, (z,), for a state x, (x,), with the least distance from it."""
-        assert self.basis is not None
-        z: Array = np.linalg.pinv(self.basis) @ (np.asarray(x) - self.x)
-        return z
+        return np.asarray(self._projection @ (np.asarray(x) - self.x))
 
     def __iter__(self) -> Iterator[Array]:
         return iter((self.A, self.B, self.C, self.D))
