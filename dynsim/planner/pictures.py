@@ -11,7 +11,7 @@ from dynsim.draw.figures.plan import CornerRun, PlanPicture, Pose, draw_plan_fig
 from dynsim.draw.geometry.meshes import Meshes
 from dynsim.draw.geometry.projection import UP, Array, Projection
 from dynsim.draw.geometry.robot import placed
-from dynsim.draw.geometry.shapes import corners_of, drawn_shape, solid
+from dynsim.draw.geometry.shapes import corners_of, drawn_shapes, solid
 from dynsim.errors import ModelError, SimulationStopped
 from dynsim.planner.answer import BracePlan, Size
 from dynsim.planner.arm import axis_lines
@@ -106,8 +106,7 @@ def _base(record: Record | None, view: Projection) -> list[Array]:
         return []
     meshes = Meshes()
     meshes.of_robot(scene)
-    fixed = [shape for part in scene.fixed if (shape := drawn_shape(part, meshes)) is not None]
-    solids = [solid(shape, meshes.unique) for shape in fixed]
+    solids = [solid(shape, meshes.unique) for shape in drawn_shapes(scene.fixed, meshes)]
     solids += [part for body in scene.base for part in corners_of(record, scene, body, 0)]
     return [view.project(corners) for corners, _ in solids]
 

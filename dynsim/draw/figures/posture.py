@@ -26,7 +26,7 @@ from dynsim.draw.geometry.shapes import (
     Faces,
     box_about,
     corners_of,
-    drawn_shape,
+    drawn_shapes,
     grid_faces,
     outline,
     round_patch,
@@ -102,8 +102,7 @@ class Skeleton:
 
     def fixed(self) -> list[tuple[Array, Faces]]:
         """Return corners, (n, 3) [m], and faces of the shapes that are fixed in the world, without meshes."""
-        shapes = (drawn_shape(shape, Meshes()) for shape in self.scene.fixed)
-        return [solid(shape, []) for shape in shapes if shape is not None]
+        return [solid(shape, []) for shape in drawn_shapes(self.scene.fixed, Meshes())]
 
     def mounts(self) -> Array:
         """Return lines from the fixed frame of the robot to each joint on it, (m, 2, 3) [m]."""

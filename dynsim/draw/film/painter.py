@@ -36,7 +36,7 @@ from dynsim.draw.geometry.robot import (
 from dynsim.draw.geometry.shapes import (
     body_shapes,
     cop_of,
-    drawn_shape,
+    drawn_shapes,
     floor_level,
     gripper,
     outline,
@@ -275,7 +275,7 @@ class Painter:
         meshes = Meshes()
         meshes.of_robot(record.scene)
         shapes = body_shapes(robot.scene, robot.reach, meshes)
-        fixed = [shown for shape in robot.scene.fixed if (shown := drawn_shape(shape, meshes)) is not None]
+        fixed = drawn_shapes(robot.scene.fixed, meshes)
         self._meshes = simplified(meshes.unique, TRIANGLES)
         self._wheels = wheel_groups(record, robot.scene)
         # Find the body that carries the gripper.

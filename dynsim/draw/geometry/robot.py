@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.draw.geometry.meshes import Meshes
-from dynsim.draw.geometry.shapes import body_shapes, drawn_shape, floor_level, gripper, solid, surface_solid
+from dynsim.draw.geometry.shapes import body_shapes, drawn_shapes, floor_level, gripper, solid, surface_solid
 from dynsim.errors import RecordError
 from dynsim.record import Record
 from dynsim.record.measures import hand_target
@@ -73,7 +73,7 @@ class DrawnRobot:
             position = (np.array(hand.position) + np.array([both["ahead"], 0.0, 0.0])).tolist()
             size = [length, width + 2.0 * both["aside"][0], height]
             shapes[hand.body].append({"kind": "box", "size": size, "p": position, "q": list(HERE)})
-        shapes.append([shown for shape in self.scene.fixed if (shown := drawn_shape(shape, meshes)) is not None])
+        shapes.append(drawn_shapes(self.scene.fixed, meshes))
         clouds = [np.concatenate([np.zeros((0, 3)), *(solid(s, meshes.unique)[0] for s in own)]) for own in shapes]
         return [cloud[np.unique((cloud @ DIRECTIONS.T).argmax(axis=0))] if len(cloud) else cloud for cloud in clouds]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -182,6 +182,11 @@ def drawn_shape(shape: Shape, meshes: Meshes) -> dict[str, Any] | None:
     return drawn
 
 
+def drawn_shapes(shapes: Iterable[Shape], meshes: Meshes) -> list[dict[str, Any]]:
+    """Return shapes in the data format of the page, without those whose mesh was not found."""
+    return [drawn for shape in shapes if (drawn := drawn_shape(shape, meshes)) is not None]
+
+
 def body_shapes(scene: Scene, reach: float, meshes: Meshes) -> list[list[dict[str, Any]]]:
     """Return the shapes of every body; a body without shapes gets rods to its children, and joints get hubs."""
     tubes = [b.shapes[0].size[0] for k, b in enumerate(scene.bodies) if _is_tube(b) and not _of_object(scene, k)]
@@ -189,7 +194,7 @@ def body_shapes(scene: Scene, reach: float, meshes: Meshes) -> list[list[dict[st
     base = set(scene.base)
     drawn = []
     for k, body in enumerate(scene.bodies):
-        shapes = [shown for shape in body.shapes if (shown := drawn_shape(shape, meshes)) is not None]
+        shapes = drawn_shapes(body.shapes, meshes)
         wanted = [child for child in scene.bodies if child.parent == k]
         # A rod extends from its joint, whereas a wheel surrounds its joint.
         bare = not shapes or (_is_tube(body) and np.abs(body.shapes[0].position).max() > 1e-9)
@@ -459,8 +464,8 @@ def corners_of(record: Record, scene: Scene, body: int, row: int) -> list[tuple[
     pose = record[POSITION][row, body].astype(np.float64), record[ORIENTATION][row, body].astype(np.float64)
     if not np.isfinite(pose[0]).all():
         return []
-    shapes = (drawn_shape(shape.placed(*pose), Meshes()) for shape in scene.bodies[body].shapes)
-    return [solid(shape, []) for shape in shapes if shape is not None]
+    shapes = (shape.placed(*pose) for shape in scene.bodies[body].shapes)
+    return [solid(shape, []) for shape in drawn_shapes(shapes, Meshes())]
 
 
 def outline(points: Array) -> Array:

@@ -41,7 +41,7 @@ from dynsim.draw.geometry.robot import (
 from dynsim.draw.geometry.shapes import (
     body_shapes,
     cop_of,
-    drawn_shape,
+    drawn_shapes,
     drawn_surface,
     gripper,
     supports,
@@ -274,7 +274,7 @@ def _record(name: str, robot: DrawnRobot, blocks: Blocks, meshes: Meshes, low: A
         "radius": thinnest(shapes),
         "reach": robot.reach,
         "bodies": bodies,
-        "fixed": [shape_drawn for shape in scene.fixed if (shape_drawn := drawn_shape(shape, meshes)) is not None],
+        "fixed": drawn_shapes(scene.fixed, meshes),
         "stands": _stands(scene),
         "surfaces": [drawn_surface(surface, *_near(surface, robot, sunk, low, high)) for surface in scene.surfaces],
         "frames": blocks.add(record.time[rows], 1e-9),
