@@ -35,7 +35,7 @@ from dynsim.draw.geometry.shapes import (
 )
 from dynsim.record import Record
 from dynsim.record.measures import hand_target
-from dynsim.record.poses import POSITION, TOUCHING, contact_positions, point_positions
+from dynsim.record.poses import POSITION, contact_positions, point_positions
 from dynsim.record.scene import WORLD, Point, Scene, SceneSurface
 
 # Number of postures, evenly spaced in time, that are drawn faintly in addition to the last one.
@@ -118,16 +118,11 @@ class Skeleton:
 
     def pads(self, row: int) -> list[tuple[Array, float]]:
         """Return the centre [m] and radius [m] of each sphere with which the robot touches surfaces."""
-        spheres = []
-        for point in self.scene.contacts if TOUCHING in self.record else ():
-            rows = np.array([*self.rows_shown()[:1], row])
-            away = np.linalg.norm(
-                point_positions(self.record, point, rows) - contact_positions(self.record, point, rows), axis=-1
-            )
-            # On a capsule, whose link has a shape, the point that touches moves.
-            if point.body not in self.objects and away[-1] > NOTHING and np.ptp(away) < 1e-4 * away[-1] + NOTHING:
-                spheres.append((point_positions(self.record, point, row), float(away[-1])))
-        return spheres
+        return [
+            (point_positions(self.record, point, row), point.radius)
+            for point in self.scene.contacts
+            if point.radius > 0.0 and point.tip is None and point.body not in self.objects
+        ]
 
     def extra(self) -> list[Array]:
         """Return points of solids, mounts and pads, (…, 3) [m], which the views must contain."""
