@@ -38,8 +38,6 @@ if TYPE_CHECKING:
 
 # Number of failed runs whose reasons are printed.
 _SHOWN = 5
-# Results in the table, unless --plot selects others: energy and the first error that the runs have.
-_ENERGY, _ERRORS = "electrical_energy_J", ("hand_error_rms_m", "final_position_error_m")
 
 
 class KeepRecords(StrEnum):
@@ -155,22 +153,27 @@ def sweep(
 
 def _print_table(name: str, rows: Sequence[SweepRow], plan: Plan, plotted: Sequence[str]) -> None:
     """Print the varied values and the results of all runs, or of the first runs and the first keys that fit."""
-    from dynsim.record.quantities import summary_quantity
-    from dynsim.scenario.quantities import quantity
+    from dynsim.record.quantities import ENERGY, ERRORS, summary_quantity
 
-    scenario = plan.scenario(next(plan.points()))
+    varied = _varied(plan)
     numbers = {key for row in rows for key in row.numbers}
-    errors = [key for key in _ERRORS if key in numbers]
-    results = {key: summary_quantity(key) for key in plotted or [_ENERGY, *errors[:1]] if key in numbers}
+    errors = [key for key in ERRORS if key in numbers]
+    results = {key: summary_quantity(key) for key in plotted or [ENERGY, *errors[:1]] if key in numbers}
     columns = [("run", [str(row.run) for row in rows])]
     if any(row.variant is not None for row in rows):
         columns.append(("variant", [escaped_line(row.variant) for row in rows]))
-    grid = {axis.key: quantity(axis.key, scenario) for axis in plan.grid}
-    sampled = {key: quantity(key, scenario) for key in plan.sampled}
-    columns += [_column(grid[key], [row.values[key] for row in rows]) for key in grid]
+    columns += [_column(varied[axis.key], [row.values[axis.key] for row in rows]) for axis in plan.grid]
     columns += [_column(results[key], [row.numbers.get(key) for row in rows]) for key in results]
-    columns += [_column(sampled[key], [row.values[key] for row in rows]) for key in sampled]
+    columns += [_column(varied[key], [row.values[key] for row in rows]) for key in plan.sampled]
     console.print(screen.listing(console, name, columns, screen.size(console)[1] - _SHOWN - 1), highlight=False)
+
+
+def _varied(plan: Plan) -> dict[str, Quantity]:
+    """Return name, symbol and unit of the varied keys of a sweep."""
+    from dynsim.scenario.quantities import quantity
+
+    scenario = plan.scenario(next(plan.points()))
+    return {key: quantity(key, scenario) for key in plan.parameters}
 
 
 def _column(described: Quantity, values: Sequence[Any]) -> tuple[str, list[str]]:
@@ -249,11 +252,8 @@ def drawn_table(name: str, rows: Sequence[SweepRow], plan: Plan, plotted: Sequen
         Columns to draw; default: energy and error.
     """
     from dynsim.draw.figures.sweep import Sweep
-    from dynsim.scenario.quantities import quantity
     from dynsim.studies.sweep import OK
 
-    scenario = plan.scenario(next(plan.points()))
-    keys = [*(axis.key for axis in plan.grid), *plan.sampled]
     return Sweep(
         name,
         [(row if row.status == OK else replace(row, numbers={})).cells() for row in rows],
@@ -261,5 +261,5 @@ def drawn_table(name: str, rows: Sequence[SweepRow], plan: Plan, plotted: Sequen
         plan.sampled,
         plan.file.variants,
         plotted,
-        {key: quantity(key, scenario) for key in keys},
+        _varied(plan),
     )

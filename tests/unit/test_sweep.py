@@ -34,7 +34,7 @@ from dynsim.draw.figures import sweep as pictures
 from dynsim.draw.figures.look import Look
 from dynsim.errors import DynsimError, ScenarioError
 from dynsim.record import Record
-from dynsim.record.quantities import Quantity
+from dynsim.record.quantities import ENERGY, Quantity
 from dynsim.record.sensitivity import sensitivities, spread
 from dynsim.scenario import SetOptions, read_scenario
 from dynsim.studies import batch
@@ -793,7 +793,7 @@ def test_what_is_no_address_is_one_line(tmp_path: Path, address: str):
 
 def test_runs_that_failed_are_counted_and_not_drawn(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """A base that tips after 5 s has taken a tenth of the energy; next to whole runs it looked like the best of all."""
-    numbers = {pictures.ENERGY: 1.0, "hand_error_rms_m": 0.1}
+    numbers = {ENERGY: 1.0, "hand_error_rms_m": 0.1}
     status = ["ok", "failed", "ok"]
     rows = [SweepRow(k, None, {"duration_s": k + 1}, state, "", numbers, "") for k, state in enumerate(status)]
     seen: list[pictures.Sweep] = []

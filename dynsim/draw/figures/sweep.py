@@ -22,12 +22,9 @@ from matplotlib.ticker import LogLocator, MaxNLocator
 from dynsim.draw.figures import style
 from dynsim.draw.figures.look import Look
 from dynsim.draw.figures.style import Array
-from dynsim.record.quantities import Quantity, summary_quantity
+from dynsim.record.quantities import ENERGY, ERRORS, Quantity, summary_quantity
 from dynsim.record.sensitivity import LEVEL, Sensitivities, sensitivities, spread
 
-ENERGY = "electrical_energy_J"
-# The first error that the table contains is drawn.
-ERRORS = ("hand_error_rms_m", "final_position_error_m")
 # Maximum number of parameters in a tornado diagram with one or two variants, and with more; of bars in a histogram.
 _PARAMETERS, _FEW, _BINS = 12, 8, 40
 # Values whose ratio exceeds this are drawn on a logarithmic axis or colour scale; values of a grid need a larger ratio.
@@ -262,8 +259,8 @@ def heat_map(sweep: Sweep) -> Figure | None:
             for axes, table in zip(row, tables, strict=False):
                 axes.contour(table, levels=levels, colors="white", linewidths=0.7)
             contours = True
-        lacking = [v for v in sweep.variants if all(row.get(metric) is None for row in sweep.of(v))]
-        if lacking := [v for v in lacking if v not in variants[metric]]:
+        missing = [v for v in sweep.variants if v not in variants[metric]]
+        if lacking := [v for v in missing if all(row.get(metric) is None for row in sweep.of(v))]:
             figure.note(f"{drawn.name}: does not exist for {', '.join(lacking)}.")
     if len(sweep.variants) > _MAPS:
         figure.note(f"Maps of at most {_MAPS} of {len(sweep.variants)} variants; --variants selects others.")
@@ -639,7 +636,7 @@ def _name_cells(axes: Axes, which: str, varied: Quantity, levels: Sequence[Any],
             ticks = MaxNLocator(count, steps=_STEPS).tick_values(values[0], values[-1])
             values = ticks[(ticks > values[0] - 1e-9) & (ticks < values[-1] + 1e-9)]
             at = np.interp(values, varied.scale * np.array(levels, dtype=float), at)
-        texts = [f"{value:.3g}".replace("-", "−") for value in values]
+        texts = [style.number(value, 3) for value in values]
     every = -(-len(texts) // (count + 1))
     label = style.broken(_label(varied), room)
     axes.set(**{f"{which}ticks": at[::every], f"{which}ticklabels": texts[::every], f"{which}label": label})
