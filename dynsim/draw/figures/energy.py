@@ -316,22 +316,28 @@ def torques(record: Record) -> Figure | None:
     called = _names(record)
     for (unit, motors), axes in zip(loads.items(), panels, strict=True):
         name, symbol, *keys = TORQUES[unit]
-        level = np.arange(len(motors))
         most, rms = ([motor[f"{name}_{kind}_{unit}"] for motor in motors] for kind in ("max", "rms"))
-        axes.barh(level, most, color="#CFCFCF", height=0.7, label="maximum")
-        axes.barh(level, rms, color=style.BLUE, height=0.4, label="rms")
+        bars(axes, [called.get(motor["joint"], motor["joint"]) for motor in motors], most, rms)
         for key, text, look in zip(keys, ("limit (stall)", "rating (for the rms)"), (LIMIT, RATING), strict=True):
             known = [(motor[key], k) for k, motor in enumerate(motors) if key in motor]
             for value, k in known:
                 limit_mark(axes, k, value, text, **look)
-        axes.set_yticks(level, [called.get(motor["joint"], motor["joint"]) for motor in motors])
-        axes.set(ylim=(len(motors) - 0.4, -0.6), xlabel=f"{name} [{symbol}]")
+        axes.set_xlabel(f"{name} [{symbol}]")
         axes.set_xlim(0.0, 1.05 * axes.get_xlim()[1])
-        axes.grid(axis="y", visible=False)
     style.legend_below(figure, list(panels), 4)
     if not limits:
         figure.note("The scenario has neither torque limits nor torque ratings of motors.")
     return figure
+
+
+def bars(axes: Axes, names: Sequence[str], largest: Sequence[float], rms: Sequence[float]) -> None:
+    """Draw a row for each name, from top to bottom, with a bar of the largest value and a thinner one of the rms."""
+    level = np.arange(len(names))
+    axes.barh(level, largest, color="#CFCFCF", height=0.7, label="maximum")
+    axes.barh(level, rms, color=style.BLUE, height=0.4, label="rms")
+    axes.set_yticks(level, names)
+    axes.set_ylim(len(names) - 0.4, -0.6)
+    axes.grid(axis="y", visible=False)
 
 
 def limit_mark(axes: Axes, level: int, value: float, label: str, **look: Any) -> None:

@@ -72,17 +72,15 @@ def following_error(record: Record) -> Figure | None:
     _mark_replay(over_time, record, named=True)
     during = record.time >= 0.0 if (record.time >= 0.0).any() else slice(None)
     errors = [MILLI * np.abs(measured - goal)[during] for _, _, measured, goal in shown]
-    level = np.arange(len(shown))
-    largest.barh(level, [_finite(np.nanmax, error) for error in errors], color="#CFCFCF", height=0.7, label="maximum")
+    most = [_finite(np.nanmax, error) for error in errors]
     rms = [_finite(lambda e: np.sqrt(np.nanmean(e**2)), error) for error in errors]
-    largest.barh(level, rms, color=style.BLUE, height=0.4, label="rms")
+    energy.bars(largest, [label for label, *_ in shown], most, rms)
+    limits = servo_limits(record, "following_error_rad")
     for k, (label, *_) in enumerate(shown):
-        if (limit := servo_limits(record, "following_error_rad").get(label)) is not None:
+        if (limit := limits.get(label)) is not None:
             energy.limit_mark(largest, k, MILLI * limit, "limit of the error")
-    largest.set_yticks(level, [label for label, *_ in shown])
-    largest.set(ylim=(len(shown) - 0.4, -0.6), xlabel=f"magnitude during the replay{one_unit}")
+    largest.set_xlabel(f"magnitude during the replay{one_unit}")
     largest.set_xlim(0.0, 1.05 * largest.get_xlim()[1])
-    largest.grid(axis="y", visible=False)
     style.legend_below(figure, [over_time, largest], 4)
     return figure
 

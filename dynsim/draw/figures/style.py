@@ -49,6 +49,8 @@ NOTE = "#555555"
 # Colour of parts of links that are below a surface because they have no contact point.
 DEEP = "#882255"
 VARIANT_COLOURS = (BLUE, GREEN, ORANGE, PURPLE, SKY, BLACK, "#8C6D31")
+# Line styles of variants that share a colour.
+DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1, 1)), (0, (5, 1, 1, 1)), (0, (8, 3)), (0, (3, 1, 1, 1, 1, 1)))
 AXIS_COLOURS = {"x": BLUE, "y": GREEN, "z": ORANGE}
 
 # Width of a figure on a page [inch]; in a figure below NARROW, which fits a column of a paper, panels are below each
@@ -392,7 +394,7 @@ def variant_styles(names: Sequence[T]) -> dict[T, dict[str, Any]]:
     """
     colours = _colours()
     count = len(colours)
-    dashes = ("-", (0, (5, 1.5)), (0, (1, 1)), (0, (5, 1, 1, 1)))
+    dashes = DASHES[:4]
     return {
         name: {
             "color": colours[k % count],
@@ -411,9 +413,8 @@ def _colours() -> Sequence[str]:
     return [to_hex(colour) for colour in cycle]
 
 
-# Line styles of variants that share a colour; legend entry of variants without an ending.
+# Legend entry of variants without an ending.
 ALONE = "without ending"
-DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1, 1)), (0, (5, 1, 1, 1)), (0, (8, 3)), (0, (3, 1, 1, 1, 1, 1)))
 
 
 def families(names: Sequence[str]) -> dict[str, tuple[str, str]]:
@@ -508,17 +509,12 @@ def shade(axes: Axes, time: Array, where: NDArray[np.bool_], colour: str, label:
 
 def legend_row() -> float:
     """Return the height of a row of a legend [point]."""
-    return LEGEND_ROW * _legend_size()
-
-
-def _legend_size() -> float:
-    """Return the size of the letters of legends [point]."""
-    return _size("legend.fontsize")
+    return LEGEND_ROW * _size("legend.fontsize")
 
 
 def fitted_legend(labels: Sequence[str], columns: int) -> tuple[list[str], int, int]:
     """Return the labels, broken into lines, the number of columns that fit into the figure, and the rows of text."""
-    size = _legend_size()
+    size = _size("legend.fontsize")
     handle = (matplotlib.rcParams["legend.handlelength"] + 2.8) * size
     available = 72.0 * 0.97 * width()
     lines = [broken(label, (available - handle) / 72.0, size) for label in labels]
