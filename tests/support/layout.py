@@ -3,24 +3,48 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Mapping
+from typing import Any
 
+import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 from matplotlib.transforms import Bbox
 
+import dynsim
+from dynsim.errors import SimulationStopped
+from dynsim.record import Record
+from dynsim.scenario import load_scenario
+
+# Widths of a page and of a column [inch].
+SIZES = (7.2, 3.4)
 # Texts may touch by this much [point]: the box of a text is larger than its ink.
 SLACK = 1.2
 
 
+def simulated(name: str, variant: str | None, changes: Mapping[str, Any]) -> Record | None:
+    """Return the record of a run, which ends early if the run stops; None if the run stops at the start."""
+    try:
+        return dynsim.simulate(load_scenario(name, variant, changes))
+    except SimulationStopped as stop:
+        return stop.record
+
+
+def faults(name: str, label: str, records: Record | Mapping[str, Record], size: float) -> list[str]:
+    """Return the faults of a figure of a width [inch], with a label of its records."""
+    figure = dynsim.figure(records, name, size=size)
+    return [f"{name} of {label} at {size} in: {fault}" for fault in layout_faults(figure)]
+
+
 def layout_faults(figure: Figure) -> list[str]:
-    """Return the texts that leave the canvas, pairs of texts that overlap, and legends over another panel's curves.
+    """Return the texts that leave the canvas, and pairs of texts that overlap.
 
     Only texts that are really drawn count; invisible ticks and texts outside a clip path do not.
     """
     slack = SLACK * figure.dpi / 72.0
     canvas = Bbox.from_bounds(-slack, -slack, figure.bbox.width + 2 * slack, figure.bbox.height + 2 * slack)
-    boxes = [(text, _ink(text)) for text in _drawn_texts(figure)]
+    boxes = [(text, text.get_window_extent()) for text in _drawn_texts(figure)]
     faults = [f"{_name(text)} leaves the canvas" for text, box in boxes if not _inside(box, canvas)]
     for (first, a), (second, b) in itertools.combinations(boxes, 2):
         across = min(a.x1, b.x1) - max(a.x0, b.x0)
@@ -55,10 +79,6 @@ def _is_shown(text: Text) -> bool:
     return box.width > 0.0
 
 
-def _ink(text: Text) -> Bbox:
-    return text.get_window_extent()
-
-
 def _inside(box: Bbox, canvas: Bbox) -> bool:
     return bool(box.x0 >= canvas.x0 and box.x1 <= canvas.x1 and box.y0 >= canvas.y0 and box.y1 <= canvas.y1)
 
@@ -67,8 +87,6 @@ def _apart(first: Text, second: Text, slack: float) -> bool:
     """Return whether slanted texts are apart although their upright boxes overlap (separating axes)."""
     if not (first.get_rotation() % 90.0 or second.get_rotation() % 90.0):
         return False
-    import numpy as np
-
     corners = [_corners(text) for text in (first, second)]
     for shape in corners:
         for k in range(2):
@@ -82,8 +100,6 @@ def _apart(first: Text, second: Text, slack: float) -> bool:
 
 def _corners(text: Text):
     """Corners of a text's slanted box [pixel], (4, 2)."""
-    import numpy as np
-
     angle = text.get_rotation()
     text.set_rotation(0.0)
     flat = text.get_window_extent()

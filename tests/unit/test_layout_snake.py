@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-
 import pytest
-from support.layout import layout_faults
+from support import layout
+from support.layout import SIZES, faults
 
-import dynsim
 from dynsim.draw.figures import snake
-from dynsim.errors import SimulationStopped
 from dynsim.record import Record
-from dynsim.scenario import load_scenario, variant_names
+from dynsim.scenario import variant_names
 
-SIZES = (7.2, 3.4)
 # Scenarios with the duration of their runs [s], if it is not that of the scenario: the gripper has to close.
 SCENARIOS: dict[str, float | None] = {
     "snake_positioning": 2.0,
@@ -34,10 +30,7 @@ SCENARIOS: dict[str, float | None] = {
 
 def simulated(name: str, variant: str | None, duration: float | None) -> Record | None:
     changes = {"record.rate_hz": 50} | ({} if duration is None else {"duration_s": duration})
-    try:
-        return dynsim.simulate(load_scenario(name, variant, changes))
-    except SimulationStopped as stop:
-        return stop.record
+    return layout.simulated(name, variant, changes)
 
 
 def runs(name: str) -> dict[str, Record]:
@@ -46,38 +39,21 @@ def runs(name: str) -> dict[str, Record]:
     return {variant: record for variant, record in records.items() if record is not None}
 
 
-def faults(jobs: Sequence[tuple[str, str, Record | Mapping[str, Record]]], sizes: Sequence[float]) -> list[str]:
-    """Return the faults of figures: each has its name, a label of the records, and the records."""
-    return [
-        f"{name} of {label} at {size} in: {fault}"
-        for size in sizes
-        for name, label, records in jobs
-        for fault in layout_faults(dynsim.figure(records, name, size=size))
-    ]
-
-
 @pytest.mark.parametrize(
     ("name", "variant", "size"), [("snake_short", "backward", 7.2), ("snake_positioning_dynamic", "z", 3.4)]
 )
 def test_figures_of_one_run_have_no_layout_faults(name: str, variant: str, size: float) -> None:
     record = simulated(name, variant, 0.3)
     assert record is not None
-    assert faults([(maker, variant, record) for maker in snake.figures(record)], [size]) == []
+    assert [fault for maker in snake.figures(record) for fault in faults(maker, variant, record, size)] == []
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_figures_of_shipped_scenarios_have_no_layout_faults(name: str) -> None:
-    """Comparisons of all variants on a page and in a column, and figures of the first variant in a column."""
+    """Figures of every variant and comparisons of all variants, on a page and in a column."""
     records = runs(name)
-    several = [(maker, "comparison", records) for maker in snake.comparisons(records)] if len(records) > 1 else []
-    first = next(iter(records))
-    assert faults([(maker, first, records[first]) for maker in snake.figures(records[first])], SIZES[1:]) == []
-    assert faults(several, SIZES) == []
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", SCENARIOS)
-def test_figures_of_all_variants_have_no_layout_faults(name: str) -> None:
-    jobs = [(maker, variant, record) for variant, record in runs(name).items() for maker in snake.figures(record)]
-    assert faults(jobs, SIZES) == []
+    assert records
+    drawn = [(maker, variant, record) for variant, record in records.items() for maker in snake.figures(record)]
+    drawn += [(maker, "comparison", records) for maker in snake.comparisons(records) if len(records) > 1]
+    assert [fault for size in SIZES for job in drawn for fault in faults(*job, size)] == []
