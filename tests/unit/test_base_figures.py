@@ -290,7 +290,7 @@ def test_postures_show_the_base_and_its_wheels(turning: Record) -> None:
     middles = np.array([solid.mean(axis=0)[:2] for solid in wheels])
     np.testing.assert_allclose(middles, [in_world(turning, 0, side * TRACK / 2)[-1] for side in (1, -1)], atol=1e-6)
     figure = drawn(posture.posture(turning))
-    shown = len(body.rows_shown())
+    shown = len(body.rows_shown)
     assert len(figure.axes[1].patches) == 4 * shown
     extent = figure.axes[1].viewLim
     assert all(extent.contains(*corner) for patch in figure.axes[1].patches for corner in patch.get_xy())

@@ -89,7 +89,7 @@ class Skeleton:
 
     def bases(self) -> list[list[Array]]:
         """Return the corners of the solids of a mobile base and objects for each posture."""
-        return [[corners for corners, _ in self.solids(k)] for k in self.rows_shown()]
+        return [[corners for corners, _ in self.solids(k)] for k in self.rows_shown]
 
     @cached_property
     def objects(self) -> tuple[int, ...]:
@@ -126,7 +126,7 @@ class Skeleton:
 
     def extra(self) -> list[Array]:
         """Return points of solids, mounts and pads, (…, 3) [m], which the views must contain."""
-        rows = self.rows_shown()
+        rows = self.rows_shown
         around = [
             centre + sign * radius * np.eye(3)
             for row in rows[-1:]
@@ -137,11 +137,12 @@ class Skeleton:
         return [*solids, *(corners for corners, _ in self.fixed()), *around, *self.mounts()]
 
     def postures(self) -> list[Array]:
-        """Return the segments at the samples of :meth:`rows_shown`; the last sample comes last."""
-        return [self.segments(k) for k in self.rows_shown()]
+        """Return the segments at the samples of :attr:`rows_shown`; the last sample comes last."""
+        return [self.segments(k) for k in self.rows_shown]
 
+    @cached_property
     def rows_shown(self) -> list[int]:
-        """Return the samples at which the robot is drawn, in order of time; empty if it never had a finite pose."""
+        """Samples at which the robot is drawn, in order of time; empty if it never had a finite pose."""
         if not self.scene.bodies:
             return []
         rows = np.flatnonzero(np.isfinite(self.record[POSITION]).all(axis=(1, 2)))
@@ -358,7 +359,7 @@ def posture(record: Record) -> Figure | None:
     if note:
         side.set_title(style.broken(note, across), color=style.PULLING)
     style.legend_below(figure, [side], 5)
-    if before := ", ".join(style.number(float(record.time[row]), 2) for row in body.rows_shown()[:-1]):
+    if before := ", ".join(style.number(float(record.time[row]), 2) for row in body.rows_shown[:-1]):
         figure.note(f"Faint: at {before} s.")
     return figure
 
@@ -457,7 +458,7 @@ def _side_view(
             _draw_mount(axes, mount, size, down=bool(flat[..., 1].mean() > mount[1, 1] - 4.0 * size))
     fixed = [plane.project(corners) for corners, _ in body.fixed()]
     add_outlines(axes, fixed, edgecolor=style.GREY, facecolor=BASE_COLOUR, lw=0.8, zorder=1.5)
-    for centre, radius in body.pads(body.rows_shown()[-1]) if drawn else []:
+    for centre, radius in body.pads(body.rows_shown[-1]) if drawn else []:
         look = {"facecolor": PAD_COLOUR, "edgecolor": colour, "lw": 0.8, "zorder": 2.8, "label": "contact sphere"}
         axes.add_patch(Circle(tuple(plane.project(centre)), radius, **look))
     for k, base in enumerate(body.bases()):
@@ -486,7 +487,7 @@ def _side_view(
     for _, _, position, force in body.contacts():
         axes.plot(*plane.project(position), zorder=6, linestyle="none", **_contact_mark(force))
     labels = contact_labels(body, plane, scale)
-    rows = np.array(body.rows_shown(), dtype=np.intp)
+    rows = np.array(body.rows_shown, dtype=np.intp)
     if body.scene.bodies and (below := penetrations(record, body.scene, rows)):
         ring: dict[str, Any] = {"markersize": 9, "markerfacecolor": "none", "color": style.DEEP, "zorder": 5}
         for point_below in below:
@@ -540,14 +541,14 @@ def _space_view(axes: Any, body: Skeleton, bounds: tuple[Array, Array], wide: bo
     axes.computed_zorder = False
     for surface in body.scene.surfaces:
         _draw_surface(axes, surface, low, high)
-    base = [*body.fixed(), *(body.solids(body.rows_shown()[-1]) if drawn else [])]
+    base = [*body.fixed(), *(body.solids(body.rows_shown[-1]) if drawn else [])]
     size = MOUNT * float((high - low).max())
     for start, end in body.mounts():
         axes.plot(*np.array([start, end]).T, color=style.GREY, lw=4.0, zorder=1.6)
         corners = start + 2.0 * size * np.array([[1, 1, 0], [1, -1, 0], [-1, -1, 0], [-1, 1, 0]])
         ground = Poly3DCollection([corners], facecolors=BASE_COLOUR, edgecolors=style.GREY, linewidths=0.8, zorder=1.5)
         axes.add_collection3d(ground, autolim=False)
-    for centre, radius in body.pads(body.rows_shown()[-1]) if drawn else []:
+    for centre, radius in body.pads(body.rows_shown[-1]) if drawn else []:
         angle = np.linspace(0.0, 2.0 * np.pi, 49)
         for u, v in ((0, 1), (0, 2), (1, 2)):
             circle = np.tile(centre, (len(angle), 1))
