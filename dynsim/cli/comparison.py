@@ -56,7 +56,8 @@ def _print(console: Console, title: str, summaries: Mapping[str, Summary], every
         return
     width, height = screen.size(console)
     folded = rows_of(runs, folded=True)
-    grouped, short = _grouped(summaries), _grouped(summaries, width)
+    kinds = _kinds_of_warnings(summaries)
+    grouped, short = _grouped(kinds, len(runs)), _grouped(kinds, len(runs), width)
     forms = ((rows, warnings), (rows, grouped), (rows, short), (folded, grouped), (folded, short))
     parts: list[RenderableType]
     for shown, texts in forms:
@@ -138,8 +139,8 @@ def _warnings(summaries: Mapping[str, Summary]) -> list[str]:
     return [warning_text(warning, ", ".join(names)) for warning, names in variants.items()]
 
 
-def _grouped(summaries: Mapping[str, Summary], width: int | None = None) -> list[str]:
-    """Return the first warning of each kind, with its variants and the number of such warnings, cut to ``width``."""
+def _kinds_of_warnings(summaries: Mapping[str, Summary]) -> list[list[tuple[str, str]]]:
+    """Return the variants and warnings of each kind, the kind with most variants first."""
     groups: list[list[tuple[str, str]]] = []
     for name, summary in summaries.items():
         for warning in summary.get("warnings", ()):
@@ -147,10 +148,15 @@ def _grouped(summaries: Mapping[str, Summary], width: int | None = None) -> list
             if not group:
                 groups.append(group)
             group.append((name, warning))
+    return sorted(groups, key=lambda group: -len({name for name, _ in group}))
+
+
+def _grouped(kinds: Sequence[Sequence[tuple[str, str]]], variants: int, width: int | None = None) -> list[str]:
+    """Return the first warning of each kind, with its variants and the number of such warnings, cut to ``width``."""
     texts = []
-    for group in sorted(groups, key=lambda group: -len({name for name, _ in group})):
+    for group in kinds:
         names = list(dict.fromkeys(name for name, _ in group))
-        several = f"{len(names)} of {len(summaries)} variants" if len(names) > _NAMED else ", ".join(names)
+        several = f"{len(names)} of {variants} variants" if len(names) > _NAMED else ", ".join(names)
         times = f" (the first of {len(group)})" if len(group) > 1 else ""
         text = Text.from_markup(warning_text(group[0][1], several))
         if width is not None:
