@@ -79,9 +79,10 @@ class HandReference(StrictConfig):
 
     def turn_in_world(self, context: BuildContext) -> Array | None:
         """Return the target axes of the hand in the world as columns, shape (3, 3); None without an orientation."""
-        if self.orientation is None or not self.from_start:
-            return None if self.orientation is None else self.orientation.matrix()
-        return np.asarray(self.orientation.matrix() @ hand_turn(context.model, context.planned_start))
+        if self.orientation is None:
+            return None
+        turn = self.orientation.matrix()
+        return np.asarray(turn @ hand_turn(context.model, context.planned_start)) if self.from_start else turn
 
 
 class BaseReference(StrictConfig):
@@ -212,11 +213,12 @@ def build(config: Config, context: BuildContext) -> JointControl:
     model = context.model
     robot = model.robot
     _check_names(config, model)
-    path = None
+    path, turn = None, None
     if config.hand is not None:
         hand_config = config.hand
         known = hand_config.path, context.duration, *([model, context.start] if hand_config.from_start else ())
         path = recall("path", lambda: hand_config.path_in_world(context), *known)
+        turn = hand_config.turn_in_world(context)
     base_path = None
     if config.base is not None:
         with errors_at("controller", "base", "path"):
@@ -236,7 +238,6 @@ def build(config: Config, context: BuildContext) -> JointControl:
             base = _base_coordinates(robot, positions, times)
             braces = [_contact(context, name, "hand.braces") for name in hand.braces]
             start, tolerance = robot.initial, hand.tolerance_m
-            turn = hand.turn_in_world(context)
             followed = follow(
                 model, times, targets, hand.joints, start, tolerance, context.progress, base, braces, turn
             )
@@ -251,8 +252,7 @@ def build(config: Config, context: BuildContext) -> JointControl:
         sample_time=config.sample_time_s,
         voltages=_planned(config, context, times, positions) if planned else None,
     )
-    if config.hand is not None:
-        control = replace(control, orientation=config.hand.turn_in_world(context))
+    control = replace(control, orientation=turn)
     return control if config.operator is None else replace(control, teleop=_teleop(config.operator, context))
 
 
