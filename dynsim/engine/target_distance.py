@@ -214,11 +214,8 @@ def hand_distance(record: Record, prepared: Prepared, settle: float, begun: floa
     if record.time[0] > begun:
         errors["hand_error_start_m"] = None
     robot = prepared.model.robot
-    target, causes, reach = (
-        hand_target(record),
-        list[DistanceCause](),
-        recall("reach", lambda: hand_reach(robot), robot),
-    )
+    reach = recall("reach", lambda: hand_reach(robot), robot)
+    target, causes = hand_target(record), list[DistanceCause]()
     if target is not None and errors["hand_error_end_m"] > _limit(EXAMINED, reach):
         causes = hand_causes(record, prepared, target[-1])
     return {**errors, "hand_error_causes": [cause._asdict() for cause in causes], "hand_reach_m": reach}
