@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from dynsim.compile.clearance import SLACK, axis_ends, axis_gaps
-from dynsim.compile.control import HandPath, MovedPath
-from dynsim.compile.hand_posture import hand_posture, hand_turns
+from dynsim.compile.hand_posture import hand_posture, hand_turn, hand_turns
 from dynsim.compile.model import Model
 from dynsim.compile.posture import HAND, Rest, holding_torques, load_forces, load_torques, on_surfaces, static_margin
 from dynsim.compile.protocols import BuildContext
@@ -440,7 +439,7 @@ class ArmPosture(StartPosture):
             If the hand cannot reach the point.
         """
         robot, coupled = self._uncoupled()
-        orientation = self._hand_axes() if keep_orientation else None
+        orientation = hand_turn(self.model, self.q) if keep_orientation else None
         arm, columns = self._on_fixed_base(robot)
         bodies = {link.name for link in arm.links} | {frame.name for frame in arm.frames}
         touching = self._touching() if keep_braces else []
@@ -451,11 +450,6 @@ class ArmPosture(StartPosture):
             Model(arm), np.array(target, dtype=np.float64), q[columns], orientation, braces, IK_TOLERANCE, moving
         )
         self._change(q)
-
-    def _hand_axes(self) -> Array:
-        """Return the axes of the hand in the world, (3, 3)."""
-        robot = self.robot
-        return np.asarray(self.model.body_pose(robot.attach(*robot.hand)[0], self.q)[0] @ robot.hand_axes)
 
     def _on_fixed_base(self, robot: Robot) -> tuple[Robot, list[int]]:
         """Return the arm with its base fixed where it is, and the indices of its coordinates."""
@@ -630,13 +624,9 @@ class ArmPosture(StartPosture):
     def path(self) -> Any:
         """Return the path of the hand, or None."""
         hand = getattr(self.scenario.controller, "hand", None)
-        if hand is None or getattr(hand.path, "frame", "world") == "start":
+        if hand is None or hand.from_start:
             return None
-        return self._built(hand.path)
-
-    def _built(self, path: Any) -> HandPath:
-        built = families.build("path", path, BuildContext(self.scenario.duration_s), HandPath)
-        return MovedPath(built, np.array(path.origin_m))
+        return hand.path_in_world(BuildContext(self.scenario.duration_s))
 
     def keys(self) -> dict[str, Any]:
         """Return the scenario keys of the posture: plant, path start, ``initial`` and contact points."""
@@ -668,9 +658,9 @@ class ArmPosture(StartPosture):
             if name in positions and abs(path.values[0] - positions[name]) > SAME:
                 waypoints = [float(to_key(positions[name])), *getattr(path, key)[1:]]
                 keys.setdefault("joints", {})[name] = rounded({key: waypoints})
-        hand = getattr(controller, "hand", None)
-        if hand is None or getattr(hand.path, "frame", "world") == "start":
+        if self.path() is None:
             return keys
+        hand = controller.hand
         starting_at = getattr(families.member("path", hand.path.type), "starting_at", None)
         keys["hand"], off, origin = {}, self._off_path(), np.array(hand.path.origin_m)
         if np.linalg.norm(off) > hand.tolerance_m:
@@ -680,7 +670,7 @@ class ArmPosture(StartPosture):
                 at = self.model.point_position(*self.robot.hand, self.q) - origin
                 keys["hand"]["path"] = rounded(starting_at(hand.path, at.tolist()))
         if hand.orientation is not None:
-            rpy = np.rad2deg(roll_pitch_yaw(self._hand_axes())).tolist()
+            rpy = np.rad2deg(roll_pitch_yaw(hand_turn(self.model, self.q))).tolist()
             if hand_turns(self.model, self.q[None], hand.orientation.matrix())[0] > SAME:
                 keys["hand"]["orientation"] = rounded({"rpy_deg": rpy})
         return {key: value for key, value in keys.items() if value}
@@ -703,8 +693,10 @@ class ArmPosture(StartPosture):
             return []
         hand = self.scenario.controller.hand
         moved = self._controller_keys().get("hand", {}).get("path", {})
+        copied = hand.model_copy(update={"path": hand.path.model_copy(update=moved)})
+        path = copied.path_in_world(BuildContext(self.scenario.duration_s))
         times = np.linspace(0.0, self.scenario.duration_s, PATH_SAMPLES)
-        return np.round(self._built(hand.path.model_copy(update=moved)).position(times), 4).ravel().tolist()
+        return np.round(path.position(times), 4).ravel().tolist()
 
     def _off_path(self) -> Array:
         """Return the vector from the hand to the start of its path, (3,) [m]; zero without a path."""
