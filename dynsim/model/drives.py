@@ -69,6 +69,11 @@ class Motor:
         return self.current_limit
 
     @property
+    def stall_torque(self) -> float:
+        """Torque or force at the joint at rest, at the voltage or current limit of the motor [N m or N]."""
+        return self.joint_constant * min(self.voltage_limit / self.resistance, self.greatest_current)
+
+    @property
     def joint_constant(self) -> float:
         """Torque constant at the joint, K_m = K k [N m/A = V s/rad]."""
         return self.torque_constant * self.gear_ratio

@@ -96,8 +96,7 @@ def moving_arm(model: Model, surfaces: Mapping[str, Surface]) -> MovingArm:
         if not isinstance(motor, Motor):
             raise ModelError(f"plan: {link.joint} has no DC motor, whose heat can be minimised; set its motor in plant")
         heat.append(motor.resistance / motor.joint_constant**2)
-        current = min(motor.greatest_current, motor.voltage_limit / motor.resistance)
-        greatest.append(min(motor.joint_constant * current, link.effort_limit))
+        greatest.append(min(motor.stall_torque, link.effort_limit))
     index, start = {robot.links[i].name: k for k, i in enumerate(links)}, robot.initial
     parent, rotation, origin = [], [], []
     for i in links:

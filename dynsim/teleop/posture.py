@@ -524,9 +524,8 @@ class ArmPosture(StartPosture):
             if isinstance(motor, TorqueSource):
                 ratings[motor.joint] = motor.torque_limit, motor.nominal_torque
                 continue
-            most = motor.joint_constant * min(motor.voltage_limit / motor.resistance, motor.greatest_current)
             lasting = min(motor.nominal_torque, motor.joint_constant * motor.nominal_current)
-            ratings[motor.joint] = most, lasting
+            ratings[motor.joint] = motor.stall_torque, lasting
         return ratings
 
     @cached_property
