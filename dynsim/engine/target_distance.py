@@ -26,7 +26,7 @@ from dynsim.dynamics import tables as ka
 from dynsim.dynamics.drive.law import asked_of, evaluate_reference, fed_forward, servo_drag
 from dynsim.engine.force_indeterminacy import contact_point
 from dynsim.errors import first_few
-from dynsim.model.base_pose import base_row
+from dynsim.model.base_pose import base_coordinates, base_row
 from dynsim.model.description import Array, Robot
 from dynsim.record import Record
 from dynsim.record.measures import hand_error, hand_target
@@ -185,11 +185,9 @@ def hand_causes(
             before, then = hand(referenced), before
             parts["free"][robot.links[k].joint] = float(weight @ (then - before))
     if "base_target" in record:
-        first, link = base_row(robot)
-        x, y, heading = record["base_target"][-1]
-        turn = heading - np.arctan2(link.R_PJ[1, 0], link.R_PJ[0, 0])
-        at = link.R_PJ.T @ (np.array([x, y, link.p_PJ[2]]) - link.p_PJ)
-        referenced[first : first + 4] = 0.0, turn / link.parameter, at[0], at[1]
+        first, _ = base_row(robot)
+        turn, at = base_coordinates(robot, record["base_target"][-1])
+        referenced[first : first + 4] = 0.0, turn, *at
         before, then = hand(referenced), before
         parts["base"][""] = float(weight @ (then - before))
     parts["reference"][""] = float(weight @ (before - target))

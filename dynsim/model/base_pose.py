@@ -24,3 +24,11 @@ def base_pose(robot: Robot, q: Array) -> Array:
     position = link.p_PJ[:, None] + link.R_PJ @ np.stack([x, y, np.zeros_like(x)])
     start = np.arctan2(link.R_PJ[1, 0], link.R_PJ[0, 0])
     return np.stack([position[0], position[1], start + link.parameter * (right - left)], axis=1)
+
+
+def base_coordinates(robot: Robot, pose: Array) -> tuple[float, Array]:
+    """Return φ_r − φ_l [rad] and the coordinates x, y, (2,) [m], at which the base has a pose of :func:`base_pose`."""
+    _, link = base_row(robot)
+    x, y, heading = pose
+    turn = (heading - np.arctan2(link.R_PJ[1, 0], link.R_PJ[0, 0])) / link.parameter
+    return float(turn), (link.R_PJ.T @ (np.array([x, y, link.p_PJ[2]]) - link.p_PJ))[:2]

@@ -21,7 +21,7 @@ from dynsim.engine import check, named
 from dynsim.engine.recording import drawn_scene, pictured_parts, provenance
 from dynsim.errors import DynsimError, ModelError, ScenarioError
 from dynsim.library import families
-from dynsim.model.base_pose import base_pose, base_row
+from dynsim.model.base_pose import base_coordinates, base_pose
 from dynsim.model.description import Array, Contact, Link, Load, Robot
 from dynsim.model.drives import Servo, TorqueSource
 from dynsim.model.urdf.reader import rotation
@@ -354,12 +354,10 @@ class ArmPosture(StartPosture):
     def _put(self, slider: Slider, value: float, q: Array) -> None:
         k = slider.index
         if slider.part == "base":
-            pose, (_, row) = base_pose(self.robot, q[None])[0], base_row(self.robot)
+            pose = base_pose(self.robot, q[None])[0]
             pose[slider.component] = np.deg2rad(value) if slider.unit == "deg" else value
-            start = float(np.arctan2(row.R_PJ[1, 0], row.R_PJ[0, 0]))
-            turn = (pose[2] - start) / row.parameter
-            q[k : k + 2] = -0.5 * turn, 0.5 * turn
-            q[k + 2 : k + 4] = row.R_PJ.T[:2, :2] @ (pose[:2] - row.p_PJ[:2])
+            turn, at = base_coordinates(self.robot, pose)
+            q[k : k + 4] = -0.5 * turn, 0.5 * turn, *at
         elif slider.part == "attitude":
             rpy = self._attitude(q[k : k + 4])
             rpy[slider.component] = np.deg2rad(value)
