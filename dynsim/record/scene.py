@@ -410,6 +410,15 @@ class Scene(_Finite):
         return base, *wheels
 
     @property
+    def bodies_of_objects(self) -> set[int]:
+        """Indices of the bodies of objects, of the bodies on them, and of the bodies of the rows of their joints."""
+        known = set[int]()
+        for k, body in enumerate(self.bodies):
+            if body.name in self.objects or body.joint.part_of in self.objects or body.parent in known:
+                known.add(k)
+        return known
+
+    @property
     def rows(self) -> dict[int, list[int]]:
         """Indices of the bodies of each joint, parents first, by the last one.
 

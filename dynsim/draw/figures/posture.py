@@ -93,12 +93,9 @@ class Skeleton:
 
     @cached_property
     def objects(self) -> tuple[int, ...]:
-        """Indices of the bodies of objects that have shapes, and of the bodies on them or before their joints."""
-        scene, known = self.scene, set[int]()
-        for k, body in enumerate(scene.bodies):
-            if body.name in scene.objects or body.joint.part_of in scene.objects or body.parent in known:
-                known.add(k)
-        return tuple(sorted(known)) if any(scene.bodies[k].shapes for k in known) else ()
+        """Indices of the bodies of objects, see :attr:`Scene.bodies_of_objects`; empty if they have no shapes."""
+        known = self.scene.bodies_of_objects
+        return tuple(sorted(known)) if any(self.scene.bodies[k].shapes for k in known) else ()
 
     def fixed(self) -> list[tuple[Array, Faces]]:
         """Return corners, (n, 3) [m], and faces of the shapes that are fixed in the world, without meshes."""

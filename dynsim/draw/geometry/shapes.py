@@ -189,7 +189,8 @@ def drawn_shapes(shapes: Iterable[Shape], meshes: Meshes) -> list[dict[str, Any]
 
 def body_shapes(scene: Scene, reach: float, meshes: Meshes) -> list[list[dict[str, Any]]]:
     """Return the shapes of every body; a body without shapes gets rods to its children, and joints get hubs."""
-    tubes = [b.shapes[0].size[0] for k, b in enumerate(scene.bodies) if _is_tube(b) and not _of_object(scene, k)]
+    own = set(range(len(scene.bodies))) - scene.bodies_of_objects
+    tubes = [scene.bodies[k].shapes[0].size[0] for k in own if _is_tube(scene.bodies[k])]
     radius = float(np.median(tubes)) if tubes else ROD * reach
     base = set(scene.base)
     drawn = []
@@ -215,15 +216,6 @@ def body_shapes(scene: Scene, reach: float, meshes: Meshes) -> list[list[dict[st
         for k in hands & set(range(len(scene.bodies))):
             drawn[k] = [{"kind": "box", "size": 3 * [0.06 * reach], "p": [0.0, 0.0, 0.03 * reach], "q": list(HERE)}]
     return drawn
-
-
-def _of_object(scene: Scene, k: int) -> bool:
-    """Return whether a body belongs to an object, not to the robot."""
-    while k != WORLD:
-        if scene.bodies[k].name in scene.objects:
-            return True
-        k = scene.bodies[k].parent
-    return False
 
 
 def _pads(scene: Scene, k: int) -> list[dict[str, Any]]:
