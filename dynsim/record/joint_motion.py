@@ -231,20 +231,17 @@ def _write_joint_trajectory(file: TextIO, joints: list[str], time: Array, q: Arr
     stamps = np.rint(time * 1e9).astype(np.int64)
     if not (np.diff(stamps) > 0).all():
         raise RecordError("the times of a joint trajectory must increase by at least 1 ns per point; reduce --rate")
-    file.write(f"joint_names: [{', '.join(map(_yaml_text, joints))}]\npoints:\n")
+    file.write(f"joint_names: [{', '.join(map(yaml_name, joints))}]\npoints:\n")
     for stamp, qs, vs in zip(stamps.tolist(), q, v, strict=True):
         seconds, nanoseconds = divmod(stamp, 1_000_000_000)
         file.write(f"- positions: {_flow(qs)}\n  velocities: {_flow(vs)}\n")
         file.write(f"  time_from_start: {{sec: {seconds}, nanosec: {nanoseconds}}}\n")
 
 
-def _yaml_text(joint: str) -> str:
+def yaml_name(name: str) -> str:
     """Return a name unchanged if YAML reads it as text, otherwise as a quoted JSON string, which YAML can read."""
-    return (
-        joint
-        if re.fullmatch(r"[A-Za-z_][\w.-]*", joint) and joint.lower() not in _YAML_WORDS
-        else json.dumps(joint, ensure_ascii=False)
-    )
+    plain = re.fullmatch(r"[A-Za-z_][\w.-]*", name) and name.lower() not in _YAML_WORDS
+    return name if plain else json.dumps(name, ensure_ascii=False)
 
 
 def _flow(values: Array) -> str:

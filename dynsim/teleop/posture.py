@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
@@ -26,6 +25,7 @@ from dynsim.model.description import Array, Contact, Link, Load, Robot
 from dynsim.model.drives import Servo, TorqueSource
 from dynsim.model.urdf.reader import rotation
 from dynsim.record import Record
+from dynsim.record.joint_motion import yaml_name
 from dynsim.record.poses import add_body_poses, poses_at
 from dynsim.record.quaternion import of_matrix, rotated
 from dynsim.record.scene import WORLD, Scene
@@ -838,7 +838,7 @@ def yaml_text(keys: Mapping[str, Any], notes: Mapping[tuple[str, ...], str], abo
     lines = []
     for key, value in keys.items():
         at, indent = (*above, str(key)), "  " * len(above)
-        flow, start = _flow(value), f"{indent}{_plain(key)}:"
+        flow, start = _flow(value), f"{indent}{yaml_name(key)}:"
         lines += [f"{indent}# {notes[at]}\n"] if at in notes else []
         nested = isinstance(value, Mapping) and any(isinstance(item, Mapping) for item in value.values())
         if isinstance(value, Mapping) and value and (len(at) == 1 or (len(at) == 2 and (nested or len(flow) > FLAT))):
@@ -852,23 +852,11 @@ def yaml_text(keys: Mapping[str, Any], notes: Mapping[tuple[str, ...], str], abo
 
 def _flow(value: Any) -> str:
     if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{_plain(key)}: {_flow(item)}" for key, item in value.items()) + "}"
+        return "{" + ", ".join(f"{yaml_name(key)}: {_flow(item)}" for key, item in value.items()) + "}"
     if isinstance(value, list | tuple):
         return "[" + ", ".join(map(_flow, value)) + "]"
     if isinstance(value, bool) or value is None:
         return {True: "true", False: "false", None: "null"}[value]
     if isinstance(value, float):
         return np.format_float_positional(value, trim="-")
-    return str(value) if isinstance(value, int) else _plain(value)
-
-
-def _plain(text: object) -> str:
-    """Return a string as a YAML scalar, in quotes if necessary."""
-    import json
-
-    plain = re.fullmatch(r"[A-Za-z_/][\w./-]*", str(text)) and str(text).lower() not in _WORDS
-    return str(text) if plain else json.dumps(str(text), ensure_ascii=False)
-
-
-# Words that YAML reads as other values.
-_WORDS = ("true", "false", "yes", "no", "on", "off", "null", "y", "n", ".nan", ".inf")
+    return str(value) if isinstance(value, int) else yaml_name(value)
