@@ -31,26 +31,31 @@ def parse_change(text: str | bytes) -> dict[str, Any]:
         If the message is not valid.
     """
     message = parse_object(text)
-    kinds = _ACTIONS.get(message.get("do") if isinstance(message.get("do"), str) else None)
-    if kinds is None:
-        raise Refused(f"do: must be one of {', '.join(filter(None, _ACTIONS))}")
+    action = message.get("do")
+    if not isinstance(action, str) or action not in _ACTIONS:
+        raise Refused(f"do: must be one of {', '.join(_ACTIONS)}")
+    kinds = _ACTIONS[action]
     if set(message) != {"do", *kinds}:
-        raise Refused(f"{message['do']}: requires the keys {', '.join(kinds) or 'do'}")
+        raise Refused(f"{action}: requires the keys {', '.join(kinds) or 'do'}")
     for key, kind in kinds.items():
-        value = message[key]
-        if kind in ("number", "point"):
-            numbers = value if kind == "point" and isinstance(value, list) and len(value) == 3 else [value]
-            valid = len(numbers) == (3 if kind == "point" else 1)
-            valid = valid and all(finite(x) and abs(x) <= VALUE_MAX for x in numbers)
-        else:
-            valid = isinstance(value, bool if kind == "flag" else str)
-        if not valid:
+        if not _KINDS[kind](message[key]):
             raise Refused(f"{key}: must be a {kind}")
     return message
 
 
+def _is_number(value: Any) -> bool:
+    return finite(value) and abs(value) <= VALUE_MAX
+
+
+# Checks of the arguments of actions, by kind.
+_KINDS: dict[str, Callable[[Any], bool]] = {
+    "name": lambda value: isinstance(value, str),
+    "flag": lambda value: isinstance(value, bool),
+    "number": _is_number,
+    "point": lambda value: isinstance(value, list) and len(value) == 3 and all(map(_is_number, value)),
+}
 # Arguments of each action of the page.
-_ACTIONS: dict[str | None, dict[str, str]] = {
+_ACTIONS: dict[str, dict[str, str]] = {
     "set": {"name": "name", "value": "number"},
     "reach": {"target": "point", "braces": "flag", "orientation": "flag"},
     "snap": {"name": "name", "hand": "flag"},
