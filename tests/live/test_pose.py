@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,22 +23,9 @@ pytestmark = pytest.mark.long
 
 
 @pytest.fixture
-def posed(tmp_path: Path) -> Iterator[Callable[..., Teleop]]:
-    """Starts ``dynsim pose``; none of the processes is left running."""
-    pytest.importorskip("websockets", reason="no websockets here: pip install 'dynsim[live]'")
-    started: list[Teleop] = []
-
-    def starts(*arguments: str) -> Teleop:
-        started.append(Teleop(tmp_path / "none", *arguments, command=("pose",), writes=False))
-        return started[-1]
-
-    yield starts
-    for process in started:
-        if process.process.poll() is None:
-            process.process.kill()
-            process.process.wait()
-        if process.process.stdout is not None:
-            process.process.stdout.close()
+def posed(teleop: Callable[..., Teleop]) -> Callable[..., Teleop]:
+    """Starts ``dynsim pose``."""
+    return partial(teleop, command=("pose",), writes=False)
 
 
 def test_changes_reach_all_pages_and_ctrl_c_prints_the_keys(posed: Callable[..., Teleop], tmp_path: Path) -> None:
