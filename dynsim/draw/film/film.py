@@ -43,8 +43,8 @@ DPI = 100
 CURSOR = "#202428"
 # Number of columns of a signal that are drawn as lines (the largest by rms); a band shows the range of all columns.
 NAMED = 4
-# Minimum width of a plot with a legend next to it [pixel], and maximum length of a name in the legend.
-LEGEND_MIN, MAX_LETTERS = 400, 16
+# Maximum length of a name in the legend.
+MAX_LETTERS = 16
 # Height of a legend entry [pixel]; entries that do not fit are omitted.
 LEGEND_ROW = 14
 

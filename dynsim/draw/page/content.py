@@ -195,7 +195,6 @@ _NAMES = {
     "loss_damper": "loss in dampers",
     "loss_scheme": "loss of time stepping",
     "tip_margin": "margin against tipping",
-    "support_margin": "support margin",
 }
 
 

@@ -63,8 +63,7 @@ class Actor {
         group.add(mesh);
         mesh.userData.text = shape.text ?? "";
         const role = shape.wheel !== undefined ? "wheel" : ["hub", "pad", "load"].includes(shape.role) ? shape.role : "body";
-        const part = { mesh, material, own, role, alpha: shape.colour ? shape.colour[3] : 1, z: shape.p,
-          painted: !own && Boolean(mesh.geometry.attributes.color) };
+        const part = { mesh, material, own, role, alpha: shape.colour ? shape.colour[3] : 1, painted: !own && Boolean(mesh.geometry.attributes.color) };
         paint.push(part);
         if (role === "wheel") {
           // A mark that makes the rotation visible.

@@ -1,13 +1,13 @@
 "use strict";
 // Panel of `dynsim pose`: sliders, gaps, torques and the scenario keys of the posture. DRIVE contains the address of the
-// socket; `dynsim` is the page that shows the robot. Tests read `dynsim.pose`: last frame, number of frames, role.
+// socket; `dynsim` is the page that shows the robot. Tests read `dynsim.pose`: last frame, number of frames.
 
 const PERIOD_MS = 25, TOUCH_M = 1e-6, ROWS_NEAR = 5;
 const RED = 0xc0202a;
 
 class Pose {
   constructor() {
-    Object.assign(this, { frames: 0, last: null, sent: 0, waiting: new Map(), over: "", rows: new Map(), points: new Map(), parts: { plant: true } });
+    Object.assign(this, { frames: 0, last: null, waiting: new Map(), over: "", rows: new Map(), points: new Map(), parts: {} });
     document.head.append(D.element("style", { textContent: DRIVE.style }));
     this.socket = new WebSocket(DRIVE.socket);
     this.socket.onmessage = (event) => this.receive(JSON.parse(event.data));
