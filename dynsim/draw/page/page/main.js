@@ -11,6 +11,10 @@
 const LABELLED = 4;
 // Maximum number of contacts whose friction cones are shown at first.
 const CONES = 12;
+// Thickness of walls relative to the reach of the robot.
+const THICK = 0.03;
+// Whether a surface is a horizontal plane with its free side above.
+const flat = (s) => s.kind === "plane" && Math.abs(s.q[1]) < 1e-6 && Math.abs(s.q[2]) < 1e-6;
 
 class App {
   constructor({ head, bytes }) {
@@ -67,7 +71,6 @@ class App {
 
   // Surfaces: the floor belongs to the stage, others to each robot.
   surfaces() {
-    const flat = (s) => s.kind === "plane" && Math.abs(s.q[1]) < 1e-6 && Math.abs(s.q[2]) < 1e-6;
     // A floor is common to all variants; without it, a faint grid below everything helps to judge positions.
     const floors = this.actors.map((a) => a.data.surfaces.filter(flat).map((s) => s.p[2])), low = this.head.box[0][2];
     const common = floors[0].find((z) => floors.every((others) => others.some((other) => Math.abs(other - z) < 1e-6)));
@@ -79,7 +82,7 @@ class App {
       actor.surfaces = [];
       for (const surface of actor.data.surfaces) {
         if (flat(surface) && Math.abs(surface.p[2] - this.floor) < 1e-6) continue;
-        const made = S.surface(surface, 0.03 * actor.data.reach, this.floor);
+        const made = S.surface(surface, THICK * actor.data.reach, this.floor);
         made.receiveShadow = true;
         made.userData = { surface, normal: new THREE.Vector3(0, 0, 1).applyQuaternion(made.quaternion), rest: made.position.clone() };
         actor.surfaces.push(made);
@@ -92,7 +95,7 @@ class App {
 
   // Lowest height of a surface.
   depth(surface, actor) {
-    if (surface.kind === "plane") return surface.p[2] - (Math.abs(surface.q[1]) + Math.abs(surface.q[2]) < 1e-6 ? 0.03 * actor.data.reach : 0);
+    if (surface.kind === "plane") return surface.p[2] - (flat(surface) ? THICK * actor.data.reach : 0);
     const made = { userData: { surface }, position: new THREE.Vector3(...(surface.p ?? [0, 0, 0])), quaternion: new THREE.Quaternion(...S.xyzw(surface.q ?? [1, 0, 0, 0])) };
     return S.extent(made, M.z)[0] ?? Infinity;
   }
