@@ -160,9 +160,12 @@ def knots(time: Array, data: NDArray[Any], most: int | None = None) -> NDArray[n
         error *= 2.0
 
 
-def bounds(robots: Sequence[DrawnRobot], axes: Array = WORLD_AXES) -> tuple[Array, Array]:
-    """Return the corners, (3,) and (3,) [m], of the box along ``axes``, (3, 3), in which everything moves."""
-    pooled = moving(robots) @ axes.T
+def bounds(robots: Sequence[DrawnRobot], axes: Array = WORLD_AXES, points: Array | None = None) -> tuple[Array, Array]:
+    """Return the corners, (3,) and (3,) [m], of the box along ``axes``, (3, 3), in which everything moves.
+
+    ``points`` is the result of :func:`moving`, if it is known.
+    """
+    pooled = (moving(robots) if points is None else points) @ axes.T
     low, high = pooled.min(axis=0), pooled.max(axis=0)
     # A robot that hardly moves must not fill the window, and a flat scene needs some depth.
     span, reach = float((high - low).max()), max(robot.reach for robot in robots)
@@ -173,9 +176,10 @@ def bounds(robots: Sequence[DrawnRobot], axes: Array = WORLD_AXES) -> tuple[Arra
 
 def framed(robots: Sequence[DrawnRobot], axes: Array) -> tuple[Array, Array]:
     """Return the box along ``axes`` of everything that moves and of the surfaces next to it, as for :func:`bounds`."""
-    low, high = bounds(robots)
+    points = moving(robots)
+    low, high = bounds(robots, points=points)
     room = SURROUNDINGS * float((high - low).max())
-    corners = [np.stack(bounds(robots, axes))]
+    corners = [np.stack(bounds(robots, axes, points))]
     for surface in {surface for robot in robots for surface in robot.scene.surfaces}:
         if abs(surface.radius or 0.0) > 4.0 * room:
             continue  # only a part of it is drawn, behind the robot

@@ -33,6 +33,7 @@ from dynsim.draw.geometry.robot import (
     gripping,
     knots,
     largest_force,
+    moving,
     paths,
     penetrations,
     robot_of,
@@ -208,7 +209,8 @@ def packed(records: Mapping[str, Record], *, ghost: bool = False) -> str:
     """
     shown = robots(records)
     every = list(shown.values())
-    turn, (low, high) = azimuth(every), bounds(every)
+    turn, points = azimuth(every), moving(every)
+    low, high = bounds(every, points=points)
     blocks = Blocks()
     meshes = Meshes()
     layout = _Layout(records[name] for name in shown)
@@ -220,7 +222,7 @@ def packed(records: Mapping[str, Record], *, ghost: bool = False) -> str:
         "by": f"dynsim {__version__}",
         "ghost": ghost,
         "azimuth": turn,
-        "box": [corner.tolist() for corner in bounds(every, view_axes("top", turn))],
+        "box": [corner.tolist() for corner in bounds(every, view_axes("top", turn), points)],
         "records": parts,
         "meshes": [packed_mesh(mesh, blocks) for mesh in simplified(meshes.unique)],
         "notes": meshes.notes(),
