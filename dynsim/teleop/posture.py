@@ -621,9 +621,11 @@ class ArmPosture(StartPosture):
     def path(self) -> Any:
         """Return the path of the hand, or None."""
         hand = getattr(self.scenario.controller, "hand", None)
-        if hand is None or hand.from_start:
-            return None
-        return hand.path_in_world(BuildContext(self.scenario.duration_s))
+        return None if hand is None else hand.path_in_world(self._context())
+
+    def _context(self) -> BuildContext:
+        """Return the context in which paths begin at the hand in the present posture."""
+        return BuildContext(self.scenario.duration_s, self.model, start=self.q)
 
     def keys(self) -> dict[str, Any]:
         """Return the scenario keys of the posture: plant, path start, ``initial`` and contact points."""
@@ -655,9 +657,9 @@ class ArmPosture(StartPosture):
             if name in positions and abs(path.values[0] - positions[name]) > SAME:
                 waypoints = [float(to_key(positions[name])), *getattr(path, key)[1:]]
                 keys.setdefault("joints", {})[name] = rounded({key: waypoints})
-        if self.path() is None:
+        hand = getattr(controller, "hand", None)
+        if hand is None or hand.from_start:
             return keys
-        hand = controller.hand
         starting_at = getattr(families.member("path", hand.path.type), "starting_at", None)
         keys["hand"], off, origin = {}, self._off_path(), np.array(hand.path.origin_m)
         if np.linalg.norm(off) > hand.tolerance_m:
@@ -691,7 +693,7 @@ class ArmPosture(StartPosture):
         hand = self.scenario.controller.hand
         moved = self._controller_keys().get("hand", {}).get("path", {})
         copied = hand.model_copy(update={"path": hand.path.model_copy(update=moved)})
-        path = copied.path_in_world(BuildContext(self.scenario.duration_s))
+        path = copied.path_in_world(self._context())
         times = np.linspace(0.0, self.scenario.duration_s, PATH_SAMPLES)
         return np.round(path.position(times), 4).ravel().tolist()
 
