@@ -28,7 +28,7 @@ def simulated(name: str, variant: str | None, duration: float) -> Record:
 
 
 def faults(name: str, label: str, records: Record | Mapping[str, Record], size: float) -> list[str]:
-    """Return the faults of a figure; a figure for which the records have no data has none."""
+    """Return the faults of a figure, or an empty list if the records have no data for it."""
     try:
         return layout.faults(name, label, records, size)
     except RecordError as error:

@@ -34,7 +34,7 @@ def simulated(name: str, variant: str | None, duration: float | None) -> Record 
 
 
 def runs(name: str) -> dict[str, Record]:
-    """Return the records of all variants of a scenario; runs that stop at the start have none."""
+    """Return the records of all variants of a scenario, except runs that stop at the start."""
     records = {variant or name: simulated(name, variant, SCENARIOS[name]) for variant in variant_names(name) or [None]}
     return {variant: record for variant, record in records.items() if record is not None}
 
