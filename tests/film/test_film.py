@@ -34,6 +34,7 @@ from dynsim.record.poses import ORIENTATION, POSITION, point_positions
 from dynsim.record.quaternion import rotated
 from dynsim.record.scene import SceneSurface
 from dynsim.scenario import build_model, load_scenario
+from dynsim.system import interruption
 
 MARK = "#FF00FF"
 
@@ -633,6 +634,25 @@ def test_command(
     assert (tmp_path / "all" / "view.html").is_file()
     assert run(monkeypatch, "view", tmp_path / "all" / "b", "--no-open") == 0
     assert (tmp_path / "all" / "b" / "view.html").is_file()
+
+
+def test_a_postponed_signal_ends_a_film(braced: Record, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One that arrives while a kernel is loaded; such a film was completed, with exit code 0."""
+    original, calls = Film.frame, []
+
+    def frame(self: Film, time: float) -> Image.Image:
+        calls.append(time)
+        if len(calls) == 3:
+            interruption.keep()
+            signal.raise_signal(signal.SIGINT)
+            interruption.heed()
+        return original(self, time)
+
+    monkeypatch.setattr(Film, "frame", frame)
+    with interruption.handled(), pytest.raises(KeyboardInterrupt):
+        dynsim.film.write({"a": braced}, tmp_path / "film.gif", size=(320, 240), speed=0.1)
+    assert len(calls) == 3
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")

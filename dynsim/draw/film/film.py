@@ -23,6 +23,7 @@ from dynsim.draw.geometry.projection import FROM, View, view_axes
 from dynsim.draw.geometry.robot import Array, azimuth, bounds, framed, robots
 from dynsim.errors import RecordError
 from dynsim.record import TIME, Record
+from dynsim.system import interruption
 from dynsim.system.arguments import names_wrong_types
 from dynsim.system.files import replacing
 from dynsim.system.terminal import plain
@@ -412,6 +413,7 @@ class Film:
                     draw.line([0, y, self.size[0], y], fill=GREY)
         if self._strip is not None and (strip := self._strip.frame(time)) is not None:
             image.paste(strip, (0, self._area[3]))
+        interruption.check()  # a signal that arrived while the kernel that fills faces was loaded is postponed
         return image
 
     def frames(self, done: Callable[[int], None] = lambda count: None) -> Iterator[Image.Image]:
