@@ -21,6 +21,8 @@ from dynsim.scenario import load_scenario
 SIZES = (7.2, 3.4)
 # Texts may touch by this much [point]: the box of a text is larger than its ink.
 SLACK = 1.2
+# Minimum distance of a text from the edge of the canvas [point].
+EDGE = 1.0
 
 
 def simulated(name: str, variant: str | None, changes: Mapping[str, Any]) -> Record | None:
@@ -38,14 +40,16 @@ def faults(name: str, label: str, records: Record | Mapping[str, Record], size: 
 
 
 def layout_faults(figure: Figure) -> list[str]:
-    """Return the texts that leave the canvas, and pairs of texts that overlap.
+    """Return the texts that leave the canvas or nearly touch its edge, and pairs of texts that overlap.
 
     Only texts that are really drawn count; invisible ticks and texts outside a clip path do not.
     """
     slack = SLACK * figure.dpi / 72.0
-    canvas = Bbox.from_bounds(-slack, -slack, figure.bbox.width + 2 * slack, figure.bbox.height + 2 * slack)
+    canvas = figure.bbox.padded(-EDGE * figure.dpi / 72.0)
     boxes = [(text, text.get_window_extent()) for text in _drawn_texts(figure)]
-    faults = [f"{_name(text)} leaves the canvas" for text, box in boxes if not _inside(box, canvas)]
+    faults = [
+        f"{_name(text)} is at the edge of the canvas or beyond" for text, box in boxes if not _inside(box, canvas)
+    ]
     for (first, a), (second, b) in itertools.combinations(boxes, 2):
         across = min(a.x1, b.x1) - max(a.x0, b.x0)
         along = min(a.y1, b.y1) - max(a.y0, b.y0)

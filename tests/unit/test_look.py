@@ -12,6 +12,7 @@ from support.messages import raises
 
 import dynsim
 from dynsim.cli import main
+from dynsim.draw.figures import style
 from dynsim.draw.figures.look import Look
 from dynsim.draw.figures.style import POINTS, WIDTH, Drawing
 from dynsim.errors import RecordError
@@ -79,6 +80,33 @@ def test_font_scales_all_letters(record: Record) -> None:
     legend = figure.axes[-1].get_legend()
     assert legend is not None
     assert legend.get_texts()[0].get_fontsize() == pytest.approx(0.88 * 12.0)
+
+
+@pytest.mark.parametrize(
+    ("family", "symbols"), [("serif", "dejavuserif"), ("sans-serif", "dejavusans"), ("STIXGeneral", "stix")]
+)
+def test_symbols_match_the_font(record: Record, family: str, symbols: str) -> None:
+    label = drawn(record, "hand_path", font=family).axes[-1].xaxis.label
+    assert (label.get_family(), label.get_math_fontfamily()) == ([family], symbols)
+
+
+@pytest.mark.parametrize("kind", ["pdf", "eps"])
+def test_vector_files_have_no_fonts_of_type_3(record: Record, tmp_path: Path, kind: str) -> None:
+    figure = drawn(record)
+    figure.savefig(tmp_path / f"figure.{kind}")
+    content = (tmp_path / f"figure.{kind}").read_bytes()
+    assert b"CIDFontType2" in content or b"FontType 42" in content
+    assert b"/Type3" not in content
+    assert b"FontType 3" not in content
+
+
+@pytest.mark.parametrize("even", [False, True])
+def test_lines_are_not_wider_than_the_figure_and_keep_units(even: bool) -> None:
+    text = "WIDE AND HEAVY MASSES MMMM WWWW at 0.123 N m, 12.5 s, 3 mm and 4 kg; " * 3
+    lines = style.broken(text, 2.0, 8.0, even=even).split("\n")
+    assert " ".join(lines) == text.strip()
+    assert all(style.text_width(line, 8.0) <= 144.0 for line in lines)
+    assert not any(line.split()[0].rstrip(",;") in ("N", "s", "mm", "kg") for line in lines)
 
 
 def test_later_style_sheet_takes_precedence(record: Record, tmp_path: Path) -> None:

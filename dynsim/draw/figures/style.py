@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import textwrap
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
@@ -20,10 +20,12 @@ from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties, findfont, get_font
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.legend import Legend
 from matplotlib.lines import Line2D
 from matplotlib.text import Text
+from matplotlib.textpath import text_to_path
 from matplotlib.ticker import AutoLocator, FuncFormatter, LogFormatter, LogLocator, NullFormatter, NullLocator
 from numpy.typing import NDArray
 
@@ -69,11 +71,14 @@ _SIZES = {
 }
 # Labels of coordinates, with an italic symbol.
 _COORDINATE = re.compile(r"(height |roll |pitch |yaw )?\$(x|y|z|\\alpha|\\beta|\\gamma)\$( \[(m|mm|rad|mrad|°)\])?")
+# Space between the edge of a figure, and its title and notes [inch].
+EDGE = 0.07
+# Space between a number and its unit, at which a line is not broken.
+_UNIT = re.compile(r"(\d) (?=(?:[mk]?[smgNWJAV]|mm|N m|kg|rad|Hz|°|%)(?!\w))")
 # Mean width of a letter as a multiple of its size, for the breaking of long lines.
 LETTER = 0.56
 DPI = 170
 _LOOK: Any = {
-    "mathtext.fontset": "dejavusans",
     "lines.linewidth": 1.2,
     "lines.solid_capstyle": "round",
     "axes.linewidth": 0.6,
@@ -120,9 +125,7 @@ def look(wanted: Look | None = None) -> Iterator[None]:
     wanted = wanted or Look()
     with matplotlib.rc_context():
         _apply_styles(wanted.styles)
-        now: Any = matplotlib.rcParams
-        default: Any = matplotlib.rcParamsDefault
-        changed = {key for key in (*_LOOK, *_SIZES, "font.size") if now[key] != default[key]}
+        changed = _changed((*_LOOK, *_SIZES, "font.size", "mathtext.fontset"))
         points = wanted.points or (matplotlib.rcParams["font.size"] if "font.size" in changed else POINTS)
         settings: Any = {**_LOOK, **{key: points * share for key, share in _SIZES.items()}}
         matplotlib.rcParams.update({key: value for key, value in settings.items() if key not in changed})
@@ -130,11 +133,31 @@ def look(wanted: Look | None = None) -> Iterator[None]:
         if wanted.family is not None:
             _check_family(wanted.family)
             matplotlib.rcParams["font.family"] = [wanted.family]
+        if "mathtext.fontset" not in changed:
+            matplotlib.rcParams["mathtext.fontset"] = _math_font()
         token = _drawn.set(wanted)
         try:
             yield
         finally:
             _drawn.reset(token)
+
+
+def _changed(keys: Iterable[str]) -> set[str]:
+    """Return the settings of matplotlib that differ from its defaults."""
+    now: Any = matplotlib.rcParams
+    default: Any = matplotlib.rcParamsDefault
+    return {key for key in keys if now[key] != default[key]}
+
+
+def _math_font() -> Any:
+    """Return matplotlib's font for symbols that is most like the font of the texts."""
+    name = get_font(findfont(FontProperties())).family_name
+    if name.startswith("DejaVu"):
+        return "dejavuserif" if "Serif" in name else "dejavusans"
+    if name.startswith(("CMU", "cmr", "Computer Modern", "Latin Modern", "LM")):
+        return "cm"
+    serif = name in matplotlib.rcParamsDefault["font.serif"] or re.search("STIXG|Times|Roman|Serif|Tinos", name)
+    return "stix" if serif else "stixsans"
 
 
 def _apply_styles(sheets: Sequence[str]) -> None:
@@ -151,10 +174,8 @@ def _apply_styles(sheets: Sequence[str]) -> None:
 
 
 def _check_family(family: str) -> None:
-    from matplotlib.font_manager import FontProperties, findfont
-
     try:
-        findfont(FontProperties(family=family), fallback_to_default=False)
+        findfont(FontProperties(family=[family]), fallback_to_default=False)
     except ValueError as error:
         raise RecordError(
             f"font {family!r}: this machine has no such font; try serif, sans-serif, or its name"
@@ -190,11 +211,30 @@ def _size(key: str) -> float:
     return float(size) if isinstance(size, int | float) else letters(_SIZES[key] * POINTS)
 
 
-def broken(text: str, across: float | None = None, points: float | None = None) -> str:
-    """Break a text into lines that fit in ``across`` [inch] (default: the figure), with letters of a size [point]."""
+def broken(text: str, across: float | None = None, points: float | None = None, *, even: bool = False) -> str:
+    """Break a text into lines that fit in ``across`` [inch] (default: the figure), with letters of a size [point].
+
+    If ``even``, the lines are about equally long. A line may have a dozen letters in any case.
+    """
     size = letters(POINTS) if points is None else points
-    count = max(int(72.0 * (width() if across is None else across) / (LETTER * size)), 12)
-    return "\n".join(textwrap.fill(part, count) for part in text.split("\n"))
+    room = 72.0 * (width() if across is None else across)
+    return "\n".join(_filled(part, room, size, even) for part in text.split("\n"))
+
+
+def _filled(text: str, room: float, size: float, even: bool) -> str:
+    count, text = max(int(room / (LETTER * size)), 12), _UNIT.sub("\\1\u00a0", text)
+    lines = textwrap.wrap(text, count)
+    while count > 12 and any(text_width(line, size) > room for line in lines):
+        count -= 1
+        lines = textwrap.wrap(text, count)
+    while even and count > 12 and len(shorter := textwrap.wrap(text, count - 1)) == len(lines):
+        count, lines = count - 1, shorter
+    return "\n".join(lines).replace("\u00a0", " ")
+
+
+def text_width(text: str, size: float) -> float:
+    """Return the width of a line of text [point], with letters of a size [point]."""
+    return float(text_to_path.get_text_width_height_descent(text, FontProperties(size=size), ismath=False)[0])
 
 
 class Drawing(Figure):
@@ -232,9 +272,9 @@ class Drawing(Figure):
         if self._note is not None:
             before = self._note.get_text()
             self._note.remove()
-        text = broken(self.caption, self.get_figwidth() - 0.15, size)
+        text = broken(self.caption, self.get_figwidth() - 2.0 * EDGE, size)
         look: Any = {"fontsize": size, "color": NOTE, "ha": "left", "va": "bottom", "in_layout": False}
-        self._note = self.text(0.07 / self.get_figwidth(), 0.0, text, **look)
+        self._note = self.text(EDGE / self.get_figwidth(), 0.0, text, **look)
         self.grow(1.25 * size * (_lines(text) - _lines(before)))
 
     def put_below(self, entries: Mapping[str, Any], columns: int, *, last: bool = False) -> None:
@@ -257,6 +297,12 @@ class Drawing(Figure):
         if self.grows:
             self.set_figheight(self.get_figheight() + points / 72.0)
 
+    def savefig(self, fname: Any, **options: Any) -> None:
+        """Write the figure; PDF and EPS files contain TrueType fonts, because journals reject fonts of type 3."""
+        fonts: Any = {"pdf.fonttype": 42, "ps.fonttype": 42}
+        with matplotlib.rc_context({key: fonts[key] for key in fonts.keys() - _changed(fonts)}):
+            super().savefig(fname, **options)
+
     def draw(self, renderer: Any) -> None:
         """Draw the figure, with notes at its lower edge, the legend above them, and the axes in the space above.
 
@@ -278,9 +324,9 @@ class Drawing(Figure):
         if isinstance(engine, ConstrainedLayoutEngine):
             share = min(used / self.bbox.height, 0.8)
             engine.set(rect=(0.0, share, 1.0, 1.0 - share))
-        # With ticks that depend on the height, the layout may alternate between two heights, and cut labels off.
-        vertical = [(axes.yaxis, axes.yaxis.get_major_locator()) for axes in self.axes]
-        automatic = [(axis, locator) for axis, locator in vertical if isinstance(locator, AutoLocator)]
+        # With ticks that depend on the size of the axes, the layout may alternate between two sizes, and cut labels.
+        both = [axis for axes in self.axes for axis in (axes.xaxis, axes.yaxis)]
+        automatic = [(axis, ticks) for axis in both if isinstance(ticks := axis.get_major_locator(), AutoLocator)]
         for axis, locator in automatic:
             locator.set_params(nbins=int(np.clip(0.85 * axis.get_tick_space(), 1, 9)))
         with warnings.catch_warnings(record=True) as caught:
@@ -324,7 +370,7 @@ def new_figure(height: float, title: str, *, page: float = WIDTH) -> Drawing:
     FigureCanvasAgg(figure)
     if wanted.title and title:
         size = _size("figure.titlesize")
-        text = broken(title, wide, size)
+        text = broken(title, wide - 2.0 * EDGE, size, even=True)
         figure.suptitle(text, fontsize=size)
         figure.grow(1.2 * size * (_lines(text) - 1))
     return figure
@@ -518,7 +564,7 @@ def fitted_legend(labels: Sequence[str], columns: int) -> tuple[list[str], int, 
     handle = (matplotlib.rcParams["legend.handlelength"] + 2.8) * size
     available = 72.0 * 0.97 * width()
     lines = [broken(label, (available - handle) / 72.0, size) for label in labels]
-    widest = max((len(line) for label in lines for line in label.split("\n")), default=1) * LETTER * size + handle
+    widest = max((text_width(line, size) for label in lines for line in label.split("\n")), default=0.0) + handle
     columns = max(1, min(columns, len(lines), int(available // widest)))
     # A legend is filled column by column, and its rows are as high as their highest label.
     per_column = -(-len(lines) // columns)
