@@ -95,6 +95,8 @@ FontOption = Annotated[
 StyleOption = Annotated[
     str | None, option("SHEETS", "Matplotlib style sheets of the figures: files or names, comma-separated.")
 ]
+NoTitleOption = Annotated[bool, typer.Option("--no-title", help="Omit the titles of the figures.")]
+NoCaptionOption = Annotated[bool, typer.Option("--no-caption", help="Omit the notes below the axes of the figures.")]
 FormatOption = Annotated[FigureFormat, typer.Option("--format", help="File format of the figures.")]
 
 

@@ -15,6 +15,8 @@ from dynsim.cli.app import (
     FiguresOption,
     FontOption,
     FormatOption,
+    NoCaptionOption,
+    NoTitleOption,
     QuietOption,
     RecordsArgument,
     Rows,
@@ -136,6 +138,8 @@ def compare(
     size: SizeOption = None,
     font: FontOption = None,
     style: StyleOption = None,
+    no_title: NoTitleOption = False,
+    no_caption: NoCaptionOption = False,
     rows: RowsOption = Rows.screen,
     quiet: QuietOption = False,
 ) -> None:
@@ -145,7 +149,7 @@ def compare(
     from dynsim.scenario import load_scenario, variant_names
     from dynsim.system.files import check_writable, discard
 
-    look = Look.of(size, font, style)
+    look = Look.of(size, font, style, title=not no_title, caption=not no_caption)
     values = parsed_overrides(overrides)
     loaded = [load_scenario(scenario, name, values) for name in variant_names(scenario)]
     folder = out or Path("results", loaded[0].name if loaded else "")
@@ -276,8 +280,8 @@ def plot(
     size: SizeOption = None,
     font: FontOption = None,
     style: StyleOption = None,
-    no_title: Annotated[bool, typer.Option("--no-title", help="Omit the titles.")] = False,
-    no_caption: Annotated[bool, typer.Option("--no-caption", help="Omit the notes below the axes.")] = False,
+    no_title: NoTitleOption = False,
+    no_caption: NoCaptionOption = False,
     trust: TrustOption = False,
 ) -> None:
     """Draw the figures of one record, or of several records and their overlay."""

@@ -29,8 +29,11 @@ _WARNINGS, _LEAST = 0.3, 3
 _HEADER = 14
 # Fraction of equal words above which two warnings are of the same kind.
 _ALIKE = 0.5
+# Words with numbers, and names with digits or underscores.
+_NUMBERED = re.compile(r"\S*[\d_]\S*")
 # Maximum number of variants that a warning names.
 _NAMED = 3
+_HIDDEN = "whole warnings: --rows all"
 
 
 def print_summary(console: Console, summary: Summary, every: bool = False) -> None:
@@ -56,14 +59,19 @@ def _print(console: Console, title: str, summaries: Mapping[str, Summary], every
         return
     width, height = screen.size(console)
     folded = rows_of(runs, folded=True)
-    kinds = _kinds_of_warnings(summaries)
-    grouped, short = _grouped(kinds, len(runs)), _grouped(kinds, len(runs), width)
-    forms = ((rows, warnings), (rows, grouped), (rows, short), (folded, grouped), (folded, short))
+    texts = {name: summary.get("warnings", ()) for name, summary in summaries.items()}
+    grouped = grouped_warnings(texts)
+    # In a file or a pipe, no text is cut.
+    pipe = screen.is_unbounded(console)
+    short = grouped if pipe else grouped_warnings(texts, width)
+    hidden = [_HIDDEN] * (len(warnings) > len(grouped))
+    cut = [_HIDDEN] * (short != grouped or bool(hidden))
+    forms = ((rows, warnings), *((r, [*w, *h]) for r in (rows, folded) for w, h in ((grouped, hidden), (short, cut))))
     parts: list[RenderableType]
-    for shown, texts in forms:
+    for shown, lines in forms:
         different, equal = _without_equal(shown)
         tables = _side_by_side(title, names, different, width)
-        parts = [*tables, *equal, *texts]
+        parts = [*tables, *equal, *lines]
         # Do not render long tables to count their lines.
         if sum(table.row_count for table in tables) < height and screen.lines(console, parts) <= height:
             screen.show(console, parts)
@@ -71,9 +79,8 @@ def _print(console: Console, title: str, summaries: Mapping[str, Summary], every
     # The rows of contacts would make this line too long.
     equal = _without_equal([row for row in folded if not row.owner])[1]
     most = max(_LEAST, min(int(_WARNINGS * height), height - len(names) - _HEADER))
-    if len(short) > most:
-        short[most - 1 :] = [f"… and {len(short) - most + 1} more kinds of warnings"]
-    parts = [*equal, "other rows: --rows all; all numbers: comparison.csv or summary.json", *short]
+    short = short if pipe else limited_warnings(short, most)
+    parts = [*equal, "other rows and whole warnings: --rows all; all numbers: comparison.csv or summary.json", *short]
     table = _chief(console, title, names, different, width, height - screen.lines(console, parts))
     screen.show(console, [table, *parts])
 
@@ -139,33 +146,48 @@ def _warnings(summaries: Mapping[str, Summary]) -> list[str]:
     return [warning_text(warning, ", ".join(names)) for warning, names in variants.items()]
 
 
-def _kinds_of_warnings(summaries: Mapping[str, Summary]) -> list[list[tuple[str, str]]]:
-    """Return the variants and warnings of each kind, the kind with most variants first."""
+def grouped_warnings(
+    warnings: Mapping[str, Sequence[str]], width: int | None = None, runs: str = "variants"
+) -> list[str]:
+    """Return a warning of each kind, the most frequent kind first, with its runs and the number of such warnings.
+
+    Parameters
+    ----------
+    warnings : mapping of str to sequence of str
+        Names of the runs, and their warnings.
+    width : int, optional
+        Number of characters to which each line is cut; default: whole lines.
+    runs : str, optional
+        Plural noun for the runs.
+    """
     groups: list[list[tuple[str, str]]] = []
-    for name, summary in summaries.items():
-        for warning in summary.get("warnings", ()):
-            group = next((group for group in groups if _alike(warning, group[0][1])), [])
-            if not group:
-                groups.append(group)
-            group.append((name, warning))
-    return sorted(groups, key=lambda group: -len({name for name, _ in group}))
-
-
-def _grouped(kinds: Sequence[Sequence[tuple[str, str]]], variants: int, width: int | None = None) -> list[str]:
-    """Return the first warning of each kind, with its variants and the number of such warnings, cut to ``width``."""
-    texts = []
-    for group in kinds:
+    known: dict[str, list[tuple[str, str]]] = {}
+    for name, text in ((name, text) for name, own in warnings.items() for text in own):
+        words = _NUMBERED.sub("", text)
+        if words not in known:
+            group = next((group for group in groups if _alike(words, _NUMBERED.sub("", group[0][1]))), None)
+            if group is None:
+                groups.append(group := [])
+            known[words] = group
+        known[words].append((name, text))
+    lines = []
+    for group in sorted(groups, key=lambda group: -len({name for name, _ in group})):
         names = list(dict.fromkeys(name for name, _ in group))
-        several = f"{len(names)} of {variants} variants" if len(names) > _NAMED else ", ".join(names)
+        several = f"{len(names)} of {len(warnings)} {runs}" if len(names) > _NAMED else ", ".join(names)
         times = f" (the first of {len(group)})" if len(group) > 1 else ""
-        text = Text.from_markup(warning_text(group[0][1], several))
+        line = Text.from_markup(warning_text(group[0][1], several))
         if width is not None:
-            text.truncate(width - len(times), overflow="ellipsis")
-        texts.append(text.markup + times)
-    return texts
+            line.truncate(width - len(times), overflow="ellipsis")
+        lines.append(line.markup + times)
+    return lines
 
 
-def _alike(*warnings: str) -> bool:
-    """Return whether two warnings are equal in most words, without numbers and names with digits or underscores."""
-    a, b = (re.sub(r"\S*[\d_]\S*", "", warning).split() for warning in warnings)
-    return SequenceMatcher(None, a, b).ratio() > _ALIKE
+def limited_warnings(lines: Sequence[str], most: int) -> list[str]:
+    """Return at most so many lines of grouped warnings."""
+    more = len(lines) - most + 1
+    return [*lines] if more < 2 else [*lines[: most - 1], f"… and {more} more kinds of warnings"]
+
+
+def _alike(first: str, second: str) -> bool:
+    """Return whether two warnings without numbers are equal in most words."""
+    return SequenceMatcher(None, first.split(), second.split()).ratio() > _ALIKE

@@ -13,6 +13,8 @@ from dynsim.cli.app import (
     FiguresOption,
     FontOption,
     FormatOption,
+    NoCaptionOption,
+    NoTitleOption,
     QuietOption,
     ScenarioArgument,
     SetOption,
@@ -80,6 +82,8 @@ def plan(
     size: SizeOption = None,
     font: FontOption = None,
     style: StyleOption = None,
+    no_title: NoTitleOption = False,
+    no_caption: NoCaptionOption = False,
     quiet: QuietOption = False,
 ) -> None:
     """Find where an arm should brace: points, surfaces, posture along the hand path, contact forces and gains.
@@ -91,7 +95,7 @@ def plan(
     from dynsim.draw.figures.look import Look
     from dynsim.scenario import load_scenario
 
-    look = Look.of(size, font, style)
+    look = Look.of(size, font, style, title=not no_title, caption=not no_caption)
     loaded = load_scenario(scenario, variant, parsed_overrides(overrides))
     folder = out or Path("results", loaded.name, loaded.variant, "plan")
     least, most = _numbers(count)

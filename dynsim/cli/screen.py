@@ -21,11 +21,15 @@ AFTER = 2
 PADDING, EDGES = 3, 4
 
 
+def is_unbounded(console: Console) -> bool:
+    """Return whether the output is a file or a pipe of unknown width."""
+    return isinstance(console, Terminal) and console.unbounded
+
+
 def size(console: Console) -> tuple[int, int]:
     """Return the columns and lines that a table may use: those of the terminal, with at least 40 lines."""
-    unbounded = isinstance(console, Terminal) and console.unbounded
     height = max(LINES, console.height if console.is_terminal else 0)
-    return COLUMNS if unbounded else console.width, height - AFTER
+    return COLUMNS if is_unbounded(console) else console.width, height - AFTER
 
 
 def lines(console: Console, parts: Sequence[RenderableType]) -> int:

@@ -16,6 +16,8 @@ from dynsim.cli.app import (
     FiguresOption,
     FontOption,
     FormatOption,
+    NoCaptionOption,
+    NoTitleOption,
     QuietOption,
     ScenarioArgument,
     SetOption,
@@ -25,7 +27,9 @@ from dynsim.cli.app import (
     option,
     parsed_overrides,
 )
+from dynsim.cli.comparison import grouped_warnings, limited_warnings
 from dynsim.cli.output import console, drawing, errors, print_line, print_warning, sweep_progress
+from dynsim.cli.tables import without_rounding
 from dynsim.errors import ScenarioError, SimulationStopped
 from dynsim.system.terminal import escaped, escaped_line
 
@@ -38,6 +42,8 @@ if TYPE_CHECKING:
 
 # Number of failed runs whose reasons are printed.
 _SHOWN = 5
+# Maximum number of lines of warnings on a screen.
+_KINDS = 10
 
 
 class KeepRecords(StrEnum):
@@ -90,6 +96,8 @@ def sweep(
     size: SizeOption = None,
     font: FontOption = None,
     style: StyleOption = None,
+    no_title: NoTitleOption = False,
+    no_caption: NoCaptionOption = False,
     quiet: QuietOption = False,
 ) -> None:
     """Simulate a scenario over a grid of values, random samples, or both; write a table of all runs and figures.
@@ -104,7 +112,7 @@ def sweep(
         raise ScenarioError(
             "--jobs (processes on this machine) and --scheduler (workers of a cluster) conflict; use one of them"
         )
-    look = Look.of(size, font, style)
+    look = Look.of(size, font, style, title=not no_title, caption=not no_caption)
     if plot and no_figures:
         raise ScenarioError("--plot and --no-figures conflict; use one of them")
     from dynsim.scenario import read_scenario
@@ -152,8 +160,9 @@ def sweep(
 
 
 def _print_table(name: str, rows: Sequence[SweepRow], plan: Plan, plotted: Sequence[str]) -> None:
-    """Print the varied values and the results of all runs, or of the first runs and the first keys that fit."""
+    """Print values and results of all runs, or of the first runs and the first keys that fit, and grouped warnings."""
     from dynsim.record.quantities import ENERGY, ERRORS, summary_quantity
+    from dynsim.studies.sweep import TABLES
 
     varied = _varied(plan)
     numbers = {key for row in rows for key in row.numbers}
@@ -163,9 +172,16 @@ def _print_table(name: str, rows: Sequence[SweepRow], plan: Plan, plotted: Seque
     if any(row.variant is not None for row in rows):
         columns.append(("variant", [escaped_line(row.variant) for row in rows]))
     columns += [_column(varied[axis.key], [row.values[axis.key] for row in rows]) for axis in plan.grid]
-    columns += [_column(results[key], [row.numbers.get(key) for row in rows]) for key in results]
+    columns += [_column(results[key], [row.numbers.get(key) for row in rows], unit=1.0) for key in results]
     columns += [_column(varied[key], [row.values[key] for row in rows]) for key in plan.sampled]
-    console.print(screen.listing(console, name, columns, screen.size(console)[1] - _SHOWN - 1), highlight=False)
+    width, height = screen.size(console)
+    warnings = {f"run {row.run}": [*filter(None, row.warnings.split("\n"))] for row in rows}
+    lines = grouped_warnings(warnings, runs="runs")
+    if not screen.is_unbounded(console):
+        lines = limited_warnings(grouped_warnings(warnings, width, runs="runs"), _KINDS)
+    if lines:
+        lines.append(f"whole warnings of each run: {TABLES[0]}")
+    screen.show(console, [screen.listing(console, name, columns, height - _SHOWN - 1 - len(lines)), *lines])
 
 
 def _varied(plan: Plan) -> dict[str, Quantity]:
@@ -176,8 +192,9 @@ def _varied(plan: Plan) -> dict[str, Quantity]:
     return {key: quantity(key, scenario) for key in plan.parameters}
 
 
-def _column(described: Quantity, values: Sequence[Any]) -> tuple[str, list[str]]:
-    """Return heading and cells of a column of the table; a failed run has no results."""
+def _column(described: Quantity, values: Sequence[Any], unit: float = 0.0) -> tuple[str, list[str]]:
+    """Return heading and cells of a column, with 0 for rounding errors next to its values or ``unit``."""
+    values = without_rounding(values, unit)
     described = described.fitted(values)
     cells = [
         "–" if value is None

@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 
 Summary = Mapping[str, Any]
 
-# Energies below this fraction of the energy turnover, and coordinates below this value [m], count as rounding errors.
+# Energies below this fraction of the energy turnover, other numbers below this fraction of the largest in the row, and
+# numbers in SI units below this value count as rounding errors.
 ROUNDING = 1e-12
 
 
@@ -33,7 +34,19 @@ def _format(value: float, form: str) -> str:
 
 
 def _number(value: Any, scale: float = 1.0, digits: int = 4) -> str:
-    return "–" if value is None else _format(value * scale, f".{digits}g")
+    return "–" if value is None else _format(_without_rounding(value) * scale, f".{digits}g")
+
+
+def _without_rounding(value: float, largest: float = 1.0) -> float:
+    """Return a number in SI units, or 0 if it is a rounding error next to the largest one."""
+    return 0.0 if abs(value) <= ROUNDING * largest else value
+
+
+def without_rounding(values: Sequence[Any], unit: float = 0.0) -> list[Any]:
+    """Return the values of one quantity, with 0 for rounding errors next to the largest number or ``unit``."""
+    sizes = [abs(value) for value in values if isinstance(value, float) and math.isfinite(value)]
+    largest = max([*sizes, unit])
+    return [_without_rounding(value, largest) if isinstance(value, float) else value for value in values]
 
 
 def _deepest(summary: Summary) -> str | None:
@@ -75,7 +88,8 @@ def _worst_joint(motor: Summary) -> str:
 
 
 def _loaded(rms: float, nominal: float) -> str:
-    return f"[bold red]{rms:.3g}[/]" if rms > nominal else f"{rms:.3g}"
+    text = _format(_without_rounding(rms, min(nominal, 1.0)), ".3g")
+    return f"[bold red]{text}[/]" if rms > nominal else text
 
 
 def _short(value: Any) -> str:
@@ -166,6 +180,7 @@ def rows_of(summaries: Sequence[Summary], folded: bool = False) -> list[SummaryR
     for key, read, show, heading in _ROWS:
         values = [read(summary, key) for summary in summaries]
         if any(value is not None for value in values):
+            values = values if show is _exponent else without_rounding(values)
             quantity = summary_quantity(key).fitted(values)
             scaled = [value * quantity.scale if isinstance(value, float) else value for value in values]
             cells = ["–" if value is None else show(value) for value in scaled]
@@ -252,7 +267,7 @@ def print_starts(console: Console, starts: Mapping[str, Start]) -> None:
     for variant, start in starts.items():
         values = {"hand": f"{_coordinates(start.hand)}"}
         values |= {f"contact {name}": f"{_coordinates(point)}" for name, point in start.contacts.items()}
-        values |= {f"gap of {name}": f"{gap:+.4g} m" for name, gap in start.gaps.items()}
+        values |= {f"gap of {name}": f"{_format(_without_rounding(gap), '+.4g')} m" for name, gap in start.gaps.items()}
         for joint, (to, was, unit) in start.solved.items():
             values[joint] = f"{to!r} {unit}, set by `initial`; was {was:.6g}"
         for joint, (at, unit) in start.nearest.items():

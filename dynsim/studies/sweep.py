@@ -86,7 +86,7 @@ class SweepRow(SweepPoint):
     numbers : mapping of str to float
         Numbers in the summary of the run, see :func:`dynsim.studies.sweep.numbers`.
     warnings : str
-        Warnings in the summary of the run, in one line.
+        Warnings in the summary of the run, one per line.
     """
 
     status: str
@@ -98,7 +98,7 @@ class SweepRow(SweepPoint):
     def of(cls, point: SweepPoint, result: RunResult) -> SweepRow:
         """Create the row of a result."""
         status = OK if result.ok else LOST if result.lost else FAILED
-        warnings = "; ".join(result.summary.get("warnings", ()))
+        warnings = "\n".join(result.summary.get("warnings", ()))
         return cls(
             **vars(point), status=status, reason=result.reason, numbers=numbers(result.summary), warnings=warnings
         )
@@ -139,7 +139,14 @@ class SweepRow(SweepPoint):
         """Return the cells of the row by column."""
         variant = {} if self.variant is None else {"variant": self.variant}
         ended = {"status": self.status, "reason": self.reason}
-        return {"run": self.run, **variant, **self.values, **ended, **self.numbers, "warnings": self.warnings}
+        return {
+            "run": self.run,
+            **variant,
+            **self.values,
+            **ended,
+            **self.numbers,
+            "warnings": self.warnings.replace("\n", "; "),
+        }
 
 
 class SweepJournal:

@@ -40,12 +40,13 @@ def faults(name: str, label: str, records: Record | Mapping[str, Record], size: 
 
 
 def layout_faults(figure: Figure) -> list[str]:
-    """Return the texts that leave the canvas or nearly touch its edge, and pairs of texts that overlap.
+    """Return texts at the edge of the canvas or beyond, pairs of texts that overlap, and the lack of a caption.
 
     Only texts that are really drawn count; invisible ticks and texts outside a clip path do not.
     """
     slack = SLACK * figure.dpi / 72.0
     canvas = figure.bbox.padded(-EDGE * figure.dpi / 72.0)
+    faults = [] if getattr(figure, "caption", "") else ["the figure has no caption"]
     boxes = [(text, text.get_window_extent()) for text in _drawn_texts(figure)]
     faults = [
         f"{_name(text)} is at the edge of the canvas or beyond" for text, box in boxes if not _inside(box, canvas)

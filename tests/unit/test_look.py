@@ -128,6 +128,14 @@ def test_caption_has_the_notes_even_if_they_are_not_drawn(record: Record) -> Non
     assert figures[0].get_figheight() > figures[1].get_figheight()
 
 
+def test_caption_names_subject_run_and_axes(record: Record) -> None:
+    assert drawn(record).caption.splitlines()[0] == (
+        "Tracking error (elbow_comparison / two_elbows): hand − target [mm], distance from target [mm] over time [s]."
+    )
+    path = drawn(record, "hand_path", title=False).caption
+    assert path == "Hand path (elbow_comparison / two_elbows): y [m], z [m] over x [m]; z [m] over y [m]."
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [

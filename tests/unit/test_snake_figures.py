@@ -224,7 +224,7 @@ def test_exact_runs_have_a_note_next_to_errors_on_a_logarithmic_axis(record):
     late = copy.deepcopy(record)
     late["position_error"][:] = np.geomspace(0.05, 5e-5, len(record))
     assert mentions(figures.comparison({"exact": record, "late": late}).caption, "1 of 2 variants")
-    assert not figures.comparison({"one": record, "two": record}).caption
+    assert not figures.comparison({"one": record, "two": record}).notes
 
 
 def test_a_joint_that_is_never_straightened_has_no_time(simulated):

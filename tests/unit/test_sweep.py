@@ -802,8 +802,8 @@ def test_runs_that_failed_are_counted_and_not_drawn(monkeypatch: pytest.MonkeyPa
     (table,) = seen
     assert [row["duration_s"] for row in table.rows] == [1, 2, 3]
     assert [bool(numbers.keys() & row.keys()) for row in table.rows] == [True, False, True]
-    assert table.figure(1.0, "all").caption == "1 of 3 runs failed."
-    assert replace(table, rows=[table.rows[0], table.rows[2]]).figure(1.0, "all").caption == ""
+    assert table.figure(1.0, "all").notes == "1 of 3 runs failed."
+    assert replace(table, rows=[table.rows[0], table.rows[2]]).figure(1.0, "all").notes == ""
     # The place stays, without a point.
     drawn = pictures.lines(table)
     assert drawn is not None

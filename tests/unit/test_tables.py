@@ -87,6 +87,18 @@ def test_zeros_print_as_zeros() -> None:
     assert numbers == ["arm", "0", "0", "3e-10", "0", "0", "0", "0.00", "0.00", "0"]
 
 
+def test_rounding_errors_next_to_other_runs_and_ratings_are_zero() -> None:
+    motor = {"joint": "joint_1", "current_rms_A": 1e-12, "nominal_current_A": 4.0}
+    summaries = {
+        "rest": {"scenario": "arm", "hand_error_rms_m": -3.469e-17, "cost_final": 1e-11, "motors": [motor]},
+        "moves": {"scenario": "arm", "hand_error_rms_m": 0.0, "cost_final": 40.0},
+    }
+    text = shown(summaries)
+    for row, cells in (("cost", ["0", "40"]), ("joint_1", ["0", "of", "4", "–"])):
+        (line,) = lines_with(text, re.compile(rf"(?i){row}"))
+        assert line.split()[-len(cells) :] == cells
+
+
 def test_battery_and_worst_joint_have_rows() -> None:
     worst = {"joint": "psi2", "torque_rms_N_m": 3.172, "nominal_torque_N_m": 1.68, "stall_torque_N_m": 8.4}
     summary = {"scenario": "one", "variant": "", "battery_energy_Wh": 0.082754, "worst_joint": worst}
@@ -203,6 +215,19 @@ def test_warnings_of_a_kind_are_grouped_with_their_number_and_variants() -> None
     text = shown({f"v{k}": snake(k) for k in range(1, 19)})
     assert lines_with(text, "9 of 18 variants: wheel1: slips for 2 % of the run (the first of 27)")
     assert lines_with(text, "9 of 18 variants: the head sags; lift it (the first of 9)")
+
+
+def test_long_warnings_are_whole_in_pipes_and_else_refer_to_all_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("COLUMNS", raising=False)
+    end = "so that this sentence is much wider than any screen, and ends with a remedy"
+    runs = {f"v{k}": {**snake(k), "warnings": [f"wheel{i} slips for {k} s, {end}" for i in (1, 2)]} for k in range(30)}
+    for summaries in (runs, {"v1": runs["v1"]}):
+        piped, narrow = shown(summaries), shown(summaries, width=100)
+        assert lines_with(piped, end)
+        assert not lines_with(narrow, end)
+        assert lines_with(piped, "whole warnings: --rows all")
+        assert lines_with(narrow, "whole warnings: --rows all")
+        assert not lines_with(shown(summaries, every=True), "--rows")
 
 
 def test_impact_losses_that_are_rounding_are_zero(beyond: Record) -> None:

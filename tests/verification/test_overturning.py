@@ -367,6 +367,24 @@ def test_it_tips_when_an_independent_margin_is_zero_and_goes_on_as_if_held(tmp_p
     assert base["traction_demand_max"] == np.nanmax(record["traction_demand"])
 
 
+def test_margin_of_a_base_without_total_load_is_that_of_a_lifted_base(tmp_path):
+    """Loads that cancel up to rounding have no centre of pressure; their quotient would be a margin of −1e15."""
+    forces = enumerate((-0.1, -0.2, 0.3))
+    loads = "".join(
+        f"  push_{k}: {{type: samples, body: base, point_m: [{0.1 * k}, {0.05 * k}, 0.1], times_s: [0, 1],"
+        f" force_N: [[0, 0, {force}], [0, 0, {force}]]}}\n"
+        for k, force in forces
+    )
+    record = dynsim.simulate(read(tmp_path, SWINGING, f"loads:\n{loads}", gravity="[0, 0, 0]", duration_s=0.02))
+    total, largest = record["wheel_load"].sum(axis=1), np.abs(record["wheel_load"]).max()
+    assert largest > 0.1
+    assert (0.0 < total).all()
+    assert (total < 1e-15).all()
+    assert (record["tip_margin"] == -1.0).all()
+    assert np.isnan(record["center_of_pressure"]).all()
+    assert record.summary["base"]["tip_margin_min"] == record.summary["base"]["tip_margin_min_settled"] == -1.0
+
+
 def test_a_run_that_is_to_stop_where_it_tips_ends_there_with_all_that_it_has(tmp_path):
     scenario = read(tmp_path, SWINGING, TIPPING, overturn="stop")
     goes_on = dynsim.simulate(read(tmp_path, SWINGING, TIPPING))

@@ -124,7 +124,8 @@ def figure(
     title : bool, optional
         Whether the figure has a title; use False for figures with a caption.
     caption : bool, optional
-        Whether notes are drawn below the axes; the attribute ``caption`` of the figure has their text in any case.
+        Whether notes are drawn below the axes; the attribute ``caption`` of the figure describes the figure and
+        has their text in any case.
     size : float, tuple of float or str, optional
         Width, or width and height [inch], such as 3.4, (3.4, 2.4) or "86mm". Default: 7.2 inches, and the height that
         the contents require. Figures below 5 inches have their panels below each other.

@@ -73,6 +73,7 @@ _SIZES = {
 _COORDINATE = re.compile(r"(height |roll |pitch |yaw )?\$(x|y|z|\\alpha|\\beta|\\gamma)\$( \[(m|mm|rad|mrad|°)\])?")
 # Space between the edge of a figure, and its title and notes [inch].
 EDGE = 0.07
+_GREEK = {"alpha": "α", "beta": "β", "gamma": "γ"}
 # Space between a number and its unit, at which a line is not broken.
 _UNIT = re.compile(r"(\d) (?=(?:[mk]?[smgNWJAV]|mm|N m|kg|rad|Hz|°|%)(?!\w))")
 # Mean width of a letter as a multiple of its size, for the breaking of long lines.
@@ -242,16 +243,17 @@ class Drawing(Figure):
 
     Attributes
     ----------
-    caption : str
-        The notes, one per line: what dashes mean, what was cut off. For the caption of a paper. They are drawn if the
-        look has a caption.
+    subject : str
+        Title, even if it is not drawn.
+    notes : str
+        Notes, one per line: what dashes mean, what was cut off. They are drawn if the look has a caption.
     grows : bool
         Whether lines of title, legend and notes make the figure higher; False if the user set its height.
     needed : float
         Height that the contents require [inch].
     """
 
-    caption = ""
+    subject = notes = ""
     grows = True
     needed = 0.0
     _note: Text | None = None
@@ -262,17 +264,39 @@ class Drawing(Figure):
         super().__init__(*args, **options)
         self._entries: dict[str, Any] = {}
 
+    @property
+    def caption(self) -> str:
+        """Caption for a paper, one sentence per line: subject and axes of the figure, then the notes."""
+        scenario, colon, subject = self.subject.partition(": ")
+        panels: dict[str, list[str]] = {}
+        for axes in filter(Axes.get_visible, self.axes):
+            sharing: Any = axes.get_shared_x_axes().get_siblings(axes)
+            across = next(filter(None, (_words(other.get_xlabel()) for other in [axes, *sharing])), "").partition(": ")[
+                0
+            ]
+            up = _words(axes.get_ylabel())
+            if up and up not in panels.setdefault(across, []):
+                panels[across].append(up)
+            elif across:
+                panels.setdefault(across, [])
+        alone = panels.pop("", [])
+        panels[""] = [up for up in alone if not any(up in others for others in panels.values())]
+        parts = [" over ".join(filter(None, [", ".join(up), across])) for across, up in panels.items()]
+        subject = f"{subject} ({scenario})" if colon else self.subject
+        sentence = ": ".join(filter(None, [subject, "; ".join(filter(None, parts))]))
+        return "\n".join(filter(None, [sentence and f"{sentence[0].upper()}{sentence[1:]}.", self.notes]))
+
     def note(self, *notes: str) -> None:
         """Add notes to the caption."""
-        self.caption = "\n".join([*filter(None, [self.caption]), *notes])
+        self.notes = "\n".join([*filter(None, [self.notes]), *notes])
         wanted = _drawn.get()
-        if not self.caption or (wanted is not None and not wanted.caption):
+        if not self.notes or (wanted is not None and not wanted.caption):
             return
         size, before = letters(7.0), ""
         if self._note is not None:
             before = self._note.get_text()
             self._note.remove()
-        text = broken(self.caption, self.get_figwidth() - 2.0 * EDGE, size)
+        text = broken(self.notes, self.get_figwidth() - 2.0 * EDGE, size)
         look: Any = {"fontsize": size, "color": NOTE, "ha": "left", "va": "bottom", "in_layout": False}
         self._note = self.text(EDGE / self.get_figwidth(), 0.0, text, **look)
         self.grow(1.25 * size * (_lines(text) - _lines(before)))
@@ -344,6 +368,11 @@ class Drawing(Figure):
             warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
 
 
+def _words(label: str) -> str:
+    """Return a label of an axis in one line, without the signs of formulas."""
+    return re.sub(r"\\(alpha|beta|gamma)", lambda match: _GREEK[match[1]], " ".join(label.replace("$", "").split()))
+
+
 def _lines(text: str) -> int:
     return text.count("\n") + 1 if text else 0
 
@@ -366,7 +395,7 @@ def new_figure(height: float, title: str, *, page: float = WIDTH) -> Drawing:
     own = float(matplotlib.rcParams["figure.figsize"][1]) if _has_own_size() and wanted.width is None else 0.0
     figure = Drawing(figsize=(wide, wanted.height or max(own, height)), layout="constrained")
     figure.grows = wanted.height is None
-    figure.needed = height
+    figure.needed, figure.subject = height, title
     FigureCanvasAgg(figure)
     if wanted.title and title:
         size = _size("figure.titlesize")

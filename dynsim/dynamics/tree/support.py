@@ -58,6 +58,8 @@ STATE_SIZE = 11
 # SupportArrays.least: loads as in state, then the margin
 LEAST_MARGIN = 3
 LEAST_SIZE = 4
+# Load [N], and load relative to the loads of the wheels, below which the ground counts as unloaded.
+NO_LOAD, ROUNDING = 1e-6, 1e-9
 
 
 class SupportArrays(NamedTuple):
@@ -89,7 +91,8 @@ def ground_reaction(model: ModelArrays, loads: LoadArrays, t, ws: Workspace, sup
 
     The margin is min_i d_i/ρ with the distance d_i of the centre of pressure Σ N_i p_i / ΣN from side i (negative
     beyond it) and the inradius ρ. N_i/ΣN are its barycentric coordinates, so d_i/ρ = (N_i/ΣN) (perimeter / side i): 1
-    at the incentre. ΣN <= 0 counts as −1. Loaded wheels share the lateral force in proportion to their loads.
+    at the incentre. If ΣN is negative or rounding error, the margin is −1. Loaded wheels share the lateral force in
+    proportion to their loads.
     """
     links, joints, gravity = ws.links, ws.joints, model.gravity
     index, base, state, carried = support.index, support.base, support.state, support.carried
@@ -132,7 +135,7 @@ def ground_reaction(model: ModelArrays, loads: LoadArrays, t, ws: Workspace, sup
     state[LATERAL] = fy
     state[MARGIN] = -1.0
     state[PRESSURE], state[PRESSURE + 1] = math.nan, math.nan
-    if fz > 0.0:
+    if fz > max(NO_LOAD, ROUNDING * (abs(state[LOADS]) + abs(state[LOADS + 1]) + abs(caster))):
         x, y = -my / fz, mx / fz
         pressure = transform(p, R, (x, y, 0.0))
         state[PRESSURE], state[PRESSURE + 1] = pressure[0], pressure[1]
