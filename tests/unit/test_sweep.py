@@ -4,6 +4,7 @@ import csv
 import json
 import logging
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -98,6 +99,27 @@ def test_values_of_a_grid(text: str, values: tuple[Any, ...]):
 def test_what_is_no_sweep_is_refused(make: Callable[[], Any], names: str):
     with raises(ScenarioError, *names.split()):
         make()
+
+
+def test_printed_table_has_warnings_of_each_kind_and_no_rounding_errors(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.delenv("COLUMNS", raising=False)
+    texts = (
+        "the battery is empty after {0} s; use a larger one\nlink_{0} slips on the floor",
+        "link_{0} slips on the floor",
+    )
+    rows = [
+        SweepRow(k, None, {LENGTH: 1.0 + k}, "ok", "", {ENERGY: value}, texts[k % 2].format(k))
+        for k, value in enumerate([4.0, 1e-12, -3.5e-17, 4.0])
+    ]
+    sweep_command._print_table("pendulum", rows, plan(Axis(LENGTH, (1.0, 2.0, 3.0, 4.0))), ())
+    printed = capsys.readouterr().out
+    assert [line.split()[-1] for line in printed.splitlines() if re.match(r"  [0-3] ", line)] == ["4", "0", "0", "4"]
+    assert "warning: 4 of 4 runs: link_0 slips on the floor (the first of 4)\n" in printed
+    assert "warning: run 0, run 2: the battery is empty after 0 s; use a larger one (the first of 2)\n" in printed
+    assert "sweep.csv" in printed.splitlines()[-1]
+    assert rows[0].cells()["warnings"] == "the battery is empty after 0 s; use a larger one; link_0 slips on the floor"
 
 
 CHAIN = read_scenario("link_tolerance")
