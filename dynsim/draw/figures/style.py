@@ -235,7 +235,7 @@ def _filled(text: str, room: float, size: float, even: bool) -> str:
 
 def text_width(text: str, size: float) -> float:
     """Return the width of a line of text [point], with letters of a size [point]."""
-    return float(text_to_path.get_text_width_height_descent(text, FontProperties(size=size), ismath=False)[0])
+    return float(text_to_path.get_text_width_height_descent(plain(text), FontProperties(size=size), ismath=False)[0])
 
 
 class Drawing(Figure):
@@ -271,9 +271,8 @@ class Drawing(Figure):
         panels: dict[str, list[str]] = {}
         for axes in filter(Axes.get_visible, self.axes):
             sharing: Any = axes.get_shared_x_axes().get_siblings(axes)
-            across = next(filter(None, (_words(other.get_xlabel()) for other in [axes, *sharing])), "").partition(": ")[
-                0
-            ]
+            labels = (_words(other.get_xlabel()).partition(": ")[0] for other in [axes, *sharing])
+            across = next(filter(None, labels), "")
             up = _words(axes.get_ylabel())
             if up and up not in panels.setdefault(across, []):
                 panels[across].append(up)
@@ -349,7 +348,8 @@ class Drawing(Figure):
             share = min(used / self.bbox.height, 0.8)
             engine.set(rect=(0.0, share, 1.0, 1.0 - share))
         # With ticks that depend on the size of the axes, the layout may alternate between two sizes, and cut labels.
-        both = [axis for axes in self.axes for axis in (axes.xaxis, axes.yaxis)]
+        # The width of axes with a fixed aspect follows from their height.
+        both = [axes.yaxis for axes in self.axes] + [axes.xaxis for axes in self.axes if axes.get_aspect() == "auto"]
         automatic = [(axis, ticks) for axis in both if isinstance(ticks := axis.get_major_locator(), AutoLocator)]
         for axis, locator in automatic:
             locator.set_params(nbins=int(np.clip(0.85 * axis.get_tick_space(), 1, 9)))
@@ -369,8 +369,10 @@ class Drawing(Figure):
 
 
 def _words(label: str) -> str:
-    """Return a label of an axis in one line, without the signs of formulas."""
-    return re.sub(r"\\(alpha|beta|gamma)", lambda match: _GREEK[match[1]], " ".join(label.replace("$", "").split()))
+    """Return a label of an axis in one line, with symbols as letters."""
+    if _COORDINATE.fullmatch(label):
+        label = re.sub(r"\\(alpha|beta|gamma)", lambda match: _GREEK[match[1]], label.replace("$", ""))
+    return " ".join(label.split())
 
 
 def _lines(text: str) -> int:
