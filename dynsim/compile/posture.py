@@ -11,10 +11,12 @@ from dynsim.compile.bracing import MIN_N, BracePlanner, brace_rows
 from dynsim.compile.mobility import immobile_at
 from dynsim.compile.model import Model
 from dynsim.compile.shapes import gap_at, share_of_axis
+from dynsim.compile.solids import axes_inside, passes_through, tangent_planes
 from dynsim.dynamics.contact.braces import statics as kb
 from dynsim.errors import ModelError, first_few
 from dynsim.model.description import Array, Contact, Load, Robot
 from dynsim.model.drives import Servo
+from dynsim.model.surfaces import Surface
 
 HAND = "hand"
 
@@ -43,6 +45,10 @@ def on_surfaces(model: Model, contacts: Mapping[str, Contact], names: Sequence[s
 
     Joints that would exceed their limits are stopped there, the worst joint first, and the other joints continue.
 
+    A point stays on the side of a box, sphere or cylinder that it faces in the initial posture. If link axes are then
+    inside the solid, or the point starts inside and cannot reach the nearest side, the search is repeated from each
+    side of the solid. The nearest posture without axes inside is returned.
+
     The search takes Gauss–Newton steps q ← q_0 + J⁺ (J (q − q_0) − e), and then Newton steps without the pull towards
     q_0 to gain the last digits.
 
@@ -65,7 +71,8 @@ def on_surfaces(model: Model, contacts: Mapping[str, Contact], names: Sequence[s
     Raises
     ------
     ModelError
-        If a name is unknown or refers to a link axis, or the points cannot reach their surfaces.
+        If a name is unknown or refers to a link axis, the points cannot reach their surfaces, or only with an arm that
+        passes through a solid.
     """
     robot = model.robot
     for name in names:
@@ -88,23 +95,69 @@ def on_surfaces(model: Model, contacts: Mapping[str, Contact], names: Sequence[s
         k for k, link in enumerate(robot.links) if len(link.row.neutral) == 1 and robot.joint_names[k] not in fixed
     ]
     points = [contacts[name] for name in names if not contacts[name].left_out]
-    stopped = dict[int, float]()
-    while True:
-        q, worst = _nearest(model, points, columns, stopped, HAND in keep)
-        if not worst <= REACHED:
-            within = f" with {', '.join(robot.joint_names[k] for k in stopped)} at the limit" if stopped else ""
+    start = robot.initial
+    gaps, _ = gaps_and_rates(model, points, start)
+
+    def search(planes: Sequence[Contact] = ()) -> tuple[Array, float, str]:
+        """Return a posture, its largest residual [m], and the joints at their limits as text."""
+        stopped = dict[int, float]()
+        guess = _nearest(model, planes, columns, stopped, HAND in keep, start)[0] if planes else start
+        while True:
+            q, worst = _nearest(model, points, columns, stopped, HAND in keep, guess)
+            beyond = _furthest_beyond(robot, columns, q) if worst <= REACHED else None
+            if beyond is None:
+                at_limit = ", ".join(robot.joint_names[k] for k in stopped)
+                return q, worst, f" with {at_limit} at the limit" if at_limit else ""
+            stopped[beyond[0]] = beyond[1]
+
+    def rank(q: Array, solid: Surface) -> tuple[float, int, float]:
+        """Return the length of axes inside a solid [mm], the number of points on the far side, and the distance."""
+        turned = 0
+        for contact, gap in zip(points, gaps, strict=True):
+            if contact.surface is solid and gap > 0.0:
+                before, now = (
+                    contact.surface.normal(model.point_position(contact.body, contact.point, posture))
+                    for posture in (start, q)
+                )
+                turned += bool(before @ now < 0.0)
+        return round(1e3 * axes_inside(robot, solid, q)), turned, float(np.linalg.norm(q - start))
+
+    q, worst, within = search()
+    sides = points
+    for solid in {id(contact.surface): contact.surface for contact in points}.values():
+        planes = tangent_planes(solid)
+        if not planes or (worst <= REACHED and rank(q, solid)[:2] == (0, 0)):
+            continue
+        tried = [
+            [replace(contact, surface=plane) if contact.surface is solid else contact for contact in sides]
+            for plane in planes
+        ]
+        others = [search(entry) for entry in tried]
+        ranks = [(rank(other[0], solid), k) for k, other in enumerate(others) if other[1] <= REACHED]
+        best = min((entry for entry in ranks if entry[0][0] == 0), default=None)
+        if best is not None and not (worst <= REACHED and rank(q, solid) <= best[0]):
+            (q, worst, within), sides = others[best[1]], tried[best[1]]
+    if not worst <= REACHED:
+        raise ModelError(
+            f"initial: cannot bring {', '.join(names)} onto their surfaces{within}: {worst:.3g} m short; "
+            "list fewer joints in initial.keep or start closer"
+        )
+    for contact in points:
+        if tangent_planes(contact.surface) and passes_through(robot, contact, q):
             raise ModelError(
-                f"initial: cannot bring {', '.join(names)} onto their surfaces{within}: {worst:.3g} m short; "
-                "list fewer joints in initial.keep or start closer"
+                f"initial.on_surface: {contact.name!r} only reaches the far side of {contact.surface_name!r}, with the "
+                "arm through it; start on the near side or move the surface within reach"
             )
-        beyond = _furthest_beyond(robot, columns, q)
-        if beyond is None:
-            return q
-        stopped[beyond[0]] = beyond[1]
+    return q
 
 
 def _nearest(
-    model: Model, points: Sequence[Contact], columns: Sequence[int], stopped: Mapping[int, float], keep_hand: bool
+    model: Model,
+    points: Sequence[Contact],
+    columns: Sequence[int],
+    stopped: Mapping[int, float],
+    keep_hand: bool,
+    guess: Array,
 ) -> tuple[Array, float]:
     """Return the posture with the points on their surfaces and joints ``stopped`` fixed, and the largest residual."""
     robot = model.robot
@@ -112,7 +165,7 @@ def _nearest(
     places = [robot.position_index[k] for k in moving]
     start = robot.initial
     hand = model.point_position(*robot.hand, start)
-    q = start.copy()
+    q = guess.copy()
     for k, value in stopped.items():
         q[robot.position_index[k]] = value
     for turn in range(ITERATIONS):

@@ -161,6 +161,18 @@ TABLES = [
                 "initial: {on_surface: [elbow], keep: [joint_1, joint_2, joint_3, joint_4]}\n",
             ),
             (
+                "start on the far side of a box, through which the arm passes",
+                "{axis: y, count: 3, length_m: 0.2,",
+                "{axis: y, length_m: 0.2, initial_deg: 170, limit_deg: [165, 170], motor: {type: wang_minami}}, "
+                "{axis: y, count: 2, length_m: 0.2,",
+                THING,
+                "{type: box, center_m: [0, 0, 0.43], edges_m: [2, 2, 0.05]}",
+                "{body: link_3}",
+                "{body: link_3, surface: thing}",
+                "integrator: {method: auto}",
+                "initial: {on_surface: [elbow]}",
+            ),
+            (
                 "equilibrium that the motors cannot hold",
                 "{axis: y, count: 3, length_m: 0.2, motor: {type: wang_minami}}",
                 "{axis: y, count: 3, length_m: 0.2, initial_deg: 30, motor: {type: wang_minami, voltage_limit_V: 1}}",
