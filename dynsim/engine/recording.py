@@ -24,6 +24,7 @@ from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.unilateral import UnilateralArrays
 from dynsim.dynamics.tree import support as ks
 from dynsim.engine.link_sensors import AppliedWrench, add_link_sensors
+from dynsim.engine.negligible import without_negligible
 from dynsim.engine.prepare import Prepared
 from dynsim.engine.ring import counted_within, time_shares
 from dynsim.engine.target_distance import hand_distance
@@ -566,6 +567,7 @@ def make_record(
     if prepared.system.unilateral is not None:
         _add_unilateral(record, prepared)
     add_link_sensors(record, scenario, prepared, pushes)
+    happened, prepared = without_negligible(record, prepared, happened)
     for event in happened:
         record.add_event(event.time, event.kind, event.name)
     if pictured:
