@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -18,7 +18,11 @@ from dynsim.system import interruption
 if TYPE_CHECKING:
     from dynsim.record import Record
     from dynsim.scenario import Scenario
+    from dynsim.teleop.posture import StartPosture
 
+PrintOption = Annotated[
+    bool, typer.Option("--print", help="Print positions, gaps and keys of the start posture as YAML, without a page.")
+]
 EXAMPLE = "Example: dynsim pose elbow_comparison --variant elbow_4"
 
 
@@ -29,18 +33,23 @@ def pose(
     http_port: HttpPortOption = 0,
     until_closed: UntilClosedOption = False,
     open_: OpenOption = True,
+    print_: PrintOption = False,
 ) -> None:
     """Find a start posture in a browser, with live gaps and torques, and copy its keys as YAML.
 
     The page has a slider for each joint, moves the hand to a point, puts contact points onto their surfaces, and marks
     bodies below surfaces. The command writes no files; when it ends, it prints the keys of a changed posture.
     """
-    require("live", "websockets")
     from dynsim.scenario import load_scenario
     from dynsim.teleop.posture import open_posture
-    from dynsim.teleop.web.posing import LivePosture
 
     loaded = load_scenario(scenario, variant, parsed_overrides(overrides))
+    if print_:
+        _print_start(open_posture(loaded))
+        return
+    require("live", "websockets")
+    from dynsim.teleop.web.posing import LivePosture
+
     with console.status("loading the kernels; on first use, compiling them takes half a minute"):
         live = LivePosture(open_posture(loaded), loaded.variant or loaded.name)
         address = live.open(http_port)
@@ -54,6 +63,22 @@ def pose(
     if live.posture.changed:
         print_line("Keys of the posture:")
         typer.echo("".join(live.posture.text().values()), nl=False)
+
+
+def _print_start(posture: StartPosture) -> None:
+    """Print the hand, contact points and bodies below surfaces as comments, and the keys of the posture."""
+    frame = posture.frame()
+    lines = [] if frame["hand"] is None else [f"hand at {frame['hand']} m"]
+    for point in frame["points"]:
+        force = "" if point["force"] is None else f", normal force {point['force']:.4g} N"
+        disabled = "" if point["enabled"] else ", disabled"
+        gap = 1e3 * round(point["gap"], 7) + 0.0
+        lines.append(f"{point['name']} at {point['at']} m, gap {gap:+.4f} mm from {point['surface']}{force}{disabled}")
+    below = [entry for entry in frame["near"] if entry["gap"] < entry["least"]]
+    lines += [f"{entry['body']}: axis {-1e3 * entry['gap']:.4g} mm below {entry['surface']}" for entry in below]
+    typer.echo("".join([*(f"# {line}\n" for line in lines), *frame["text"].values()]), nl=False)
+    for note in filter(None, (posture.note, frame["rest"])):
+        print_warning(note)
 
 
 # Hides the plots and the time axis of a page with a single posture.

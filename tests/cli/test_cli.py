@@ -13,7 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import h5py
+import numpy as np
 import pytest
+from ruamel.yaml import YAML
 from support.messages import check_message, lines_with, mentions, says
 
 from dynsim._version import __version__
@@ -379,6 +381,27 @@ def test_check_writes_a_page_of_start_postures_also_if_it_refuses(
     assert says(out, "no browser")
     page = (tmp_path / "results" / "elbow_comparison" / "start.html").read_text(encoding="utf-8")
     assert page.startswith("<!DOCTYPE html>")
+
+
+def test_pose_prints_the_start_and_its_keys_without_a_page(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture
+):
+    monkeypatch.chdir(tmp_path)
+    lower = ("pose", "elbow_comparison", "--print", "--set", "plant.initial_deg.1=50")
+    code, text, errors = in_process(monkeypatch, capfd, *lower)
+    assert (code, errors) == (0, [])
+    keys, lines = YAML(typ="safe").load(text), text.splitlines()
+    model = build_model(load_scenario("elbow_comparison", overrides={"plant.initial_deg.1": 50}))
+    hand = model.point_position(*model.robot.hand, model.robot.initial)
+    assert lines[0] == f"# hand at {np.round(hand, 6).tolist()} m"
+    assert lines[1] == "# elbow_4 at [0.298858, 0.298858, -0.036977] m, gap -36.9770 mm from floor"
+    assert lines[3] == "# link_6: axis 100.1 mm below floor"
+    assert keys["plant"] == {"initial_deg": [0, 50, 90, -90, 45, 45, -90, 45, -45, 45]}
+    assert keys["controller"]["hand"]["path"]["center_m"] == pytest.approx((hand - [0.1, 0, 0]).tolist())
+    code, text, errors = in_process(monkeypatch, capfd, "pose", "snake_operator", "--print")
+    assert (code, errors) == (0, [])
+    assert YAML(typ="safe").load(text)["plant"]["initial_base_pose"] == [0, 0, 0]
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_check_says_where_it_starts_before_it_refuses(tmp_path: Path):
