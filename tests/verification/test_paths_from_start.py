@@ -137,11 +137,12 @@ def test_orientation_counts_from_the_start(tool: str, tmp_path: Path) -> None:
 
 
 def test_mobile_arm_paths_start_at_its_hand() -> None:
-    """The world path of the shipped scenario begins within 1e-9 m of the hand."""
-    world = dynsim.load_scenario("mobile_reach")
-    line = {"frame": "start", "from_m": [0, 0, 0], "to_m": [1.504557674096, 0, 0]}
+    """The shipped scenario follows the same path as one in the world that begins within 1e-9 m of the hand."""
+    start = dynsim.load_scenario("mobile_reach")
+    height = 0.588850080015
+    line = {"frame": "world", "from_m": [0.295442325904, 0, height], "to_m": [1.8, 0, height]}
     keys = {f"controller.hand.path.{key}": value for key, value in line.items()}
-    start = dynsim.load_scenario("mobile_reach", overrides=keys)
+    world = dynsim.load_scenario("mobile_reach", overrides=keys)
     t = np.linspace(0.0, 10.0, 11)
     targets = [build.controller(each, dynsim.build_model(each)).target(t) for each in (world, start)]
     assert np.abs(targets[0] - targets[1]).max() < 1e-9  # type: ignore[operator]
