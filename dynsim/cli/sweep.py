@@ -123,7 +123,7 @@ def sweep(
     axes, laws = tuple(map(Axis.parse, grid or ())), tuple(map(Law.parse, sample or ()))
     plan = Plan(file, _variants(file.variants, variants), parsed_overrides(overrides), axes, laws, count, seed)
     # Invalid values are reported here, before processes and threads start.
-    name = plan.scenario(next(plan.points())).name
+    name = plan.first.name
     folder = out or Path("results", name, "sweep")
     unchecked = list(plot or ())
 
@@ -188,8 +188,7 @@ def _varied(plan: Plan) -> dict[str, Quantity]:
     """Return name, symbol and unit of the varied keys of a sweep."""
     from dynsim.scenario.quantities import quantity
 
-    scenario = plan.scenario(next(plan.points()))
-    return {key: quantity(key, scenario) for key in plan.parameters}
+    return {key: quantity(key, plan.first) for key in plan.parameters}
 
 
 def _column(described: Quantity, values: Sequence[Any], unit: float = 0.0) -> tuple[str, list[str]]:

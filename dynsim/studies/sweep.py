@@ -328,7 +328,7 @@ def run_sweep(
         check_writable(folder / RECORDS)
     # A misspelt key would fail in every run, so the first run of each variant is checked in advance.
     for point in {point.variant: point for point in reversed(points)}.values():
-        plan.scenario(point)
+        _ = plan.scenario(point) if point.run else plan.first
     header = _header(plan)
     with held_folder(folder):
         earlier = earlier_rows(folder, header, resume)

@@ -9,6 +9,7 @@ import re
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -203,6 +204,11 @@ class Plan:
     def parameters(self) -> list[str]:
         """All keys that are varied, in the order of the table columns: first the grid, then the samples."""
         return [axis.key for axis in self.grid] + self.sampled
+
+    @cached_property
+    def first(self) -> Scenario:
+        """Scenario of the first run."""
+        return self.scenario(next(self.points()))
 
     def points(self) -> Iterator[SweepPoint]:
         """Yield all runs; variants are the outer loop, samples the inner loop."""

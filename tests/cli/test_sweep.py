@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 from support.messages import lines_with, mentions
 
+from dynsim.cli import main
 from dynsim.cli.sweep import _print_table
-from dynsim.scenario import find_scenario, read_scenario
+from dynsim.scenario import Scenario, ScenarioFile, find_scenario, read_scenario
 from dynsim.studies.sweep import OK, SweepRow
 from dynsim.studies.sweep_plan import Axis, Plan
 
@@ -50,6 +51,24 @@ def test_a_sweep_that_is_refused_says_one_line(tmp_path: Path, arguments: list[s
     assert mentions(result.stderr.replace("\n", " "), name)
     assert "Exception in thread" not in result.stderr
     assert "Traceback" not in result.stderr
+
+
+def test_first_scenario_is_loaded_once_and_again_by_its_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    loads: list[object] = []
+    load = ScenarioFile.load
+
+    def counted(file: ScenarioFile, variant: str | None = None, overrides: object = None) -> Scenario:
+        loads.append(overrides)
+        return load(file, variant, overrides)
+
+    monkeypatch.setattr(ScenarioFile, "load", counted)
+    monkeypatch.chdir(tmp_path)
+    grid = ["--grid", f"{LENGTH}=0.5,1", "--jobs", "1", "--no-figures", *SHORT]
+    monkeypatch.setattr(sys, "argv", ["dynsim", "sweep", "single_pendulum", *grid])
+    with pytest.raises(SystemExit) as finished:
+        main()
+    assert finished.value.code == 0
+    assert [overrides[LENGTH] for overrides in loads] == [0.5, 0.5, 1.0]
 
 
 @pytest.mark.parametrize(("limits", "well", "code"), [("1,1e-9", 1, 0), ("1e-9,2e-9", 0, 3)])

@@ -144,6 +144,15 @@ def test_refusals_say_where_and_what(old: str, new: str, line: int, names: list[
     check_message(message, f"bad.urdf:{line}", *names)
 
 
+def test_a_xacro_file_is_reported_once(tmp_path: Path) -> None:
+    """Other problems of the file, such as names that no link has, may vanish when it is expanded."""
+    path = tmp_path / "bad.urdf"
+    path.write_text(GOOD.replace('"arm"', '"${prefix}arm"').replace("4.00", "${m}"), encoding="utf-8")
+    message = refused(path)
+    check_message(message, "bad.urdf:3", "xacro", "bad_expanded.urdf")
+    assert len(message.splitlines()) == 1
+
+
 def test_what_the_specification_lets_a_file_leave_out_has_its_value(tmp_path: Path) -> None:
     text = GOOD.replace('<axis xyz="0 1 0"/>\n', "").replace('<dynamics damping="0.5" friction="0"/>\n', "")
     text = text.replace('lower="-1" ', "").replace('<origin xyz="0 0 0.1" rpy="0 0 0"/>\n', "")

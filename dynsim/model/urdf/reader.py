@@ -84,6 +84,10 @@ class _Reported(ModelError):
     """Consequence of a problem that is already in the list."""
 
 
+class _Unexpanded(ModelError):
+    """Expression of xacro, which alone is reported: the other problems may vanish with it."""
+
+
 @dataclass
 class Findings:
     """Problems of a file, each with its line, harmless extras, which are ignored, and repairs."""
@@ -105,6 +109,9 @@ class Findings:
 
     def check(self) -> None:
         """Raise the only problem, or one error with all problems, one per line."""
+        for problem in self.problems:
+            if isinstance(problem, _Unexpanded):
+                raise ModelError(str(problem))
         if len(self.problems) == 1:
             raise self.problems[0]
         texts = list(dict.fromkeys(map(str, self.problems)))
@@ -284,7 +291,7 @@ class Element:
     def _check_expanded(self, key: str) -> None:
         value = self.attributes[key]
         if "${" in value or "$(" in value:
-            raise self.fault(f"<{self.tag} {key}={quoted(value)}>: {_expand(self.path)}")
+            raise _Unexpanded(str(self.fault(f"<{self.tag} {key}={quoted(value)}>: {_expand(self.path)}")))
 
 
 def _error(path: Path, line: int, text: str) -> ModelError:
