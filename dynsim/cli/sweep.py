@@ -195,9 +195,11 @@ def _column(described: Quantity, values: Sequence[Any], unit: float = 0.0) -> tu
     """Return heading and cells of a column, with 0 for rounding errors next to its values or ``unit``."""
     values = without_rounding(values, unit)
     described = described.fitted(values)
+    from dynsim.record.quantities import rounded
+
     cells = [
         "–" if value is None
-        else f"{value * described.scale:.4g}" if isinstance(value, (int, float)) and not isinstance(value, bool)
+        else rounded(value * described.scale) if isinstance(value, (int, float)) and not isinstance(value, bool)
         else escaped_line(value)
         for value in values
     ]  # fmt: skip
@@ -272,7 +274,8 @@ def drawn_table(name: str, rows: Sequence[SweepRow], plan: Plan, plotted: Sequen
 
     return Sweep(
         name,
-        [(row if row.status == OK else replace(row, numbers={})).cells() for row in rows],
+        # A varied key, such as duration_s, may have the name of a result.
+        [{**(row if row.status == OK else replace(row, numbers={})).cells(), **row.values} for row in rows],
         [axis.key for axis in plan.grid],
         plan.sampled,
         plan.file.variants,

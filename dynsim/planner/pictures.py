@@ -8,6 +8,7 @@ import numpy as np
 
 from dynsim.draw.figures.look import Look
 from dynsim.draw.figures.plan import CornerRun, PlanPicture, Pose, draw_plan_figures
+from dynsim.draw.figures.style import spaced
 from dynsim.draw.geometry.meshes import Meshes
 from dynsim.draw.geometry.projection import UP, Array, Projection
 from dynsim.draw.geometry.robot import placed
@@ -22,8 +23,8 @@ from dynsim.scenario import build
 
 # Number of instants of the first pass at which the arm is drawn.
 POSES = 3
-# Number of grid points per axis for drawing surfaces, and margin of the grid around the arm [m].
-GRID, BEYOND = 160, 0.15
+# Number of grid points per axis for drawing surfaces, and margin of the grid around the arm, relative to its length.
+GRID, BEYOND = 240, 0.3
 # Depth below the braces at which surfaces are cut for the view from above, and distance of ends of a closed path [m].
 INSIDE, CLOSED = 1e-3, 1e-6
 
@@ -66,13 +67,15 @@ def picture(plan: BracePlan, record: Record | None = None) -> PlanPicture:
     path = view.project(task.targets(np.linspace(0.0, task.duration, 200)))
     base = _base(record, view)
     points = np.vstack([path, *(line for pose in poses for line in pose.lines), *base])
-    low, high = points.min(axis=0) - BEYOND, points.max(axis=0) + BEYOND
+    beyond = BEYOND * float(np.ptp(points, axis=0).max())
+    low, high = points.min(axis=0) - beyond, points.max(axis=0) + beyond
     along, left, up = np.linspace(low, high, GRID).T
     touched = np.vstack([pose.points for pose in poses])
     depth = float(touched[:, 2].mean()) - INSIDE if len(touched) else 0.0
+    along_arm = {c.label: (c.joint, float(np.linalg.norm(c.on_joint))) for c in task.candidates}
     answered = {size.count: size for size in plan.answered}
     return PlanPicture(
-        title=task.scenario.title,
+        title=task.scenario.title.replace(task.scenario.name, spaced(task.scenario.name), 1),
         poses=poses,
         path=path,
         braces=[brace.label for brace in best.braces],
@@ -83,7 +86,7 @@ def picture(plan: BracePlan, record: Record | None = None) -> PlanPicture:
         base=base,
         sets={count: plan.ranked[count] for count in answered},
         survives={count: size.survives for count, size in answered.items()},
-        singles=plan.singles,
+        singles=dict(sorted(plan.singles.items(), key=lambda single: along_arm[single[0]])),
         corners={
             count: [_corner(c, size.heat, plan.tolerances) for c in size.verdict.corners]
             for count, size in answered.items()
@@ -120,7 +123,7 @@ def _corner(corner: Corner, planned: float, tolerances: Tolerances) -> CornerRun
     label = ", ".join(text for text, differs in errors.items() if differs) or "as planned"
     most = tolerances.heat if any(errors.values()) else 1.0 + tolerances.nominal
     allowed = 1e3 * (abs(corner.surface_shift_m) + tolerances.hand_m)
-    return CornerRun(label, corner.heat_W / planned, most, 1e3 * corner.hand_rms_m, allowed, bool(corner.reason))
+    return CornerRun(label, corner.heat_W / planned, most, 1e3 * corner.hand_rms_m, allowed, corner.reason)
 
 
 def _view(task: Task) -> Projection:

@@ -85,6 +85,35 @@ class Quantity:
         return replace(self, unit="mm", scale=1e3) if small else self
 
 
+def rounded(value: float, digits: int = 4, zeros: str = "") -> str:
+    """Round a number to significant digits, for tables and figures.
+
+    Parameters
+    ----------
+    value : float
+        Number.
+    digits : int, optional
+        Number of significant digits; all digits before the decimal point are kept.
+    zeros : {"", "#"}, optional
+        "#" keeps zeros at the end, unless the number is an integer.
+
+    Returns
+    -------
+    str
+        The number, with an exponent if it is very small or very large.
+
+    Examples
+    --------
+    >>> [rounded(value) for value in (12, 25123.4, 6.26, 0.85213, 0.0, 1.17e12)]
+    ['12', '25123', '6.26', '0.8521', '0', '1.17e+12']
+    >>> rounded(6.26, zeros="#")
+    '6.260'
+    """
+    if isinstance(value, int) or value == 0.0 or 10**digits <= abs(value) < 1e7:
+        return f"{value:.0f}"
+    return f"{value:{zeros}.{digits}g}".removesuffix(".")
+
+
 def unit_of(key: str) -> tuple[str, str]:
     """Split a key into its words and its unit.
 

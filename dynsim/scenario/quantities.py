@@ -100,6 +100,9 @@ def quantity(key: str, scenario: Scenario | ScenarioConfig | None = None) -> Qua
     name = _NAMES.get(words) or (_SPECIFICATION.split(described)[0] if owner else described) or words.replace("_", " ")
     if components == ["z"] and words in _POSITIONS and _in_world(sections):
         name, components = "height error of the surfaces" if words == "shift" else "height", []
+        # A solid extends above its centre or axis.
+        part = "centre" if words == "center" else "axis" if " the axis" in text else ""
+        owner = f"{owner or f'the {sections[-1]}'}'s {part}" if part else owner
     if words == "mass" and of_motor:
         name = "motor mass"
     if owner:

@@ -686,7 +686,7 @@ def test_a_figure_for_a_paper_has_no_title() -> None:
     scenario = load_scenario("elbow_comparison", "two_elbows", {"duration_s": 0.1})
     record = dynsim.simulate(scenario)
     titled, bare = (dynsim.figure(record, "energy", title=title) for title in (True, False))
-    assert titled.get_suptitle().startswith("elbow_comparison")
+    assert titled.get_suptitle().startswith("elbow comparison")
     assert bare.get_suptitle() == ""
     assert len(bare.axes) == len(titled.axes) > 0
     both = dynsim.figure({"one": record, "two": record}, "compare_energy", title=False)

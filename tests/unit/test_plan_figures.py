@@ -12,6 +12,7 @@ from matplotlib.patches import Circle, Polygon
 from support.messages import mentions
 
 from dynsim.draw.figures.plan import CornerRun, PlanPicture, Pose, heat_by_set, posture, robustness, single_braces
+from dynsim.record.quantities import rounded
 
 
 def picture(aside: float) -> PlanPicture:
@@ -44,37 +45,46 @@ def names_of(axes: Axes) -> list[str]:
 def test_an_arm_that_leaves_its_plane_is_drawn_from_above_too(aside: float, views: int) -> None:
     figure = figure_of(picture(aside))
     assert [axes.get_ylabel() for axes in figure.axes] == ["height [m]", "left [m]"][:views]
-    for axes, texts in zip(figure.axes, (["1", "2 N"], ["1"]), strict=False):
-        assert [text.get_text() for text in axes.texts if text.get_text()] == texts
-    assert "elbow on floor" in names_of(figure.axes[0])
+    for axes in figure.axes:
+        assert [text.get_text() for text in axes.texts if text.get_text()] == ["1"]
+    assert "elbow on floor: 4.0 N" in names_of(figure.axes[0])
     assert bool(figure.axes[0].get_xlabel()) is (views == 1)
 
 
-def test_arrows_of_forces_end_at_the_braces_and_stay_in_the_picture() -> None:
-    figure = figure_of(picture(0.3))
-    low = figure.axes[0].get_ylim()[0]
-    arrows = [text for text in figure.axes[0].texts if not text.get_text()]
-    # Two postures with the same force of 4 N, and a scale of 2 N.
-    assert len(arrows) == 3
+def test_arrows_of_forces_and_their_numbers_are_within_the_view() -> None:
+    """Only the last pose has arrows: those of all poses would be crowded."""
+    shown = picture(0.3)
+    first, last = shown.poses
+    pushed = np.array([[0.0, 0.0, 2.0], [-4.0, 0.0, 0.0]])
+    points = np.array([[1.0, 0.3, 0.0], [2.0, 0.0, 0.4]])
+    last = replace(last, points=points, forces=pushed, centres=points)
+    figure = figure_of(replace(shown, poses=[first, last], braces=["elbow on floor", "hand on wall"]))
+    axes = figure.axes[0]
+    arrows = [text for text in axes.texts if not text.get_text()]
+    assert len(arrows) == 2
     lengths = [np.linalg.norm(np.subtract(arrow.xy, arrow.xyann)) for arrow in arrows]
-    assert lengths[:2] == pytest.approx([2.0 * lengths[2]] * 2)
-    for arrow in arrows[:2]:
-        np.testing.assert_allclose(arrow.xy, [1.0, 0.0])
-        assert low <= arrow.xyann[1] < 0.0
+    assert lengths[1] == pytest.approx(2.0 * lengths[0])
+    for arrow, point, name in zip(arrows, points, ("1", "2"), strict=True):
+        np.testing.assert_allclose(arrow.xy, point[[0, 2]])
+        (number,) = [text for text in axes.texts if text.get_text() == name]
+        assert axes.bbox.containsx(number.get_window_extent().x1)
+        assert axes.bbox.containsy(number.get_window_extent().y0)
 
 
-def test_an_arm_without_braces_has_no_names() -> None:
+def test_an_arm_without_braces_has_no_forces() -> None:
     shown = picture(0.0)
     bare = Pose(0.0, shown.poses[0].lines, *np.zeros((3, 0, 3)))
     figure = figure_of(PlanPicture(**{**vars(shown), "poses": [bare], "braces": []}))
     assert not figure.axes[0].texts
+    assert mentions(figure.get_suptitle(), "without braces")
+    assert not mentions(figure.get_suptitle(), "forces")
 
 
 def compared() -> PlanPicture:
     """Plans of no brace and of one that does not survive, with two corners."""
     corners = {
-        0: [CornerRun("as planned", 1.0, 1.05, 0.1, 5.0, False), CornerRun("up", 1.0, 1.5, 0.1, 10.0, False)],
-        1: [CornerRun("as planned", 0.8, 1.05, 0.2, 5.0, False), CornerRun("up", 18.0, 1.5, 12.0, 10.0, True)],
+        0: [CornerRun("as planned", 1.0, 1.05, 0.1, 5.0), CornerRun("up", 1.0, 1.5, 0.1, 10.0)],
+        1: [CornerRun("as planned", 0.8, 1.05, 0.2, 5.0), CornerRun("up", 18.0, 1.5, 12.0, 10.0, "too hot")],
     }
     return replace(
         picture(0.0),
@@ -88,7 +98,7 @@ def compared() -> PlanPicture:
 def test_heat_is_dots_with_the_simulated_heat_of_the_answers() -> None:
     """Bars on a logarithmic axis begin anywhere: the least would hardly be seen."""
     for make, heats, labels, runs in (
-        (heat_by_set, [50.0, 0.5, 2.0], ["none", "a", "b"], [50.0, 0.4]),
+        (heat_by_set, [50.0, 0.5, 2.0], ["no braces", "a", "b"], [50.0, 0.4]),
         (single_braces, [0.3, 9.0], ["a", "b"], []),
     ):
         figure = make(compared())
@@ -98,7 +108,7 @@ def test_heat_is_dots_with_the_simulated_heat_of_the_answers() -> None:
         assert not axes.patches
         assert mentions(figure.get_suptitle(), "on floor")
         assert [text.get_text() for text in axes.get_yticklabels()] == labels
-        assert [text.get_text() for text in axes.texts] == [f"{heat:g} W" for heat in heats]
+        assert [text.get_text() for text in axes.texts] == [f"{rounded(heat, 3, '#')} W" for heat in heats]
         drawn = [(line.get_marker(), line.get_xdata()[0]) for line in axes.lines if line.get_label()[0] != "_"]
         assert [x for marker, x in drawn if marker != "|"] == pytest.approx(heats)
         assert [x for marker, x in drawn if marker == "|"] == pytest.approx(runs)
@@ -109,7 +119,7 @@ def test_limits_and_rejected_runs_of_robustness_are_drawn() -> None:
     figure = robustness(compared())
     assert figure is not None
     heats, errors = figure.axes
-    assert names_of(heats) == ["0 braces: survives", "1 brace: rejected", "limit", "rejects the plan"]
+    assert names_of(heats) == ["no braces: survives", "1 brace: rejected", "limit", "rejects the plan"]
     for axes, limits, rejected in ((heats, [1.05, 1.5], 18.0), (errors, [5.0, 10.0], 12.0)):
         (dashed,) = axes.collections
         assert [segment[0, 0] for segment in dashed.get_segments()] == pytest.approx(limits)
@@ -117,18 +127,22 @@ def test_limits_and_rejected_runs_of_robustness_are_drawn() -> None:
         assert crosses == [rejected]
         assert axes.get_xlim()[1] > max(rejected, *limits)
     assert [text.get_text() for text in heats.get_yticklabels()] == ["as planned", "up"]
-    assert mentions(figure.caption, "survives", "limit")
+    assert mentions(figure.caption, "survives", "limit", "too hot")
 
 
 def test_run_that_ended_early_is_a_cross_at_the_edge() -> None:
     shown = compared()
-    lost = replace(shown.corners[1][1], heat=np.nan, error=np.nan)
+    lost = replace(shown.corners[1][1], heat=np.nan, error=np.nan, reason="tips over")
     figure = robustness(replace(shown, corners={**shown.corners, 1: [shown.corners[1][0], lost], 2: [lost]}))
     assert figure is not None
     for axes in figure.axes:
         (cross,) = [x for line in axes.lines if line.get_marker() == "x" for x in line.get_xdata()]
         assert cross == axes.get_xlim()[1]
-    assert mentions(figure.caption, "ended early", "2: rejected as planned")
+    assert mentions(figure.caption, "ended early", "Rejected as planned, and so not drawn (2 braces): tips over")
+
+
+def test_a_single_brace_set_has_no_comparison() -> None:
+    assert heat_by_set(replace(compared(), sets={0: [("none", 50.0)]})) is None
 
 
 def test_base_and_spheres_of_braces_are_drawn() -> None:

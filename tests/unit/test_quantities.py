@@ -25,6 +25,7 @@ ARM = {
     "surfaces": {
         "table": {"type": "box", "center_m": [0.5, 0.0, 0.2], "edges_m": [1.0, 1.0, 0.1]},
         "floor": {"type": "plane"},
+        "pipe": {"type": "cylinder", "point_m": [0.0, 0.0, 1.0], "axis": [1.0, 0.0, 0.0], "radius_m": 0.1},
     },
     "contacts": {"law": "unilateral", "points": {"elbow": {"body": "link_2", "surface": "floor", "friction": 0.4}}},
     "loads": {"tool": {"type": "payload", "body": "link_4", "mass_kg": 0.2}},
@@ -35,7 +36,8 @@ ARM = {
     ("key", "label", "symbol"),
     [
         ("duration_s", "simulated time [s]", ""),
-        ("surfaces.table.center_m.2", "height of table [m]", ""),
+        ("surfaces.table.center_m.2", "height of table's centre [m]", ""),
+        ("surfaces.pipe.point_m.2", "height of pipe's axis [m]", ""),
         ("surfaces.table.center_m.0", "centre of table, x [m]", ""),
         ("surfaces.floor.point_m.2", "height of floor [m]", ""),
         # The first entry of the chain has three joints.
@@ -63,7 +65,7 @@ def test_key_without_scenario_is_named_by_its_words() -> None:
     labels = [
         quantity(key).label for key in ("surfaces.table.center_m.2", "loads.tool.mass_kg", "plant.k.stall_time_s")
     ]
-    assert labels == ["height of table [m]", "mass of tool [kg]", "stall time of the k [s]"]
+    assert labels == ["height of table's centre [m]", "mass of tool [kg]", "stall time of the k [s]"]
 
 
 def test_every_key_of_shipped_scenarios_is_readable() -> None:

@@ -1,6 +1,7 @@
 """Sweeps: the set of runs, equality with single runs, and runs that survive an interruption."""
 
 import csv
+import itertools
 import json
 import logging
 import os
@@ -30,6 +31,7 @@ from support.sweep_work import DEADLY, REFUSED, attentive, deaf, leaves, once_de
 
 import dynsim
 from dynsim.cli import sweep as sweep_command
+from dynsim.cli.sweep import drawn_table
 from dynsim.draw.figures import style
 from dynsim.draw.figures import sweep as pictures
 from dynsim.draw.figures.look import Look
@@ -649,7 +651,36 @@ def test_single_value_far_beyond_the_others_is_beyond_the_axis():
     figure = pictures.lines(pictures.Sweep("test", rows, ["a"], [], plotted=["tip"]))
     assert figure is not None
     assert figure.axes[0].get_ylim()[0] > -10.0
+    assert min(np.nanmin(line.get_ydata()) for line in figure.axes[0].lines) > -10.0
     assert mentions(figure.caption, "1 of 24", "−1e+12")
+
+
+def test_result_does_not_replace_a_varied_value_of_the_same_name():
+    """Failed runs have only the varied value: 1 and 1.0 would be two rows of a map."""
+    plan = Plan(PENDULUM, (None,), {}, (Axis.parse("duration_s=1,2"),), (), 1, 0)
+    rows = [SweepRow(0, None, {"duration_s": 1}, "ok", "", {"duration_s": 1.0, "steps": 9}, "")]
+    (drawn,) = drawn_table("single_pendulum", rows, plan).rows
+    assert (str(drawn["duration_s"]), drawn["steps"]) == ("1", 9)
+
+
+def test_ticks_of_maps_do_not_touch_each_other():
+    rows = [row | {"a": -0.12 + 0.01 * k} for k in range(7) for row in ROWS]
+    figure = pictures.heat_map(pictures.Sweep("test", rows, ["a", "b"], ["mass"]))
+    assert figure is not None
+    texts = [text.get_text() for text in figure.axes[2].get_xticklabels()]
+    assert texts[0] == "−0.12"
+    assert len({len(text) for text in texts}) == 1
+    boxes = [text.get_window_extent() for text in figure.axes[2].get_xticklabels()]
+    assert all(left.x1 + 2.0 < right.x0 for left, right in itertools.pairwise(boxes))
+
+
+def test_markers_of_lines_are_not_cut_by_the_frame():
+    figure = pictures.lines(pictures.Sweep("test", ROWS, ["a"], ["mass"]))
+    assert figure is not None
+    for axes in figure.axes:
+        assert axes.get_xlim()[0] < 0.0
+        assert axes.get_xlim()[1] > 1.0
+        assert not any(line.get_clip_on() for line in axes.lines)
 
 
 def test_colour_bars_stand_below_their_column():

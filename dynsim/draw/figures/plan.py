@@ -18,14 +18,15 @@ from dynsim.draw.figures import style
 from dynsim.draw.figures.look import Look
 from dynsim.draw.figures.style import BLACK, BLUE, GREEN, GREY, VARIANT_COLOURS, Array, number
 from dynsim.draw.geometry.shapes import outline
+from dynsim.record.quantities import rounded
 
-# Maximum length of the arrow of the largest force, relative to the height of the view.
-ARROW = 0.35
+# Length of the arrow of the largest force, and of the number at its tail, relative to the length of the view.
+ARROW, TAIL = 0.08, 0.06
 # An arm that leaves its vertical plane by less than this fraction of its length is not drawn from above.
 FLAT = 0.02
 # Values whose ratio exceeds this are drawn on a logarithmic axis.
 WIDE = 20.0
-# Margin on each side of the arm in the view from above [m].
+# Margin around the arm in a view [m].
 MARGIN = 0.1
 # Colours of surfaces, of a fixed or mobile base, and of every other row of a chart.
 _SURFACE, _BASE, _BAND = "#D9D9D9", "#F2F2F2", "#F4F4F4"
@@ -33,6 +34,8 @@ _SURFACE, _BASE, _BAND = "#D9D9D9", "#F2F2F2", "#F4F4F4"
 _MARKERS, _SMALL = "osD^vP*", 7.0
 # Heights of a row of a chart, and of title, legend and axis [inch]; share of the width for labels of rows.
 _ROW, _ROOM, _LABELS = 0.26, 1.2, 0.42
+# Marks of brace sets.
+_BEST, _REJECTED, _OTHER = "best of its size", "rejected", "other set"
 
 
 @dataclass(frozen=True)
@@ -70,8 +73,8 @@ class CornerRun:
         Mean heat and its limit, relative to the planned heat; the heat is NaN if the run ended early.
     error, error_limit : float
         Rms error of the hand and its limit [mm]; the error is NaN if the run ended early.
-    rejected : bool
-        Whether the run rejects the plan, by these limits or for another reason.
+    reason : str
+        Reason why the run rejects the plan, such as a limit; "" if it does not.
     """
 
     label: str
@@ -79,7 +82,7 @@ class CornerRun:
     heat_limit: float
     error: float
     error_limit: float
-    rejected: bool
+    reason: str = ""
 
 
 @dataclass(frozen=True)
@@ -103,13 +106,13 @@ class PlanPicture:
     base : sequence of (n, 3) ndarray
         Corners of the solids of a fixed or mobile base [m].
     sets : mapping of int to sequence
-        Labels and heat [W] of brace sets, by number of braces; the first set for each number is the planner's answer.
+        Labels and heat [W] of brace sets, by number of braces; the first set for each number is the best.
     survives : mapping of int to bool or None
-        Whether each answer survives verification.
+        Whether each best set survives verification.
     singles : mapping of str to float
         Heat of single braces by candidate [W].
     corners : mapping of int to sequence of CornerRun
-        Simulated runs of each answer, by number of braces; the first run is as planned.
+        Simulated runs of each best set, by number of braces; the first run is as planned.
     """
 
     title: str
@@ -129,19 +132,22 @@ def posture(picture: PlanPicture) -> Figure | None:
     """Draw the best plan at several times with brace forces, and also from above if the arm leaves its plane."""
     if not picture.poses:
         return None
-    along, up, _ = picture.ground
+    up = picture.ground[1]
+    last = picture.poses[-1]
     drawn = np.vstack([picture.path, *(line for pose in picture.poses for line in pose.lines), *picture.base])
-    flat = np.ptp(drawn[:, 1]) < FLAT * np.ptp(along)
-    shapes = [float(np.ptp(up) / np.ptp(along))]
-    if not flat:
-        shapes.append(float((np.ptp(drawn[:, 1]) + 2.0 * MARGIN) / np.ptp(along)))
-    height = min((style.width() - 0.7) * sum(shapes) + 0.35 * len(shapes), 8.0) + 0.6
-    figure = style.new_figure(height, f"{picture.title}: posture and forces of the best plan")
+    span, sizes = float(np.ptp(drawn[:, 0])), np.linalg.norm(last.forces, axis=1, keepdims=True)
+    arrows = ARROW * span * last.forces / (sizes.max(initial=0.0) or 1.0)
+    # The numbers at the tails of the arrows are within the view.
+    tails = last.points - arrows - TAIL * span * last.forces / np.where(sizes > 0.0, sizes, 1.0)
+    flat = np.ptp(drawn[:, 1]) < FLAT * span
+    limits = np.vstack([drawn - MARGIN, drawn + MARGIN, tails])
+    low, high = limits.min(axis=0), limits.max(axis=0)
+    low[2], high[2] = max(low[2], up[0]), min(high[2], up[-1])
+    shapes = (high - low)[[2] if flat else [2, 1]] / (high - low)[0]
+    height = min((style.width() - 0.7) * float(shapes.sum()) + 0.35 * len(shapes), 8.0) + 0.6
+    subject = "posture and forces of the best plan" if picture.braces else "posture of the best plan, without braces"
+    figure = style.new_figure(height, f"{picture.title}: {subject}")
     views = figure.subplots(len(shapes), 1, squeeze=False, sharex=True, height_ratios=shapes)[:, 0]
-    # Most arrows start below the braces and must stay within the view.
-    lowest = min(pose.points[:, 2].min(initial=up[-1]) for pose in picture.poses)
-    length = min(ARROW * float(np.ptp(up)), float(lowest - up[0]))
-    largest = max(float(np.linalg.norm(pose.forces, axis=1).max(initial=0.0)) for pose in picture.poses)
     surfaces = (picture.ground, picture.tops)
     for axes, row, name, solid in zip(views, (2, 1), ("height [m]", "left [m]"), surfaces, strict=False):
         seen = [0, row]
@@ -150,18 +156,13 @@ def posture(picture: PlanPicture) -> Figure | None:
             axes.contourf(*solid, levels=[-1e9, 0.0], colors=[_SURFACE])
             axes.contour(*solid, levels=[0.0], colors=[GREY], linewidths=0.8)
         _draw_base(axes, picture, seen)
-        _draw_poses(axes, picture, seen, largest, length)
+        _draw_poses(axes, picture, seen, arrows)
         axes.plot(*picture.path[:, seen].T, color=GREEN, linewidth=2.0, label="path of the hand")
-        axes.set(ylabel=name, aspect="equal")
-    views[0].set(xlim=(along[0], along[-1]), ylim=(up[0], up[-1]))
-    if largest > 0.0:
-        _draw_scale(views[0], picture, largest, length)
-    if not flat:
-        views[1].set_ylim(drawn[:, 1].min() - MARGIN, drawn[:, 1].max() + MARGIN)
+        axes.set(ylabel=name, aspect="equal", xlim=(low[0], high[0]), ylim=(low[row], high[row]))
     views[-1].set_xlabel("distance along the heading [m]")
     style.legend_below(figure, [views[0]], 3)
     times = ", ".join(number(pose.time, 2) for pose in picture.poses)
-    braced = " Arrows: normal forces on the arm. Circles: braces." if largest > 0.0 else ""
+    braced = " Arrows: normal forces on the arm in the dark posture. Black circles: braces." if picture.braces else ""
     base = "" if picture.base else " Square: base."
     figure.note(f"Postures at t = {times} s, from faint to dark.{braced}{base}")
     return figure
@@ -181,75 +182,67 @@ def _draw_base(axes: Axes, picture: PlanPicture, seen: list[int]) -> None:
         axes.plot(*joint[seen], color=GREY, marker="s", markersize=8.0, zorder=1.5)
 
 
-def _draw_poses(axes: Axes, picture: PlanPicture, seen: list[int], largest: float, length: float) -> None:
-    """Draw links, braces and forces, and number the braces in the last pose; the legend contains their names."""
+def _draw_poses(axes: Axes, picture: PlanPicture, seen: list[int], arrows: Array) -> None:
+    """Draw links and braces, and the numbered forces of the last pose; the legend has their names and values."""
     for k, pose in enumerate(picture.poses):
-        shade = 0.25 + 0.75 * (k + 1) / len(picture.poses)
+        shade = 0.2 + 0.8 * ((k + 1) / len(picture.poses)) ** 2
         for line in pose.lines:
-            axes.plot(*line[:, seen].T, color=BLUE, alpha=shade, marker="o", markersize=2.5, linewidth=1.6)
+            axes.plot(*line[:, seen].T, color=BLUE, alpha=shade, marker="o", markersize=2.0, linewidth=1.2)
         for point, centre in zip(pose.points, pose.centres, strict=True):
             radius = float(np.linalg.norm(centre - point))
             axes.add_patch(Circle(centre[seen], radius, facecolor="none", edgecolor=BLACK, alpha=shade, linewidth=0.8))
-        for point, force in zip(pose.points[:, seen], pose.forces[:, seen] / (largest or 1.0) * length, strict=True):
-            if np.linalg.norm(force) > 0.02 * length:
-                _arrow(axes, point - force, point, alpha=shade)
-    for k, (name, point) in enumerate(zip(picture.braces, picture.poses[-1].points[:, seen], strict=True), start=1):
+    last = picture.poses[-1]
+    size = style.letters(_SMALL)
+    for k, (name, point, centre, arrow) in enumerate(
+        zip(picture.braces, last.points[:, seen], last.centres[:, seen], arrows[:, seen], strict=True), start=1
+    ):
+        # The circle of a thin link would be too small to be seen.
+        axes.plot(*centre, "o", markersize=4.0, markerfacecolor="white", markeredgecolor=BLACK, zorder=4)
+        tail, length = point - arrow, float(np.linalg.norm(arrow))
+        if length > 0.0:
+            look: dict[str, Any] = {
+                "arrowstyle": "-|>",
+                "color": BLACK,
+                "mutation_scale": 6.0,
+                "shrinkA": 0,
+                "shrinkB": 0,
+            }
+            axes.annotate("", xy=tuple(point), xytext=tuple(tail), arrowprops=look, zorder=5)
+        # The number is at the tail of the arrow, or below the brace if the force points towards the reader.
+        away = -arrow / length if length > 0.1 * float(np.linalg.norm(arrows[k - 1])) else np.array([0.0, -1.0])
         axes.annotate(
-            f"{k}",
-            point,
-            xytext=(7.0, -8.0),
-            textcoords="offset points",
-            ha="center",
-            va="center",
-            fontsize=style.letters(7.5),
-            fontweight="bold",
-            path_effects=[withStroke(linewidth=2.0, foreground="white")],
-        )
-        axes.plot([], [], color=BLACK, marker=f"${k}$", markeredgewidth=0.2, linestyle="none", label=name)
-
-
-def _arrow(axes: Axes, start: Array, end: Array, **look: Any) -> None:
-    arrow = {"arrowstyle": "-|>", "color": BLACK, "shrinkA": 0.0, "shrinkB": 0.0, **look}
-    axes.annotate("", xy=(end[0], end[1]), xytext=(start[0], start[1]), arrowprops=arrow)
-
-
-def _draw_scale(axes: Axes, picture: PlanPicture, largest: float, length: float) -> None:
-    """Draw an arrow for a round force in the upper corner that is farther from the arm."""
-    power = 10.0 ** np.floor(np.log10(largest))
-    force = next(step * power for step in (5.0, 2.0, 1.0) if step * power <= largest)
-    (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
-    tip = high - 0.05 * (high - low)
-    corners = [np.array([left + share * (right - left), tip]) for share in (0.03, 0.9)]
-    drawn = np.vstack([*(line for pose in picture.poses for line in pose.lines), picture.path])[:, [0, 2]]
-    corner = max(corners, key=lambda point: np.linalg.norm(drawn - point, axis=1).min())
-    _arrow(axes, corner - [0.0, length * force / largest], corner)
-    axes.annotate(
-        f"{force:g} N",
-        (corner[0], corner[1]),
-        xytext=(5.0, -1.0),
-        textcoords="offset points",
-        va="top",
-        fontsize=style.letters(7.5),
-    )
+            f"{k}", tuple(tail), xytext=tuple(1.2 * size * away), textcoords="offset points", ha="center", va="center",
+            fontsize=size, fontweight="bold", zorder=6, path_effects=[withStroke(linewidth=2.0, foreground="white")],
+        )  # fmt: skip
+        force = rounded(float(np.linalg.norm(last.forces[k - 1])), 2, "#")
+        look = {"color": BLACK, "marker": f"${k}$", "markeredgewidth": 0.2, "linestyle": "none"}
+        axes.plot([], [], label=f"{name}: {force} N", **look)
 
 
 def heat_by_set(picture: PlanPicture) -> Figure | None:
-    """Draw the planned heat of the best brace sets of each size; answers are filled and show their simulated heat."""
+    """Draw the planned heat of the best brace sets of each size; return None for a single set, which has no rival.
+
+    The best set of each size is filled, and has its simulated heat.
+    """
     rows = [(count, label, heat, k) for count, sets in picture.sets.items() for k, (label, heat) in enumerate(sets)]
-    if not rows:
+    if len(rows) < 2:
         return None
     marks, runs = [], []
     for count, _, heat, k in rows:
         corners = picture.corners.get(count, ())
         lost = k == 0 and picture.survives.get(count) is False
-        marks.append("rejected answer" if lost else "answer" if k == 0 else "other set")
+        marks.append(_OTHER if k else _REJECTED if lost else _BEST)
         runs.append(corners[0].heat * heat if k == 0 and corners else np.nan)
-    labels, surface = _without_surface([label for _, label, _, _ in rows])
+    labels, surface = _without_surface([label if count else "no braces" for count, label, _, _ in rows])
     title = f"{picture.title}: heat of the motors by brace set{surface}"
     figure = _dots(title, labels, [heat for _, _, heat, _ in rows], marks, "mean heat, planned [W]", runs)
     for y in range(1, len(rows)):
         if rows[y][0] != rows[y - 1][0]:
             figure.axes[0].axhline(y - 0.5, color=GREY, linewidth=0.5)
+    verified = any(survives is not None for survives in picture.survives.values())
+    least = " of the sets that survive simulated errors of friction and surfaces" if verified else ""
+    rejected = " Rejected: no set of this size survives; the least planned heat is drawn." if _REJECTED in marks else ""
+    figure.note(f"Size: number of braces. Best: least planned heat{least}.{rejected}")
     return figure
 
 
@@ -260,8 +253,8 @@ def single_braces(picture: PlanPicture) -> Figure | None:
     heats = list(picture.singles.values())
     marks = ["minimum" if heat == min(heats) else "other point" for heat in heats]
     labels, surface = _without_surface(list(picture.singles))
-    title = f"{picture.title}: one brace{surface}, by braced point"
-    return _dots(title, labels, heats, marks, "minimum heat at one posture, no slip [W]")
+    title = f"{picture.title}: heat of the motors with one brace{surface}"
+    return _dots(title, labels, heats, marks, "minimum heat at mid-path, no slip [W]")
 
 
 def _without_surface(labels: Sequence[str]) -> tuple[list[str], str]:
@@ -275,7 +268,7 @@ def _without_surface(labels: Sequence[str]) -> tuple[list[str], str]:
 
 def _row(labels: Sequence[str]) -> float:
     """Return the height of a row with labels of several lines [inch]."""
-    return max(_ROW, 1.35 * style.letters(_SMALL) / 72.0 * max(label.count("\n") + 1 for label in labels))
+    return max(_ROW, 1.65 * style.letters(_SMALL) / 72.0 * max(label.count("\n") + 1 for label in labels))
 
 
 def _dots(
@@ -285,7 +278,7 @@ def _dots(
     marks: Sequence[str],
     axis: str,
     runs: Sequence[float] = (),
-) -> Figure:
+) -> style.Drawing:
     """Draw a row with a dot and its number for each value, and a line for each simulated value in ``runs``.
 
     Bars would have no natural origin on the logarithmic axis that a wide range requires.
@@ -295,12 +288,11 @@ def _dots(
     figure = style.new_figure(_ROOM + _row(names) * len(values), title)
     axes = figure.subplots()
     for y, (value, mark) in enumerate(zip(values, marks, strict=True)):
-        look: dict[str, Any] = {"marker": "X" if mark.startswith("rejected") else "o", "color": BLUE, "markersize": 6.0}
+        look: dict[str, Any] = {"marker": "X" if mark == _REJECTED else "o", "color": BLUE, "markersize": 6.0}
         face = "white" if mark.startswith("other") else BLUE
         axes.plot(value, y, linestyle="none", markerfacecolor=face, clip_on=False, zorder=3, label=mark, **look)
-        axes.text(
-            1.02, y, f"{float(f'{value:.3g}'):g} W", transform=axes.get_yaxis_transform(), va="center", fontsize=size
-        )
+        text = f"{rounded(value, 3, '#')} W"
+        axes.text(1.02, y, text, transform=axes.get_yaxis_transform(), va="center", fontsize=size)
     for y, run in enumerate(runs):
         if np.isfinite(run):
             axes.plot(run, y, "|", color=BLACK, markersize=11.0, clip_on=False, zorder=4, label="simulated run")
@@ -326,7 +318,7 @@ def robustness(picture: PlanPicture) -> Figure | None:
     first = next(iter(shown.values()))
     size = style.letters(_SMALL)
     names = [style.broken(corner.label, 0.3 * style.width(), size) for corner in first]
-    row = max(0.07 * len(shown) + 0.08, _row(names))
+    row = max(0.085 * len(shown) + 0.08, _row(names))
     figure = style.new_figure(
         _ROOM + row * len(names), f"{picture.title}: simulated runs with errors of friction and surfaces"
     )
@@ -342,22 +334,23 @@ def robustness(picture: PlanPicture) -> Figure | None:
             axes.set_xlim(0.8 * max(least, 1e-3 * most), 1.5 * most)
             style.log_axis(axes, "x")
         else:
-            axes.set_xlim(-0.03 * most, 1.08 * most)
+            # A heat is compared with the planned heat, an error with zero.
+            least = min(1.0, *(float(np.nanmin(array)) for array in values.values())) if key == "heat" else 0.0
+            axes.set_xlim(least - 0.06 * (most - least), most + 0.08 * (most - least))
             axes.xaxis.set_major_locator(MaxNLocator(4 if style.narrow() else 7, steps=(1, 2, 5, 10)))
         for y in rows[::2]:
             axes.axhspan(y - 0.5, y + 0.5, color=_BAND, linewidth=0, zorder=0)
         for k, (count, corners) in enumerate(shown.items()):
             at = rows + 0.8 * ((k + 0.5) / len(shown) - 0.5)
-            lost = np.array([corner.rejected for corner in corners])
-            verdict = "survives" if picture.survives.get(count) else "rejected"
-            label = f"{count} brace{'' if count == 1 else 's'}: {verdict}"
+            lost = np.array([bool(corner.reason) for corner in corners])
+            label = f"{_braces(count)}: {'survives' if picture.survives.get(count) else 'rejected'}"
             look = {"color": VARIANT_COLOURS[k % 7], "marker": _MARKERS[k % 7]}
             axes.plot(values[count], at, linestyle="none", markersize=4.0, label=label, **look)
             # Runs that ended early are at the edge.
             ends = np.where(np.isfinite(values[count]), values[count], axes.get_xlim()[1])
             axes.plot(ends[lost], at[lost], "x", color=BLACK, markersize=6.0, zorder=4)
         axes.vlines(limits, rows - 0.5, rows + 0.5, color=BLACK, linestyle=(0, (3, 2)), linewidth=1.0, label="limit")
-        if any(corner.rejected for corners in shown.values() for corner in corners):
+        if any(corner.reason for corners in shown.values() for corner in corners):
             axes.plot([], [], "x", color=BLACK, markersize=6.0, label="rejects the plan")
         axes.grid(visible=False, axis="y")
         axes.set_ylim(len(names) - 0.5, -0.5)
@@ -370,9 +363,15 @@ def robustness(picture: PlanPicture) -> Figure | None:
     )
     if any(not np.isfinite(corner.heat) for corners in shown.values() for corner in corners):
         figure.note("Crosses at the right edge: runs that ended early.")
-    if lacking := [str(count) for count in picture.corners if count not in shown]:
-        figure.note(f"Number of braces {', '.join(lacking)}: rejected as planned; errors were not simulated.")
+    for count, corners in picture.corners.items():
+        if first_lost := next((corner for corner in corners if corner.reason), None):
+            case = f"Rejected with {first_lost.label}" if count in shown else "Rejected as planned, and so not drawn"
+            figure.note(f"{case} ({_braces(count)}): {first_lost.reason}.")
     return figure
+
+
+def _braces(count: int) -> str:
+    return f"{count or 'no'} brace{'' if count == 1 else 's'}"
 
 
 FIGURES = {

@@ -455,12 +455,18 @@ def save_all(makers: Mapping[str, Callable[[T], Figure | None]], of: T, folder: 
 def title(record: Record, subject: str) -> str:
     """Return a title with scenario and variant (or the measured robot), and the end time of an incomplete run."""
     note = "" if record.complete else f" (incomplete: ends at {record.time[-1]:.3g} s)"
-    return f"{record.title or 'record'}: {subject}{note}"
+    name = record.scenario_name
+    return f"{record.title.replace(name, spaced(name), 1) or 'record'}: {subject}{note}"
 
 
 def comparison_title(records: Sequence[Record], subject: str) -> str:
     """Return a title with the scenario of the variants."""
-    return f"{records[0].scenario_name or 'comparison'}: {subject}"
+    return f"{spaced(records[0].scenario_name) or 'comparison'}: {subject}"
+
+
+def spaced(name: str) -> str:
+    """Return the name of a scenario for a title: a file name such as "wall_push" consists of words."""
+    return name.replace("_", " ")
 
 
 def variant_styles(names: Sequence[T]) -> dict[T, dict[str, Any]]:
@@ -555,7 +561,7 @@ def log_axis(axes: Axes, which: str = "y") -> None:
     near = high < 200.0 * low
     axis = axes.yaxis if which == "y" else axes.xaxis
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if near else (1.0,)))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: number(value, 6)))
     axis.set_minor_formatter(NullFormatter())
 
 

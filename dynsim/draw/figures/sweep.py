@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import ListedColormap, LogNorm, Normalize
+from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.ticker import LogLocator, MaxNLocator
@@ -22,7 +22,7 @@ from matplotlib.ticker import LogLocator, MaxNLocator
 from dynsim.draw.figures import style
 from dynsim.draw.figures.look import Look
 from dynsim.draw.figures.style import Array
-from dynsim.record.quantities import ENERGY, ERRORS, Quantity, summary_quantity
+from dynsim.record.quantities import ENERGY, ERRORS, Quantity, rounded, summary_quantity
 from dynsim.record.sensitivity import LEVEL, Sensitivities, sensitivities, spread
 
 # Maximum number of parameters in a tornado diagram with one or two variants, and with more; of bars in a histogram.
@@ -43,12 +43,14 @@ _ROWS, _LOW = 5, 1.6
 _MARKERS, _NUMBERED, _DIGITS = "osD^vP*X", 12, 7.0
 # Steps between ticks, as multiples of a power of ten.
 _STEPS = (1, 2, 2.5, 5, 10)
-# Colour of a map where runs lack the number; runs that failed are grey.
-_LACKING = "#E8E8E8"
+# Marks in the cells of a map that have no colour.
+_MISSING = {"x": "no run succeeded", "_": "number does not exist"}
 # Values farther beyond the middle 80 % than this multiple of their range are beyond the axis.
 _FAR = 30.0
-# Maximum number of rows of a map whose cells contain numbers.
-_CELLS = 12
+# Minimum number of rows and columns of a map with contours.
+_SMOOTH = 5
+# Maximum number of rows of a map whose cells contain numbers, and minimum size of these numbers [point].
+_CELLS, _LEAST = 12, 5.0
 
 
 @dataclass(frozen=True)
@@ -87,7 +89,7 @@ class Sweep:
     def figure(self, height: float, subject: str) -> style.Drawing:
         """Create a figure; its title has the scenario and a single variant, and a note the number of failed runs."""
         variant = f" / {self.variants[0]}" if len(self.variants) == 1 and self.variants[0] else ""
-        figure = style.new_figure(height, f"{self.name}{variant}: {subject}")
+        figure = style.new_figure(height, f"{style.spaced(self.name)}{variant}: {subject}")
         if bad := sum(map(_failed, self.rows)):
             figure.note(f"{bad} of {len(self.rows)} runs failed.")
         return figure
@@ -145,7 +147,7 @@ def lines(sweep: Sweep) -> Figure | None:
         return None
     (key,) = sweep.grid
     styles, metrics, varied = sweep.looks, sweep.metrics, sweep.varied(key)
-    figure = sweep.figure(_PANEL * len(metrics) + _ROOM, f"effect of {varied.name}")
+    figure = sweep.figure(_PANEL * len(metrics) + _ROOM, f"effect of the {varied.name}")
     panels = figure.subplots(len(metrics), 1, sharex=True, squeeze=False)[:, 0]
     levels = _levels(sweep.rows, key)
     numeric = _numeric(levels)
@@ -153,15 +155,18 @@ def lines(sweep: Sweep) -> Figure | None:
     shaded = False
     for axes, (metric, drawn) in zip(panels, metrics.items(), strict=True):
         for k, variant in enumerate(sweep.variants):
-            look: dict[str, Any] = dict(styles[variant])
+            # Hollow markers of decreasing size show curves that coincide.
+            look: dict[str, Any] = {
+                "color": styles[variant]["color"], "linewidth": 1.0, "marker": _MARKERS[k % len(_MARKERS)],
+                "markersize": 3.5 + 2.5 * 0.5**k, "markerfacecolor": "none", "clip_on": False,
+            }  # fmt: skip
             if not numeric:
                 # Nothing is between two words.
                 look["linestyle"] = "none"
             groups = [_values(_at(sweep.of(variant), {key: level}), metric) * drawn.scale for level in levels]
             means = np.array([group.mean() if len(group) else np.nan for group in groups])
             if np.isfinite(means).any():
-                mark = {"marker": _MARKERS[k % len(_MARKERS)], "markersize": 3.5}
-                axes.plot(at, means, label=variant or None, **mark, **look)
+                axes.plot(at, means, label=variant or None, **look)
             if numeric and any(len(group) > 1 for group in groups):
                 limits = np.array(
                     [np.quantile(group, [0.025, 0.975]) if len(group) else (np.nan,) * 2 for group in groups]
@@ -169,12 +174,14 @@ def lines(sweep: Sweep) -> Figure | None:
                 axes.fill_between(at, *limits.T, color=look["color"], alpha=0.15, linewidth=0)
                 shaded = True
         axes.set_ylabel(style.broken(drawn.label, _PANEL))
+        # Markers are not on the axes; words are in the middle of their columns.
+        axes.margins(x=0.02 if numeric else 0.5 / len(levels))
         _scale(axes, "y", drawn.scale * _values(sweep.rows, metric))
         _clip(figure, axes, drawn, drawn.scale * _values(sweep.rows, metric))
+    figure.align_ylabels(panels)
     panels[-1].set_xlabel(style.broken(_label(varied)))
     if not numeric:
         panels[-1].set_xticks(at, [style.broken(str(level), 0.8 * style.width() / len(levels)) for level in levels])
-        panels[-1].margins(x=0.5 / len(levels))
     elif _is_geometric(at):
         style.log_axis(panels[-1], "x")
     elif style.narrow():
@@ -201,9 +208,8 @@ def heat_map(sweep: Sweep) -> Figure | None:
     grid = _Grid([len(drawn) for drawn in variants.values()], _ACROSS)
     panel = (0.6 if grid.rows > 4 else 0.75 if grid.rows > 3 or style.narrow() else 1.0) * _PANEL
     height = panel * grid.rows + _ROOM + _COLOURS * len(grid.bands)
-    figure = sweep.figure(height, f"effect of {sweep.varied(x).name} and {sweep.varied(y).name}")
+    figure = sweep.figure(height, f"effect of the {sweep.varied(x).name} and the {sweep.varied(y).name}")
     panels = grid.subplots(figure)
-    notes: dict[str, str] = {}
     contours = False
     for m, (row, (metric, drawn)) in enumerate(zip(panels, metrics.items(), strict=True)):
         tables = np.full((len(variants[metric]), len(ys), len(xs)), np.nan)
@@ -217,23 +223,20 @@ def heat_map(sweep: Sweep) -> Figure | None:
                     failed[k, j, i] = not len(values) and all(map(_failed, runs))
         low, high = np.nanmin(tables), np.nanmax(tables)
         norm = LogNorm(low, high) if _is_wide(low, high) else Normalize(low, high)
-        texts = _cell_texts(tables, norm)
+        texts = np.vectorize(_rounded, otypes=[object])(tables)
         written = _fit_cells(texts, grid.width)
         for k, (axes, table, bad, variant) in enumerate(zip(row, tables, failed, variants[metric], strict=False)):
             if len(sweep.variants) > 1:
                 axes.set_title(variant)
             image = axes.imshow(table, origin="lower", aspect="auto", cmap="viridis", norm=norm)
             axes.grid(visible=False)
-            axes.set_facecolor(_LACKING)
-            if bad.any():
-                axes.imshow(
-                    np.where(bad, 0.0, np.nan), origin="lower", aspect="auto", cmap=ListedColormap([style.GREY])
-                )
-                notes["no run succeeded"] = style.GREY
-            if (np.isnan(table) & ~bad).any():
-                notes["number does not exist"] = _LACKING
+            axes.autoscale(enable=False)
+            for marker, mask in (("x", bad), ("_", np.isnan(table) & ~bad)):
+                if mask.any():
+                    row_index, column = np.nonzero(mask)
+                    axes.plot(column, row_index, marker, color=style.GREY, markersize=4.0, label=_MISSING[marker])
             if written:
-                _write_cells(axes, image, table, texts[k])
+                _write_cells(axes, image, table, texts[k], written)
             _name_cells(axes, "y", sweep.varied(y), ys, 8, 0.55 * panel)
             _name_cells(axes, "x", sweep.varied(x), xs, 8 if grid.width > _ACROSS else 5, 0.8 * grid.width)
             if k % grid.columns or (m % grid.beside and k < len(variants[next(iter(metrics))])):
@@ -248,13 +251,12 @@ def heat_map(sweep: Sweep) -> Figure | None:
         ticks = max(int(1.8 * grid.width * grid.columns), 2)
         if not isinstance(norm, LogNorm):
             bar.locator = MaxNLocator(min(ticks, 8), steps=_STEPS)
-        elif high > 200.0 * low:
-            bar.ax.xaxis.set_major_locator(LogLocator(numticks=ticks))
         else:
             style.log_axis(bar.ax, "x")
-            if ticks < 4:
-                bar.ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
-        if not written and min(tables.shape[1:]) > 1 and high > low:
+            if high > 200.0 * low or ticks < 4:
+                subs = (1.0,) if high > 200.0 * low else (1.0, 3.0)
+                bar.ax.xaxis.set_major_locator(LogLocator(subs=subs, numticks=max(ticks, 4)))
+        if not written and min(tables.shape[1:]) >= _SMOOTH and high > low:
             levels = [tick for tick in bar.ax.get_xticks() if low < tick < high]
             for axes, table in zip(row, tables, strict=False):
                 axes.contour(table, levels=levels, colors="white", linewidths=0.7)
@@ -263,13 +265,10 @@ def heat_map(sweep: Sweep) -> Figure | None:
         if lacking := [v for v in missing if all(row.get(metric) is None for row in sweep.of(v))]:
             figure.note(f"{drawn.name}: does not exist for {', '.join(lacking)}.")
     if len(sweep.variants) > _MAPS:
-        figure.note(f"Maps of at most {_MAPS} of {len(sweep.variants)} variants; --variants selects others.")
+        figure.note(f"Maps of the first {_MAPS} of {len(sweep.variants)} variants.")
     if contours:
         figure.note("White lines: contours at the ticks of the colour bar.")
-    for text, colour in notes.items():
-        panels[0][0].plot([], [], "s", color=colour, markersize=8.0, label=text)
-    if notes:
-        style.legend_below(figure, [panels[0][0]], 2)
+    style.legend_below(figure, [axes for row in panels for axes in row], 2)
     if others := [*sweep.grid[2:], *sweep.sampled]:
         figure.note(f"Mean over {_listed(sweep, others)}.")
     return figure
@@ -327,7 +326,10 @@ class _Grid:
         return style.width() / (self.beside * self.columns)
 
     def subplots(self, figure: Figure) -> list[list[Axes]]:
-        """Create the axes and return those of each metric; those beyond its members are at the end and empty."""
+        """Create the axes and return those of each metric; those beyond its members are at the end and empty.
+
+        A single panel has the width of its row.
+        """
         axes = figure.subplots(self.rows, self.beside * self.columns, squeeze=False)
         panels = []
         for m, count in enumerate(self.members):
@@ -336,38 +338,27 @@ class _Grid:
             block = axes[first : first + self.bands[band], left : left + self.columns].ravel()
             for empty in block[count:]:
                 empty.set_axis_off()
+            if count == 1:
+                spec = block[0].get_subplotspec().get_gridspec()
+                block[0].set_subplotspec(spec[first, left : left + self.columns])
             panels.append(list(block))
         return panels
 
 
-def _cell_texts(tables: Array, norm: Normalize) -> Any:
-    """Return the values of maps as texts, an array of the same shape; missing values are empty."""
-    high = float(np.nanmax(np.abs(tables)))
-    # Equal decimals unless the values differ widely.
-    equal = 1e-3 < high < 1e5 and not isinstance(norm, LogNorm)
-    places = max(3 - math.floor(math.log10(high)), 0) if equal else 0
-
-    def text(value: float) -> str:
-        shown = f"{value:.{places}f}" if equal else f"{float(f'{value:.3g}'):g}"
-        return shown.replace("-", "−") if np.isfinite(value) else ""
-
-    return np.vectorize(text, otypes=[object])(tables)
-
-
-def _fit_cells(texts: Any, across: float) -> bool:
-    """Return whether texts fit into the cells of maps that are ``across`` wide [inch]."""
+def _fit_cells(texts: Any, across: float) -> float:
+    """Return the size of letters with which texts fit into the cells of maps ``across`` wide [inch]; 0 if too small."""
     # Labels of ticks and axes are 0.45 in wide; digits are wider than the mean letter.
-    space = 72.0 * (across - 0.45) / texts.shape[2] - 4.0
-    longest = max(map(len, texts.flat))
-    return bool(space > 1.15 * style.LETTER * style.letters(_DIGITS) * longest and texts.shape[1] <= _CELLS)
+    space = 72.0 * (across - 0.45) / texts.shape[2] - 3.0
+    size = min(style.letters(_DIGITS), space / (1.15 * style.LETTER * max(map(len, texts.flat))))
+    return size if size >= _LEAST and texts.shape[1] <= _CELLS else 0.0
 
 
-def _write_cells(axes: Axes, image: AxesImage, table: Array, texts: Any) -> None:
+def _write_cells(axes: Axes, image: AxesImage, table: Array, texts: Any, size: float) -> None:
     """Write the values of a map into its cells, in black or white depending on the colour."""
     for (row, column), text in np.ndenumerate(texts):
         shade = image.cmap(image.norm(table[row, column]))[:3]
         colour = "black" if np.dot(shade, (0.3, 0.6, 0.1)) > 0.5 else "white"
-        axes.text(column, row, text, ha="center", va="center", fontsize=style.letters(_DIGITS), color=colour)
+        axes.text(column, row, text, ha="center", va="center", fontsize=size, color=colour)
 
 
 def pareto(sweep: Sweep) -> Figure | None:
@@ -396,20 +387,27 @@ def pareto(sweep: Sweep) -> Figure | None:
     # No run is both to the left of the steps and below them.
     steps: dict[str, Any] = {"color": style.GREY, "linewidth": 0.8, "drawstyle": "steps-post", "zorder": 2}
     axes.plot(*front.T, **steps)
-    filled: dict[str, Any] = {"marker": "o", "markersize": 5, "color": style.GREY, "linewidth": 0.8}
-    axes.plot([], [], label="Pareto front", **filled)
+    alone = len(front) == 1
+    filled: dict[str, Any] = {"marker": "o", "markersize": 5, "color": style.GREY, "linewidth": 0.0 if alone else 0.8}
+    axes.plot([], [], label="best run" if alone else "Pareto front", **filled)
     axes.margins(0.1)
     axes.set(xlabel=right.label, ylabel=up.label)
     _scale(axes, "x", points[:, 0])
     _scale(axes, "y", points[:, 1])
     style.legend_below(figure, [axes], 5)
-    front_note = f"{len(rows)} runs. Pareto front: no run is better in both."
+    firsts = [(points == at).all(axis=1).argmax() for at in front]
     if len(front) <= _NUMBERED and all("run" in row for row in rows):
-        figure.note(f"{front_note} Numbers: runs as in the table, the first of equal runs.")
-        firsts = [(points == at).all(axis=1).argmax() for at in front]
         _number_runs(figure, axes, front, [str(rows[k]["run"]) for k in firsts])
+    if alone:
+        run = rows[firsts[0]]
+        about = [str(run.get("variant", "")), *(sweep.value(key, run[key]) for key in sweep.grid)]
+        which = ", ".join(filter(None, [f"number {run['run']} in the table" if "run" in run else "", *about]))
+        figure.note(f"{len(rows)} runs. Best run ({which}): least energy and least error.")
     else:
-        figure.note(front_note)
+        figure.note(
+            f"{len(rows)} runs. Pareto front: no run is better in both. Numbers: runs as in the table, the first of "
+            "equal runs."
+        )
     return figure
 
 
@@ -476,7 +474,8 @@ def samples(sweep: Sweep) -> Figure | None:
             values = _values(_at(sweep.of(variant), point), metric) * drawn.scale
             heads = [variant] * (len(variants) > 1) + [sweep.value(key, at) for key, at in point.items()]
             head = ", ".join(heads) if len(members) > 1 else ""
-            title = "\n".join(filter(None, [head, _distribution(axes, values, sweep.looks[variant]["color"])]))
+            texts = _distribution(axes, values, sweep.looks[variant]["color"], grid.width)
+            title = "\n".join(filter(None, [head, texts]))
             axes.set_title(style.broken(title, 0.85 * grid.width, style.letters(7.5)), fontsize=style.letters(7.5))
             if k >= len(members) - grid.columns:
                 axes.set_xlabel(style.broken(drawn.label, 0.8 * grid.width))
@@ -491,8 +490,8 @@ def samples(sweep: Sweep) -> Figure | None:
     return figure
 
 
-def _distribution(axes: Axes, values: Array, colour: str) -> str:
-    """Draw the histogram of the draws at one grid point with their mean and interval; return these as text."""
+def _distribution(axes: Axes, values: Array, colour: str, across: float) -> str:
+    """Draw the draws at one grid point as a histogram ``across`` wide [inch]; return mean and interval as text."""
     if len(values) < 2 or np.ptp(values) == 0.0:
         axes.set_axis_off()
         few = f"too few runs with numbers: {len(values)}"
@@ -507,11 +506,9 @@ def _distribution(axes: Axes, values: Array, colour: str) -> str:
     for limit in (statistics.low, statistics.high):
         axes.axvline(limit, color=style.BLACK, linewidth=0.8, linestyle=(0, (4, 2)))
     axes.margins(x=0.03)
-    separator = ",\n" if style.narrow() else ", "
-    return (
-        f"mean {_with_interval(statistics.mean, statistics.mean_high - statistics.mean)}{separator}"
-        f"{100 * LEVEL:g} % in {style.number(statistics.low)} … {style.number(statistics.high)}"
-    )
+    mean = f"mean {_with_interval(statistics.mean, statistics.mean_high - statistics.mean)},"
+    limits = f"{100 * LEVEL:g} % in {_rounded(statistics.low)} … {_rounded(statistics.high)}"
+    return f"{mean}{' ' if across > _ACROSS + 0.5 else chr(10)}{limits}"
 
 
 def tornado(sweep: Sweep) -> Figure | None:
@@ -589,6 +586,10 @@ def _failed(row: Mapping[str, Any]) -> bool:
     return bool(row.get("status", "ok") != "ok")
 
 
+def _rounded(value: float) -> str:
+    return rounded(value, zeros="#").replace("-", "−") if np.isfinite(value) else ""
+
+
 def _label(quantity: Quantity) -> str:
     """Return the label of an axis, with the symbol of the quantity if it is a letter."""
     symbol = f" {quantity.symbol}" if len(quantity.symbol) == 1 else ""
@@ -637,7 +638,12 @@ def _name_cells(axes: Axes, which: str, varied: Quantity, levels: Sequence[Any],
             values = ticks[(ticks > values[0] - 1e-9) & (ticks < values[-1] + 1e-9)]
             at = np.interp(values, varied.scale * np.array(levels, dtype=float), at)
         texts = [style.number(value, 3) for value in values]
-    every = -(-len(texts) // (count + 1))
+    places = max(len(text.partition(".")[2]) for text in texts)
+    if _numeric(levels) and not any("e" in text for text in texts):
+        texts = [f"{value:.{places}f}".replace("-", "−") for value in values]
+    digits = style.LETTER * style.letters(7.5) * (max(map(len, texts)) + 1.5)
+    fit = max(int(72.0 * room / digits), 1) if which == "x" else len(texts)
+    every = -(-len(texts) // min(count + 1, fit))
     label = style.broken(_label(varied), room)
     axes.set(**{f"{which}ticks": at[::every], f"{which}ticklabels": texts[::every], f"{which}label": label})
 
@@ -666,7 +672,11 @@ def _clip(figure: style.Drawing, axes: Axes, drawn: Quantity, values: Array) -> 
     span = high - low
     far = (values > high + _FAR * span) | (values < low - _FAR * span)
     if far.any() and span > 0.0 and axes.get_yscale() == "linear":
-        axes.set_ylim(min(values[~far].min(), low) - 0.1 * span, max(values[~far].max(), high) + 0.1 * span)
+        least, most = min(values[~far].min(), low), max(values[~far].max(), high)
+        axes.set_ylim(least - 0.1 * span, most + 0.1 * span)
+        for line in axes.lines:
+            at = np.asarray(line.get_ydata(), dtype=float)
+            line.set_ydata(np.where((at < least) | (at > most), np.nan, at))
         extreme = style.number(values[far][np.abs(values[far]).argmax()], 3)
         figure.note(f"{drawn.name}: {far.sum()} of {len(values)} values, up to {extreme}, are beyond the axis.")
 
