@@ -461,7 +461,9 @@ SAME_END = 1e-9
 def pictured_parts(scene: Scene, scenario: Scenario) -> Scene:
     """Return the scene with the parts that only the scenario defines: objects, mesh folders and the gripper."""
     plant, grip, tip = scenario.plant, None, 0.0
-    if (law := getattr(plant, "gripper", None)) is not None:
+    # A length of zero means that the robot has no gripper, unless there are objects to grasp.
+    law = getattr(plant, "gripper", None)
+    if law is not None and (plant.gripper_length_m or scenario.config.objects):
         grip = SoftGripper(law.capture_m, law.bound_N, law.turning_bound_N_m)
         tip = 0.0 if plant.controlled_point == "gripper" else plant.gripper_length_m
     files = (getattr(part, "file", None) for part in (plant, getattr(plant, "arm", None)))

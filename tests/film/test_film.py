@@ -251,7 +251,7 @@ def test_a_hub_is_not_covered_by_a_rod_that_leans_to_the_viewer(braced: Record) 
 
 
 def test_a_snake_has_fingers_that_close(robots: dict[str, Record]) -> None:
-    """Two blocks about the hand, nearer to each other when closed, and a stem where its link ends before it."""
+    """Two blocks up to the tip, nearer to each other when closed, and a stem if the link ends before the tip."""
     snake = robots["snake"]
     film = Film({"one": snake}, view="top", plot="", size=(640, 480))
     robot, camera = film.painters["one"].robot, film.painters["one"].camera
@@ -270,16 +270,17 @@ def test_a_snake_has_fingers_that_close(robots: dict[str, Record]) -> None:
         assert fingers.sum() == 16
         tips = (solids.corners + solids.aside[int(closed)])[fingers] - robot.scene.hand.position
         apart.append(2.0 * np.abs(tips[:, 1]).min())
-        assert tips[:, 0].min() < 0.0 < tips[:, 0].max()
+        np.testing.assert_allclose(tips[:, 0].max(), snake.scene.tip, atol=1e-12)
         # They are lit: the tint is darkened.
         shown = np.asarray(painter.frame(0.0)).astype(int)
         tinted = np.argwhere((shown[..., 0] - shown[..., 1] > 60) & (shown[..., 2] - shown[..., 1] > 60))[:, ::-1]
         assert len(tinted) > 20
-        np.testing.assert_allclose(tinted.mean(axis=0), hand_mark(painter, 0.0), atol=0.05 * camera.scale / FINER)
+        ahead = hand_mark(painter, 0.0) + np.array([tips[:, 0].mean() * camera.scale / FINER, 0.0])
+        np.testing.assert_allclose(tinted.mean(axis=0), ahead, atol=0.02 * camera.scale / FINER)
     assert apart[0] > 2.0 * apart[1] > 0.0
     for ahead, count in ((0.0905, 0), (0.1805, 1)):
         hand = replace(snake.scene.hand, position=(ahead, 0.0, 0.0))
-        shapes = body_shapes(replace(snake.scene, points=(hand,)), 1.0, Meshes())
+        shapes = body_shapes(replace(snake.scene, points=(hand,), tip=0.0), 1.0, Meshes())
         stems = [shape["p"][0] for own in shapes for shape in own if shape.get("role") == "stem"]
         assert stems == count * [0.5 * ahead]
 

@@ -74,7 +74,7 @@ PHRASES = {
     "impact row": "impact loss",
     "ledger row": "ledger residual",
     # Legends and titles of figures.
-    "gear friction": "friction of the gear",
+    "gear friction": "friction",
     "impacts": "impacts",
     "no poses": "some joints were not recorded",
     "no scene": "has no scene",

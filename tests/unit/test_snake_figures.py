@@ -145,7 +145,7 @@ def test_modes_that_would_fill_the_chart_are_shares_of_time(monkeypatch):
     assert len(modes) == len(np.unique(record["mode"]))
     np.testing.assert_allclose(modes.sum(axis=0), 1.0, atol=1e-12)
     # Below them range and lowest value of each part.
-    for name, signal, scale in (("σ_min of B̃", "sigma_min", 1.0), ("support margin", "support_margin", 1e3)):
+    for name, signal, scale in (("of B̃", "sigma_min", 1.0), ("support margin", "support_margin", 1e3)):
         (axis,) = [axis for axis in figure.axes if name in axis.get_ylabel()]
         values = [scale * record[signal][rows] for rows in parts]
         stairs = axis.patches[0].get_data()
@@ -340,10 +340,40 @@ def test_servos_beside_their_limits(simulated):
         assert any(says(text.get_text(), "gear friction") for text in axis.get_legend().texts) == (friction > 0.0)
         assert axis.get_ylim()[0] < -stall < stall < axis.get_ylim()[1]
     worst = record.summary["worst_joint"]
-    (line,) = [line for name, line in lines(figure.axes[0]).items() if name.startswith("ψ2: rms")]
+    (line,) = [line for name, line in lines(figure.axes[0]).items() if name.startswith("ψ2 rms")]
     assert worst["joint"] == "psi2"
-    assert line.get_label() == f"ψ2: rms {worst['torque_rms_N_m']:.2f} N m"
+    assert line.get_label() == f"ψ2 rms {worst['torque_rms_N_m']:.2f} N m"
     np.testing.assert_array_equal(line.get_ydata(), record["torque"][:, record.labels["torque"].index("psi2")])
+
+
+@pytest.mark.parametrize("draw", [snake_tasks.servos, snake_tasks.servo_loads])
+def test_servo_above_its_stall_torque_is_shown_and_named(simulated, draw):
+    record = copy.copy(simulated("snake_valve", "turns"))
+    assert "9.3" not in drawn(draw, record).caption
+    record.summary = copy.deepcopy(record.summary)
+    motor = next(motor for motor in record.summary["motors"] if motor["joint"] == "psi3")
+    motor["torque_max_N_m"] = 9.3
+    figure = drawn(draw, record)
+    assert mentions(figure.caption, "ψ3", "9.30 N m")
+    assert figure.axes[0].get_ylim()[1] > 9.3
+
+
+def test_earlier_postures_of_a_push_end_before_the_plate():
+    """All postures of the side view are along one axis, so no head appears behind the plate that it pushes."""
+    record = simulate(load_scenario("snake_push", "i_x", {"duration_s": 2.0}))
+    assert record.scene.grip is None
+    plate = 0.34876
+    side = drawn(figures.overview, record).axes[1]
+    heads = [line.get_xdata()[0] for line in side.lines if line.get_marker() == "o"]
+    assert len(heads) == figures.IN_A_PICTURE
+    x, y, yaw = record["base_pose"][-1]
+    expected = (record["posture"][snake_view.moments(record, figures.IN_A_PICTURE), 0, :2] - [x, y]) @ [
+        np.cos(yaw),
+        np.sin(yaw),
+    ]
+    np.testing.assert_allclose(heads, expected, atol=1e-9)
+    assert np.ptp(heads) > 0.02
+    assert max(heads) < plate - x
 
 
 def test_each_servo_has_a_bar_below_its_limits(simulated):
@@ -422,7 +452,7 @@ def test_the_valve_beside_the_head_that_turns_it(simulated):
     turned = np.rad2deg(record["q"][:, record.labels["q"].index("valve")])
     (valve,) = [line for name, line in lines(angle).items() if name.startswith("valve: ")]
     np.testing.assert_array_equal(valve.get_ydata(), turned)
-    target = lines(angle)["its target"]
+    target = lines(angle)["target of the gripper"]
     assert target.get_xdata()[[0, -1]] == pytest.approx([7.0, 18.495], abs=0.01)
     assert target.get_ydata()[[0, -1]] == pytest.approx([0.0, 90.0], abs=0.1)
     friction = record["joint_friction"][:, record.labels["joint_friction"].index("valve")]
@@ -460,7 +490,7 @@ def test_the_pipe_is_drawn_and_rises(simulated):
     assert np.ptp(pipe.get_ydata()) == pytest.approx(160.0, abs=5.0)
     weight = 0.2 * 9.81
     rows = record.time.searchsorted([10.0, 25.0])
-    assert lines(ground)["pipe"].get_ydata()[rows] == pytest.approx([weight, 0.0], abs=0.01)
+    assert ground.lines[0].get_ydata()[rows] == pytest.approx([weight, 0.0], abs=0.01)
     strip = drawn(makers["fig_13"], record)
     assert any(mentions(text.get_text(), "object") for text in strip.legends[0].texts)
     wood = [patch for axis in strip.axes for patch in axis.patches if patch.get_facecolor() == to_rgba("#E9CFA6")]

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from dynsim.draw import film
@@ -24,6 +25,7 @@ from dynsim.draw.figures.snake_view import (
     NUMBERED,
     ROUNDING,
     View,
+    curve_styles,
     error_axis,
     greek,
     interval_starts,
@@ -85,6 +87,9 @@ def comparison(records: Mapping[str, Record]) -> Figure:
     figure = style.new_figure(6.6 + 0.2 * (len(records) > 6), title)
     axes = figure.subplots(4, 1, sharex=True)
     looks, entries = style.family_styles(list(records))
+    if len(records) <= len(style.DASHES):
+        looks = curve_styles(list(records))
+        entries = {name: Line2D([], [], **look) for name, look in looks.items()}
     overlay_margins(axes[:3], records, looks)
     errors = {name: 1e3 * record["position_error"] for name, record in records.items()}
     for name, record in records.items():
@@ -129,7 +134,7 @@ def overview(record: Record) -> Figure:
 def tracking(record: Record) -> Figure:
     """Draw the six coordinates of the controlled point with their targets, and the errors."""
     columns = 1 if style.narrow() else 2
-    figure = style.new_figure(8.6 / columns + 2.0, style.title(record, "controlled point and its target"))
+    figure = style.new_figure(6.3 if columns == 2 else 8.4, style.title(record, "tracking of the target"))
     axes = figure.subplots(8 // columns, columns, sharex=True, squeeze=False)
     panels, time = list(axes.T.ravel()), record.time
     parts = (("position", range(3), 1.0, "m", 2e-3), ("attitude", range(3, 6), DEGREES, "°", 0.2))
@@ -163,10 +168,10 @@ def joints(record: Record) -> Figure:
         ("yaw of the base", np.arange(n_h, len(labels))),
     ]
     parts = [(title, group) for title, group in parts if len(group)]
-    figure = style.new_figure(2.0 * len(parts) + 0.4, style.title(record, "joint angles and their limits"))
+    figure = style.new_figure(2.0 * len(parts) + 0.4, style.title(record, "joint angles and limits"))
     axes = figure.subplots(len(parts), 1, sharex=True, squeeze=False)[:, 0]
     for axis, (title, group) in zip(axes, parts, strict=True):
-        looks = style.variant_styles(group.tolist())
+        looks = curve_styles(group.tolist())
         for j in group.tolist():
             axis.plot(record.time, phi[:, j], label=greek(labels[j]), **looks[j])
             out = record["at_limit"][:, j] > 0
@@ -174,7 +179,7 @@ def joints(record: Record) -> Figure:
         for limit in sorted({*upper[group], *lower[group]}):
             limit_line(axis, DEGREES * limit, "limits" if limit == max(upper[group]) else "")
         axis.set_ylabel(f"{title} [°]")
-        style.legend_beside(axis, 6)
+        style.legend_beside(axis, 3)
     axes[-1].set_xlabel("time [s]")
     axes[-1].set_xlim(record.time[0], record.time[-1] or None)
     if record["at_limit"].any():
@@ -197,7 +202,7 @@ def redundancy(record: Record) -> Figure:
     cost.set_ylim(bottom=0)
     dense = len(mode_starts(record)) > NUMBERED
     _over_time(sigma, record, record["sigma_min"], dense)
-    sigma.set_ylabel("smallest singular\nvalue σ_min of B̃")
+    sigma.set_ylabel("smallest singular\nvalue of B̃")
     sigma.set_ylim(bottom=0)
     _over_time(margin, record, 1e3 * record["support_margin"], dense)
     margin.set_ylim(bottom=min(0.0, 1e3 * float(record["support_margin"].min())) - 4)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from dynsim.draw.figures import style
-from dynsim.draw.figures.snake_view import BODY, GROUND, HEAD, TARGET, greek, object_bodies, pair_wheels
+from dynsim.draw.figures.snake_view import BODY, GROUND, HEAD, TARGET, curve_styles, greek, object_bodies, pair_wheels
 from dynsim.draw.figures.style import Array
 from dynsim.record import Record
 from dynsim.record.measures import GRIPPER_STATES
@@ -61,45 +61,68 @@ def _kinds(record: Record) -> dict[tuple[float, float, float], list[dict[str, An
 
 
 def servos(record: Record) -> Figure:
-    """Draw the shaft torques with stall torque, nominal torque and gear friction; servos of one type share a panel."""
+    """Draw the shaft torques with stall torque, nominal torque and gear friction; servos of one type share a panel.
+
+    If a joint is driven back, the gear friction adds to the torque of the motor, and the back EMF to its voltage. The
+    shaft torque may then exceed the stall torque.
+    """
     kinds = _kinds(record)
     heights = [1.0 if k == 0 else 0.6 for k in range(len(kinds))]
-    # In a narrow figure the legends are above the panels.
-    legends = 8 * len(kinds) * style.legend_row() / 72.0 if style.narrow() else 0.0
-    title = style.title(record, "torques of the servos and their limits")
-    figure = style.new_figure(0.9 + 3.4 * sum(heights) + 0.6 * legends, title)
+    # In a narrow figure the legends are above the panels, in two columns.
+    legends = 4 * len(kinds) * style.legend_row() / 72.0 if style.narrow() else 0.0
+    title = style.title(record, "servo torques and limits")
+    figure = style.new_figure(0.9 + 2.9 * sum(heights) + legends, title)
     axes = figure.subplots(len(kinds), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]
     for axis, ((stall, nominal, friction), motors) in zip(axes, kinds.items(), strict=True):
         order = sorted(motors, key=lambda motor: -motor["torque_rms_N_m"])
-        colours = dict(zip((m["joint"] for m in order), style.VARIANT_COLOURS[:LOADED], strict=False))
+        looks = curve_styles([motor["joint"] for motor in order[:LOADED]])
         for k, motor in enumerate(order):
             name = motor["joint"]
             values = record["torque"][:, record.labels["torque"].index(name)]
-            label = f"{greek(name)}: rms {motor['torque_rms_N_m']:.2f} N m" if name in colours else None
+            label = f"{greek(name)} rms {motor['torque_rms_N_m']:.2f} N m" if name in looks else None
             # The most loaded servos are on top.
-            look = {"color": colours.get(name, FAINT), "lw": 1.1 if name in colours else 0.6, "zorder": 3.0 - 0.01 * k}
-            axis.plot(record.time, values, label=label, **look)
+            look = looks.get(name, {"color": FAINT, "linewidth": 0.6})
+            axis.plot(record.time, values, label=label, zorder=3.0 - 0.01 * k, **look)
         if len(order) > LOADED:
             axis.plot([], [], color=FAINT, lw=0.6, label=f"{len(order) - LOADED} others")
-        _both(axis, stall, f"stall torque {stall:g} N m", color=HEAD, ls="--", lw=0.9)
+        _both(axis, stall, f"stall {stall:g} N m", color=HEAD, ls="--", lw=0.9)
         if nominal:
-            _both(axis, nominal, f"nominal, rms: {nominal:g} N m", color="black", ls=":", lw=0.9)
+            _both(axis, nominal, f"nominal {nominal:g} N m", color="black", ls=":", lw=0.9)
         if friction:
-            label = f"friction of the gear {friction:g} N m,\ncarried without current"
+            label = f"friction {friction:g} N m"
             axis.axhspan(-friction, friction, color=style.SKY, alpha=0.25, lw=0, zorder=0, label=label)
-        axis.set(xlim=(record.time[0], record.time[-1]), ylim=(-1.1 * stall, 1.1 * stall), ylabel="torque [N m]")
+        reach = _reach(stall, motors)
+        axis.set(xlim=(record.time[0], record.time[-1]), ylim=(-reach, reach), ylabel="torque [N m]")
         style.legend_beside(axis)
     axes[-1].set_xlabel("time [s]")
+    if any(friction for _, _, friction in kinds):
+        figure.note("Nominal: limit of the rms torque. Friction: what the gear carries without current.")
+    _explain_excess(figure, kinds)
     return figure
+
+
+def _reach(stall: float, motors: list[dict[str, Any]]) -> float:
+    """Return the end of an axis that shows the stall torque and the largest torque of servos [N m]."""
+    return 1.1 * max(stall, *(motor["torque_max_N_m"] for motor in motors))
+
+
+def _explain_excess(figure: style.Drawing, kinds: Mapping[tuple[float, float, float], list[dict[str, Any]]]) -> None:
+    """Add a note if the shaft torque of a servo exceeds its stall torque."""
+    above = [m for (stall, *_), motors in kinds.items() for m in motors if m["torque_max_N_m"] > 1.001 * stall]
+    if above:
+        worst = max(above, key=lambda motor: motor["torque_max_N_m"] / motor["stall_torque_N_m"])
+        figure.note(
+            f"{greek(worst['joint'])}: {worst['torque_max_N_m']:.2f} N m exceeds the stall torque. The servo is driven "
+            "back; gear friction and back EMF add to its torque."
+        )
 
 
 def servo_loads(record: Record) -> Figure:
     """Draw the rms and largest torque of each servo next to its nominal torque and its stall torque."""
     kinds = _kinds(record)
     below = style.narrow()
-    figure = style.new_figure(
-        2.9 * (len(kinds) if below else 1) + 0.5, style.title(record, "torque of each servo and its limits")
-    )
+    figure = style.new_figure(2.9 * (len(kinds) if below else 1) + 0.5, style.title(record, "load of each servo"))
+    peaks: list[str] = []
     ratios = [len(motors) + 2.0 for motors in kinds.values()]
     shape: Any = {"height_ratios": [1.0] * len(kinds)} if below else {"width_ratios": ratios}
     axes = figure.subplots(len(kinds) if below else 1, 1 if below else len(kinds), squeeze=False, **shape).ravel()
@@ -117,9 +140,15 @@ def servo_loads(record: Record) -> Figure:
         if nominal:
             axis.axhline(nominal, color="black", ls=":", lw=1.0, label="nominal torque")
         axis.set_xticks(places, [greek(motor["joint"]) for motor in motors], rotation=90)
-        axis.set(xlim=(-0.7, len(motors) - 0.3), ylim=(0.0, 1.08 * stall), ylabel="torque [N m]")
+        axis.set(xlim=(-0.7, len(motors) - 0.3), ylim=(0.0, _reach(stall, motors)), ylabel="torque [N m]")
         axis.grid(axis="x", visible=False)
+        worst = max(motors, key=lambda motor: motor["torque_max_N_m"])
+        torque = np.abs(record["torque"][:, record.labels["torque"].index(worst["joint"])])
+        time = record.time[torque.argmax()]
+        peaks.append(f"{greek(worst['joint'])} {worst['torque_max_N_m']:.3g} N m at {time:.3g} s")
     style.legend_below(figure, list(axes), 5)
+    figure.note(f"Largest torques: {'; '.join(peaks)}.")
+    _explain_excess(figure, kinds)
     return figure
 
 
@@ -146,24 +175,29 @@ def power(record: Record) -> Figure:
 
 def wheels(record: Record) -> Figure:
     """Draw the load of each wheel pair, the times at which wheels on the ground carry nothing, and slip speeds."""
-    figure = style.new_figure(6.2 + 0.6 * style.narrow(), style.title(record, "loads and slip of the wheels"))
+    figure = style.new_figure(6.2 + 0.6 * style.narrow(), style.title(record, "wheel loads and slip"))
     axes = figure.subplots(3, 1, sharex=True, height_ratios=[1.0, 0.9, 1.0])
     time, pairs = record.time, pair_wheels(record)
-    looks = style.variant_styles(list(pairs))
     grounded = record["grounded"] > 0
     slip = 1e3 * np.linalg.norm(record["contact_slip_velocity"], axis=2)
     loads = record["contact_normal_force"]
+    # Pairs that are in the air during the whole run have no curves.
+    looks = curve_styles([pair for pair, columns in pairs.items() if loads[:, columns].any()])
     for k, (pair, columns) in enumerate(pairs.items()):
-        axes[0].plot(time, loads[:, columns].sum(axis=1), label=pair, **(looks[pair] | {"linewidth": 1.0}))
         touching = loads[:, columns] > 0.0
         bare = grounded[:, k] & ~touching.all(axis=1)
-        for where, colour, label in ((grounded[:, k], GROUND, "on the ground"), (bare, HEAD, "a wheel lifts off")):
+        for where, colour, label in (
+            (grounded[:, k], GROUND, "on the ground"),
+            (bare, style.ORANGE, "a wheel lifts off"),
+        ):
             if where.any():
                 axes[1].fill_between(
                     time, k + 0.62, k + 1.38, where=where, step="post", color=colour, lw=0, label=label
                 )
-        # Wheels in the air do not slip.
-        axes[2].plot(time, np.where(touching, slip[:, columns], 0.0).max(axis=1), **(looks[pair] | {"linewidth": 1.0}))
+        if pair in looks:
+            axes[0].plot(time, loads[:, columns].sum(axis=1), label=pair, **looks[pair])
+            # Wheels in the air do not slip.
+            axes[2].plot(time, np.where(touching, slip[:, columns], 0.0).max(axis=1), **looks[pair])
     axes[0].set_ylabel("load of the pair\n[N]")
     axes[0].set_ylim(bottom=0.0)
     axes[1].set(ylim=(len(pairs) + 0.5, 0.5), ylabel="wheel pair", yticks=range(1, len(pairs) + 1))
@@ -173,7 +207,7 @@ def wheels(record: Record) -> Figure:
     axes[2].set_ylim(bottom=0.0)
     axes[2].set(xlabel="time [s]", xlim=(time[0], time[-1] or None))
     figure.align_ylabels(axes)
-    style.legend_below(figure, axes[:2], 5)
+    style.legend_below(figure, axes[:2], 7)
     contacts = {contact["name"]: contact for contact in record.summary.get("contacts", ())}
     named = [contacts[record.labels["contact_normal_force"][k]] for columns in pairs.values() for k in columns]
     slipped = max((1e3 * contact["slip_distance_m"], contact["name"]) for contact in named)
@@ -198,8 +232,8 @@ def gripper(record: Record) -> Figure:
         bounds = (None, None) if grip is None else (grip.force, grip.torque)
         parts = (("force [N]", "N", bounds[0], ""), ("torque [N m]", "N m", bounds[1], "about "))
         for axis, values, (label, unit, bound, about) in zip(axes[1:], np.split(forces, 2, axis=1), parts, strict=True):
-            for name, column in zip("xyz", values.T, strict=True):
-                axis.plot(record.time, column, color=style.AXIS_COLOURS[name], label=f"{about}{name}")
+            for (name, look), column in zip(curve_styles("xyz").items(), values.T, strict=True):
+                axis.plot(record.time, column, label=f"{about}{name}", **look)
             style.at_least(axis, 1e-3)
             if bound is not None:
                 _both(axis, bound, f"bound {bound:g} {unit}", color=HEAD, ls="--", lw=0.9)
@@ -249,10 +283,13 @@ def _moved(axis: Axes, record: Record, name: str, body: int) -> None:
     scale, unit = (180.0 / np.pi, "°") if turns else (1e3, "mm")
     own = record["q"][:, record.labels["q"].index(name)]
     last = f"{style.number(scale * own[-1], 3)}{'' if turns else ' '}{unit}"
-    axis.plot(record.time, scale * own, color="black", lw=2.4, label=f"{name}: {last}")
+    axis.plot(record.time, scale * own, color="black", lw=1.2, label=f"{name}: {last}")
     for start, end in _holds(record, name):
         rows = slice(start, end)
-        drawn = (("w", "gripper", style.BLUE, "-"), ("w_target", "its target", TARGET, "--"))
+        drawn = (
+            ("w", "gripper", style.SKY, style.DASHES[1]),
+            ("w_target", "target of the gripper", HEAD, style.DASHES[2]),
+        )
         for signal, label, colour, dashes in drawn:
             along = own[start] + _followed(record, record[signal][rows], body)
             axis.plot(record.time[rows], scale * along, color=colour, ls=dashes, lw=1.1, label=label)
@@ -294,7 +331,7 @@ def _loaded(axis: Axes, record: Record, name: str, loads: dict[str, Array]) -> N
         axis.plot(record.time, values, color=colour, label=text)
     style.at_least(axis, 1e-3)
     axis.axhline(0.0, color=style.GREY, lw=0.6)
-    axis.set_ylabel(f"hinge on {name}\n[N m]" if hinge else f"rails on {name}\n[N]")
+    axis.set_ylabel(f"torque of the hinge\non {name} [N m]" if hinge else f"force of the rails\non {name} [N]")
 
 
 def _height(axis: Axes, record: Record, name: str, body: int) -> None:
@@ -302,13 +339,13 @@ def _height(axis: Axes, record: Record, name: str, body: int) -> None:
     axis.plot(record.time, 1e3 * record["w_target"][:, 2], "--", color=TARGET, lw=1.0, label="target of the snake")
     axis.plot(record.time, 1e3 * record["w"][:, 2], color=style.BLUE, lw=1.0, label="controlled point")
     rise = style.number(round(float(height[-1] - height[0]), 1) + 0.0)
-    axis.plot(record.time, height, color="black", lw=1.4, label=f"{name}: rises by {rise} mm")
+    axis.plot(record.time, height, color="black", lw=1.2, label=f"{name}: rises by {rise} mm")
     axis.set_ylabel("height [mm]")
 
 
 def _standing(axis: Axes, record: Record, name: str, columns: list[int]) -> None:
-    axis.plot(record.time, record["contact_normal_force"][:, columns].sum(axis=1), color=style.ORANGE, label=name)
-    axis.set_ylabel("surfaces carry [N]")
+    axis.plot(record.time, record["contact_normal_force"][:, columns].sum(axis=1), color=style.ORANGE)
+    axis.set_ylabel(f"load of {name}\non surfaces [N]")
     axis.set_ylim(bottom=0.0)
 
 
@@ -347,7 +384,8 @@ def _finish(axes: Array, record: Record) -> None:
         for kind, times in happened.items():
             for time in times:
                 axis.axvline(time, color="#555555", ls=EVENTS[kind], lw=0.8, label=f"_{kind}")
-        style.legend_beside(axis)
+        if axis.get_legend_handles_labels()[1]:
+            style.legend_beside(axis)
     # Add one legend below all panels.
     named = {h.get_label(): h for h in (*axes[0].collections, *axes[0].lines) if str(h.get_label()).startswith("_")}
     texts = [*STATES, *EVENTS]

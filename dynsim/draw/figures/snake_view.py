@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from dynsim.draw.figures import style
 from dynsim.draw.figures.posture import add_outlines, draw_cuts
-from dynsim.draw.figures.style import Array
+from dynsim.draw.figures.style import Array, T
 from dynsim.draw.geometry.projection import ABOVE, UP, Projection
 from dynsim.draw.geometry.shapes import corners_of, wheel_groups
 from dynsim.errors import RecordError
@@ -137,7 +137,9 @@ def _columns(count: int) -> int:
     return -(-count // -(-count // most))
 
 
-def _grid(title: str, rows: Sequence[Sequence[Box]], columns: int, lines: int) -> tuple[style.Drawing, NDArray[Any]]:
+def _grid(
+    title: str, rows: Sequence[Sequence[Box]], columns: int, lines: int, *, labelled: bool = False
+) -> tuple[style.Drawing, NDArray[Any]]:
     """Create axes in rows of ``columns`` cells; a cell has one panel per box, below each other, at one scale.
 
     Parameters
@@ -150,13 +152,18 @@ def _grid(title: str, rows: Sequence[Sequence[Box]], columns: int, lines: int) -
         Number of cells in a row.
     lines : int
         Number of lines of the titles of cells.
+    labelled : bool, optional
+        Whether every cell has tick labels on its left, and not only the first one of a row.
     """
     # A single cell is not so wide that it would be higher than TALLEST.
-    cell = min((style.width() - 0.7) / columns, *(TALLEST * (b[1] - b[0]) / (b[3] - b[2]) for row in rows for b in row))
+    left = 0.7 + labelled * (columns - 1) * style.letters(24.0) / 72.0
+    cell = min(
+        (style.width() - left) / columns, *(TALLEST * (b[1] - b[0]) / (b[3] - b[2]) for row in rows for b in row)
+    )
     heights = [max(cell * (box[3] - box[2]) / (box[1] - box[0]), LOWEST) for row in rows for box in row]
     ticks = len(heights) if len(heights) > len(rows) else 1
     texts = ticks * style.letters(18.0) + len(rows) * style.letters(6.0 + 10.0 * lines)
-    figure = style.new_figure(sum(heights) + texts / 72.0 + 1.2, title)
+    figure = style.new_figure(sum(heights) + texts / 72.0 + 0.8, title)
     axes = figure.subplots(len(heights), columns, squeeze=False, height_ratios=heights)
     for panel in axes.ravel():
         panel.set_aspect("equal", adjustable="box")
@@ -220,17 +227,20 @@ def posture_grid(
                 view.draw(panel, above=above)
             first = column == 0 and label.strip() and view is lines[label][0][0]
             panels[0].set_title((f"{label}\n" if first else "") + texts[id(view)], fontsize=size)
-    _explain(figure, pooled, {"its path": Line2D([], [], color=HEAD, lw=1.0)})
+    _explain(figure, pooled, {"path of the point": Line2D([], [], color=HEAD, lw=1.0)})
     return figure
 
 
 def overlaid(title: str, runs: Mapping[str, tuple[Record, Sequence[View]]]) -> Figure:
-    """Draw one cell for each run: postures over time, earlier ones in lighter grey, and paths on the ground.
+    """Draw one cell for each run: postures and objects over time, earlier ones lighter, and paths on the ground.
 
     Cells have one scale. If a point of the body rises or sinks by more than ``RISES``, or the robot is straight, a side
-    view along the heading of the base is added below.
+    view along the last heading of the base is added below.
     """
     views = [view for _, line in runs.values() for view in line]
+    for _, line in runs.values():
+        for view in line:
+            view.beside = line[-1].beside
     high = [np.stack([view.points[:, 2] for view in line]) for _, line in runs.values()]
     side = max(float(np.ptp(heights, axis=0).max()) for heights in high) > RISES
     tops, sides = [], []
@@ -252,7 +262,8 @@ def overlaid(title: str, runs: Mapping[str, tuple[Record, Sequence[View]]]) -> F
         cells.append([(x - half[0], x + half[0], y - half[1], y + half[1]), profile][: 1 + side])
     starts = range(0, len(runs), columns)
     lines = max(label.count("\n") + bool(label) for label in labels)
-    figure, axes = _grid(title, [cells[start] for start in starts], columns, lines)
+    uneven = [cells[k][0][2:] != cells[k - k % columns][0][2:] for k in range(len(cells))]
+    figure, axes = _grid(title, [cells[start] for start in starts], columns, lines, labelled=any(uneven))
     for k, ((record, line), label) in enumerate(zip(runs.values(), labels, strict=True)):
         row, column = divmod(k, columns)
         used = min(columns, len(runs) - row * columns)
@@ -260,8 +271,10 @@ def overlaid(title: str, runs: Mapping[str, tuple[Record, Sequence[View]]]) -> F
         for panel, above in zip(panels, (True, False), strict=False):
             for shade, view in zip(np.linspace(0.82, 0.4, len(line) - 1), line, strict=False):
                 view.draw_body(panel, above, str(shade), str(shade))
+                outlines = (view.project(corners, above) for corners in view.objects)
+                add_outlines(panel, outlines, fc="none", ec=str(shade), lw=0.5, zorder=1.4)
             line[-1].draw(panel, above=above)
-        if column > 0 and not side:
+        if uneven[k]:
             panels[0].tick_params(labelleft=True)
         panels[0].plot(*record["base_pose"][:, :2].T, color=GROUND, lw=0.8, zorder=2)
         panels[0].plot(*record["w"][:, :2].T, color=HEAD, lw=1.0, zorder=5.5)
@@ -269,8 +282,8 @@ def overlaid(title: str, runs: Mapping[str, tuple[Record, Sequence[View]]]) -> F
         panels[0].set_title(label, fontsize=size)
     more: dict[str, Any] = {
         "earlier posture": Line2D([], [], color="0.65", lw=1.8),
-        "its path": Line2D([], [], color=HEAD, lw=1.0),
-        "its target": Line2D([], [], color=TARGET, ls="--", lw=1.0),
+        "path of the point": Line2D([], [], color=HEAD, lw=1.0),
+        "target of the point": Line2D([], [], color=TARGET, ls="--", lw=1.0),
         "path of pair 1": Line2D([], [], color=GROUND, lw=0.8),
     }
     _explain(figure, views, more)
@@ -433,6 +446,15 @@ def _not_flat(box: tuple[float, float, float, float]) -> tuple[float, float, flo
     x0, x1, y0, y1 = box
     more = max(0.0, MIN_HEIGHT * (x1 - x0) - (y1 - y0)) / 2
     return x0, x1, y0 - more, y1 + more
+
+
+def curve_styles(names: Sequence[T]) -> dict[T, dict[str, Any]]:
+    """Return the look of each curve of a panel: colours and line styles both differ, so that grey prints are clear."""
+    colours, dashes = style.VARIANT_COLOURS, style.DASHES
+    return {
+        name: {"color": colours[k % len(colours)], "linestyle": dashes[k % len(dashes)], "linewidth": 1.1}
+        for k, name in enumerate(names)
+    }
 
 
 def greek(name: str) -> str:

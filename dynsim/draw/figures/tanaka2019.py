@@ -20,6 +20,7 @@ from dynsim.draw.figures.snake_view import (
     HEAD,
     SYMBOLS,
     View,
+    curve_styles,
     greek,
     mode_chart,
     overlay_margins,
@@ -114,7 +115,7 @@ def _deviations(records: Mapping[str, Record], sources: Mapping[str, str]) -> Fi
         axis.margins(y=0.08)
         axis.set_ylabel(f"{_name(i)} [{'mm' if i < 3 else 'mrad'}]")
     axes[-1].set_xlim(-0.6, len(moved) - 0.4)
-    axes[-1].set_xticks(places, [SYMBOLS.get(m, m) for m in moved])
+    axes[-1].set_xticks(places, [_name(COORDINATES.index(m)).split()[-1] for m in moved])
     axes[-1].set_xlabel("coordinate that was moved")
     figure.align_ylabels(axes)
     style.legend_below(figure, [axes[0]], 2)
@@ -137,7 +138,7 @@ def sag_and_feedback(records: Mapping[str, Record]) -> Figure:
         record = records[name]
         for i, axis in enumerate(column):
             axis.plot(record.time, record["w"][:, i], color=GROUND, label="simulated")
-            axis.plot(record.time, record["w_target"][:, i], ":", color="red", lw=1.4, label="target")
+            axis.plot(record.time, record["w_target"][:, i], "--", color=HEAD, lw=1.0, label="target")
             style.at_least(axis, 0.02)
         column[0].set_title(title, fontsize=style.letters(8.0))
         column[-1].set_xlabel("time [s]")
@@ -153,12 +154,14 @@ def wheel_loads(records: Mapping[str, Record]) -> Figure:
     moved = [name for name in TABLE_III if name in records]
     columns = 1 if style.narrow() else 2
     rows = -(-len(moved) // columns)
+    loads = {name: pair_loads(records[name]) for name in moved}
+    looks = curve_styles([pair for pair in loads[moved[0]] if any(load[pair].any() for load in loads.values())])
     figure = style.new_figure(1.3 * rows + 1.3, "loads of the wheel pairs by the coordinate that was moved")
     axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
     for axis, name in zip(axes.ravel(), moved, strict=False):
         record = records[name]
-        for pair, load in pair_loads(record).items():
-            axis.plot(record.time, load, lw=0.9, label=pair)
+        for pair, look in looks.items():
+            axis.plot(record.time, loads[name][pair], label=pair, **look)
         axis.set_title(f"moving {SYMBOLS.get(name, name)}", fontsize=style.letters(8.0))
         axis.set_ylim(bottom=0.0)
     for axis in axes.ravel()[len(moved) :]:
@@ -198,7 +201,7 @@ def head_and_cost(record: Record) -> Figure:
         scale, error, unit = (1e3, HEAD_ERROR[0], "mm") if i < 3 else (1.0, HEAD_ERROR[1], "rad")
         target = scale * record["w_target"][:, i]
         axis.plot(time, scale * record["w"][:, i], color=GROUND, label="simulated")
-        axis.plot(time, target, ":", color="red", lw=1.4, label="target")
+        axis.plot(time, target, "--", color=HEAD, lw=1.0, label="target")
         low, high, label = target - scale * error, target + scale * error, "errors in [T]: about 30 mm, 0.1 rad"
         axis.fill_between(time, low, high, color=VARIANT_COLOURS[4], alpha=0.25, lw=0, label=label)
         style.at_least(axis, 4 * scale * error)
@@ -237,7 +240,7 @@ def joint_angles(record: Record) -> Figure:
         out, label = record["at_limit"][:, j] > 0, "excluded from allocation at its limit"
         axis.plot(record.time[out], phi[out, j], ".", color=HEAD, ms=3, label=label)
         if "phi_command" in record:
-            axis.plot(record.time, record["phi_command"][:, j], ":", color="red", lw=1.2, label="commanded")
+            axis.plot(record.time, record["phi_command"][:, j], "--", color=HEAD, lw=1.0, label="commanded")
         reach = 1.15 * geometry.upper[j]
         axis.set(ylim=(-reach, reach), ylabel=f"{greek(names[j])} [rad]")
     for axis in axes[-1]:

@@ -365,7 +365,7 @@ class Painter:
         hand = self.robot.scene.hand
         if hand is None or self._gripped == WORLD:
             return []
-        both = gripper(shapes, self.robot.reach)
+        both = gripper(shapes, self.robot.scene, self.robot.reach)
         position = np.array(hand.position) + np.array([both["ahead"], 0.0, 0.0])
         shape = {"kind": "box", "size": both["size"], "p": position.tolist(), "q": list(HERE)}
         return [(shape, side * np.outer(both["aside"], [0.0, 1.0, 0.0])) for side in (-1.0, 1.0)]

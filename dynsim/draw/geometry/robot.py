@@ -68,7 +68,7 @@ class DrawnRobot:
         shapes = body_shapes(self.scene, self.reach, meshes)
         hand = self.scene.hand
         if hand is not None and hand.body != WORLD and gripping(self.record) is not None:
-            both = gripper(shapes, self.reach)
+            both = gripper(shapes, self.scene, self.reach)
             length, width, height = both["size"]
             position = (np.array(hand.position) + np.array([both["ahead"], 0.0, 0.0])).tolist()
             size = [length, width + 2.0 * both["aside"][0], height]
@@ -80,6 +80,8 @@ class DrawnRobot:
 
 def gripping(record: Record) -> Array | None:
     """Return the state of the gripper, (T,): the number of the state, or 1 if closed; None without a gripper."""
+    if record.scene is None or record.scene.grip is None:
+        return None
     return next((record[name] for name in ("gripper_state", "gripper") if name in record), None)
 
 

@@ -250,10 +250,11 @@ def _payloads(scene: Scene, k: int) -> list[dict[str, Any]]:
 
 
 def _stems(scene: Scene, k: int) -> list[dict[str, Any]]:
-    """Return thin rods from a body to the hand if the first shape of the body ends before the hand."""
+    """Return thin rods from a body to the hand or the tip of its gripper if the first shape of the body ends before."""
     tube = scene.bodies[k].shapes[0]
     far = float(np.linalg.norm(tube.position)) + 0.5 * tube.size[1] + tube.size[0]
-    ends = [np.array(point.position) for point in scene.points if point.role == "hand" and point.body == k]
+    tip = np.array([scene.tip, 0.0, 0.0])
+    ends = [np.array(point.position) + tip for point in scene.points if point.role == "hand" and point.body == k]
     return [_rod(end, 0.5 * tube.size[0]) | {"role": "stem"} for end in ends if np.linalg.norm(end) > far]
 
 
@@ -263,13 +264,14 @@ def thinnest(shapes: list[list[dict[str, Any]]]) -> float:
     return min((s["size"][0] for s in rods if s.get("role") not in ("stem", "pad")), default=0.0)
 
 
-def gripper(shapes: list[list[dict[str, Any]]], reach: float) -> dict[str, Any]:
-    """Return two gripper fingers as boxes in the frame of the hand's body [m].
+def gripper(shapes: list[list[dict[str, Any]]], scene: Scene, reach: float) -> dict[str, Any]:
+    """Return two gripper fingers as boxes in the frame of the hand [m], which end at the tip of the gripper.
 
     The result contains their forward distance, and their lateral distances when open and when closed.
     """
     size = max(1.7 * thinnest(shapes), 0.012 * reach)
-    return {"size": [1.6 * size, 0.4 * size, 0.8 * size], "ahead": 0.5 * size, "aside": [0.8 * size, 0.28 * size]}
+    ahead = scene.tip - 0.8 * size
+    return {"size": [1.6 * size, 0.4 * size, 0.8 * size], "ahead": ahead, "aside": [0.8 * size, 0.28 * size]}
 
 
 def _is_tube(body: Body) -> bool:

@@ -302,7 +302,7 @@ def _record(name: str, robot: DrawnRobot, blocks: Blocks, meshes: Meshes, low: A
         part["pressure"] = {"name": pressure[0], "at": blocks.add(pressure[1][instants], 1e-4)}
     if (grip := gripping(record)) is not None and scene.hand is not None:
         part["gripper"] = blocks.add(grip[instants])
-        part["fingers"] = gripper(shapes, robot.reach)
+        part["fingers"] = gripper(shapes, scene, robot.reach)
         if "gripper_state" in record:
             part["states"] = list(GRIPPER_STATES)
     if scene.hand is not None:
