@@ -40,10 +40,11 @@ STEPS = tuple(1e-2 / 3.0**k for k in range(9))
 ZERO_ROW = 1e-6
 MODES = {ka.OPEN: "open", ka.SLIDING: "sliding", ka.STICKING: "sticking"}
 _AXES = "xyz"
-# Singular values below this fraction of the largest belong to directions that constraints block; they are rounding
-# errors of about 1e-13.
-BLOCKED = 1e-9
-# Largest part of the state equations that leaves the free directions, relative to the largest entry.
+# Singular value of the response to forces, per unit of kinetic energy, above which a direction is free. Constraints
+# project the response of unconstrained bodies, so that the values are 0 or at least 1.
+FREE = 0.5
+# Largest part of the rates of a free motion, per unit of kinetic energy, that leaves the free directions, relative to
+# these rates; rates below 1/s or 1/s² count as 1.
 TURNING = 1e-4
 
 
@@ -159,21 +160,29 @@ def _free_states(frozen: _Frozen, A: Array, n_q: int, n_v: int) -> Array:
     ScenarioError
         If the free directions turn so fast that the equations leave them.
     """
-    from scipy.linalg import block_diag  # imported here because it loads slowly
+    from scipy.linalg import block_diag, qr  # imported here because it loads slowly
 
     inputs, nothing = frozen.inputs(), np.zeros(0, dtype=int)
     pushes = [*inputs["force"].values(), *inputs["torque"].values()]
     # With fixed modes accelerations are linear in the forces, so one difference is exact.
-    rates = [push(nothing, np.ones(1)) - push(nothing, -np.ones(1)) for push in pushes]
-    accelerations = np.stack(rates, axis=1)[n_q : n_q + n_v]
-    directions, sizes, _ = np.linalg.svd(accelerations, full_matrices=False)
-    free = directions[:, sizes > BLOCKED * sizes[0]]
-    turned = A[:n_q, n_q : n_q + n_v] @ free
-    basis = block_diag(turned, free, np.eye(len(A) - n_q - n_v))
-    moved = A @ basis
-    leaving = moved - basis @ (np.linalg.pinv(basis) @ moved)
-    motion = slice(0, n_q + n_v)
-    if np.abs(leaving[motion]).max() > TURNING * np.abs(moved[motion]).max():
+    rates = [0.5 * (push(nothing, np.ones(1)) - push(nothing, -np.ones(1))) for push in pushes]
+    factor, forces = frozen.inertia_and_forces(n_q)
+    # In the coordinates Lᵀ v with M = L Lᵀ, bodies without constraints respond to a unit force with a unit rate. Light
+    # and heavy bodies then have the same scale.
+    inverse = np.stack(rates, axis=1)[n_q : n_q + n_v] @ np.linalg.pinv(forces)
+    response = factor.T @ inverse @ factor
+    count = int((np.linalg.svd(response, compute_uv=False) > FREE).sum())
+    _, _, pivots = qr(response, pivoting=True)
+    free, _ = np.linalg.qr(np.linalg.solve(factor.T, response[:, pivots[:count]]))
+    transmission = A[:n_q, n_q : n_q + n_v]
+    motion = block_diag(transmission @ free, free)
+    basis = block_diag(motion, np.eye(len(A) - n_q - n_v))
+    moved = A[: len(motion)] @ basis[:, : 2 * count]
+    leaving = moved - motion @ (np.linalg.pinv(motion) @ moved)
+    weight = block_diag(factor.T @ np.linalg.pinv(transmission), factor.T)
+    energy = np.linalg.norm(weight @ motion, axis=0)
+    left, moved = (np.linalg.norm(weight @ table, axis=0) / energy for table in (leaving, moved))
+    if (left > TURNING * np.maximum(moved, 1.0)).any():
         raise ScenarioError(
             "Simulation.linearize: reduced=True requires a state near rest; here the directions that the contacts "
             "leave free turn too fast; advance to an instant at which the robot rests"
@@ -217,6 +226,21 @@ class _Frozen:
         self._latest = copied(self._workspace)
         derivative(system, self.time, y, self._latest, dy)
         return dy[: self._tracked]
+
+    def inertia_and_forces(self, n_q: int) -> tuple[Array, Array]:
+        """Return the Cholesky factor of the mass matrix, (n, n), and the joint forces of all pushes, (n, 6 bodies)."""
+        model, q = self._prepared.model, self.x[:n_q]
+        # A closed brake counts as a constraint, not as inertia.
+        armature = np.where(model.armature == ka.BRAKED, 1.0, model.armature)
+        forces, torques = list[Array](), list[Array]()
+        for body in model.robot.bodies:
+            rotation, _ = model.body_pose(body, q)
+            jacobian = model.point_jacobian(body, np.zeros(3), q)
+            forces.append(jacobian.T)
+            arms = [model.point_jacobian(body, rotation[k], q) - jacobian for k in range(3)]
+            # The three points at e_k move by ω × e_k, and ω = ½ Σ e_k × (ω × e_k).
+            torques.append(0.5 * np.sum([np.cross(np.eye(3)[k], arm.T) for k, arm in enumerate(arms)], axis=0))
+        return np.linalg.cholesky(model.mass_matrix(q) + np.diag(armature)), np.hstack(forces + torques)
 
     def inputs(self) -> dict[str, dict[str, Callable[[NDArray[Any], Array], Array]]]:
         """Return all inputs by family and label, as functions of the outputs to read and of the change, (1,)."""

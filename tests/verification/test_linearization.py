@@ -19,6 +19,7 @@ import dynsim
 from dynsim import DynsimError, Simulation, load_scenario
 from dynsim.model.surfaces import Quadric
 from dynsim.scenario import build
+from dynsim.scenario.reading import scenario_from_resolved
 
 Function = Callable[[np.ndarray], np.ndarray]
 
@@ -319,6 +320,67 @@ def test_the_reduced_system_has_the_free_motions_only(name: str, variant: str, c
             for linear in (whole, small)
         ]
         assert np.abs(response[1] - response[0]).max() < 1e-6 * np.abs(response[0]).max()
+
+
+def three_links(**link: object) -> dict:
+    """Resolved scenario of three links with stiff loops under gravity."""
+    motor = {"type": "wang_minami"}
+    links = {"mass_kg": 0.3, "length_m": 0.3, "radius_m": 0.02, "damping_N_m_s_per_rad": 0.5, "motor": motor} | link
+    chain = [{"axis": "z", "length_m": 0.0}, {"axis": "y", "initial_deg": 60}, {"axis": "y", "initial_deg": 70}]
+    plant = {"type": "serial_arm", "base": {"position_m": [0, 0, 0.3]}, "link": links, "chain": chain}
+    control = {"type": "joint_pd", "k_p_V_per_rad": 200, "k_d_V_s_per_rad": 8}
+    law = {"contacts": {"law": "unilateral", "friction": 2.0}}
+    return {"name": "arm", "duration_s": 4.0, "plant": plant, "controller": control, **law}
+
+
+@pytest.mark.parametrize("holds", ["friction", "brakes", "contact"])
+def test_reduced_system_has_only_currents_if_every_joint_is_blocked(holds: str) -> None:
+    data = three_links(**({"friction_N_m": 5.0} if holds == "friction" else {}))
+    if holds == "contact":
+        data["surfaces"] = {"floor": {"type": "plane"}}
+        data["contacts"]["points"] = {"tip": {"body": "link_3", "point_m": [0, 0, 0.3], "surface": "floor"}}
+        data["initial"] = {"on_surface": ["tip"]}
+    simulation = Simulation(scenario_from_resolved(data))
+    simulation.advance(1.0)
+    if holds == "brakes":
+        for joint in simulation.robot.joint_names[1:]:
+            simulation.set_brake(joint, closed=True)
+        partly = simulation.linearize(reduced=True)
+        simulation.set_brake("joint_1", closed=True)
+        assert partly.states[:2] == ("q.free_1", "v.free_1")
+        assert len(partly.states) == 5
+        assert np.abs(partly.basis[[1, 2, 4, 5]]).max() < 1e-12
+    small = simulation.linearize(["command", "force.link_3"], ["hand_position"], reduced=True)
+    assert small.states == ("current.joint_1", "current.joint_2", "current.joint_3")
+    assert not small.B[:, 3:].any()
+    motor = simulation.robot.motors[0]
+    assert_near(np.linalg.eigvals(small.A).real, np.full(3, -motor.resistance / motor.inductance), 1e-9)
+
+
+def test_reduced_system_keeps_heavy_bodies_next_to_a_tiny_one() -> None:
+    ball = {"shape": "sphere", "mass_kg": 1e-5, "radius_m": 1e-3, "position_m": [2, 0, 5]}
+    box = {"mass_kg": 1000.0, "size_m": [0.5, 0.5, 0.5], "position_m": [4, 0, 5]}
+    changes = {"contacts.law": "unilateral", "objects": {"box": box, "ball": ball}}
+    simulation = Simulation(load_scenario("single_pendulum", None, changes))
+    small = simulation.linearize(["force"], ["vdot"], reduced=True)
+    assert len(small.states) == 2 * (1 + 6 + 6)
+    whole = simulation.linearize(["force"], ["vdot"])
+    assert_near(small.D, whole.D, 1e-12)
+    for body, mass in (("box", 1000.0), ("ball", 1e-5)):
+        push = small.inputs.index(f"force.{body}.z")
+        moved = (small.basis @ small.B)[len(small.x) // 2 :, push]
+        assert np.linalg.norm(moved) == pytest.approx(1.0 / mass, rel=1e-9)
+
+
+def test_reduced_system_keeps_the_poles_of_an_arm_with_a_tiny_loose_link() -> None:
+    data = three_links()
+    tiny = {"mass_kg": 2e-5, "length_m": 3e-3, "radius_m": 1e-4, "damping_N_m_s_per_rad": 1e-6, "motor": None}
+    data["plant"]["chain"].append({"axis": "y", "initial_deg": 80} | tiny)
+    simulation = Simulation(scenario_from_resolved(data))
+    small, whole = simulation.linearize(reduced=True), simulation.linearize()
+    assert len(small.states) == len(whole.states) == 11
+    ours, theirs = (np.sort_complex(np.linalg.eigvals(linear.A)) for linear in (small, whole))
+    np.testing.assert_allclose(ours, theirs, rtol=1e-6)
 
 
 def test_a_reduced_state_is_that_of_a_free_motion() -> None:
