@@ -95,6 +95,14 @@ FontOption = Annotated[
 StyleOption = Annotated[
     str | None, option("SHEETS", "Matplotlib style sheets of the figures: files or names, comma-separated.")
 ]
+PanelsOption = Annotated[
+    str | None,
+    option(
+        "NAMES",
+        "Draw only the figures with these panels, and only the panels: names or parts of names, comma-separated, such "
+        "as distance,work; an unknown name lists all. Several records: only their overlay.",
+    ),
+]
 NoTitleOption = Annotated[bool, typer.Option("--no-title", help="Omit the titles of the figures.")]
 NoCaptionOption = Annotated[bool, typer.Option("--no-caption", help="Omit the notes below the axes of the figures.")]
 FormatOption = Annotated[FigureFormat, typer.Option("--format", help="File format of the figures.")]

@@ -17,6 +17,7 @@ from dynsim.cli.app import (
     FormatOption,
     NoCaptionOption,
     NoTitleOption,
+    PanelsOption,
     QuietOption,
     RecordsArgument,
     Rows,
@@ -138,6 +139,7 @@ def compare(
     size: SizeOption = None,
     font: FontOption = None,
     style: StyleOption = None,
+    panels: PanelsOption = None,
     no_title: NoTitleOption = False,
     no_caption: NoCaptionOption = False,
     rows: RowsOption = Rows.screen,
@@ -149,7 +151,7 @@ def compare(
     from dynsim.scenario import load_scenario, variant_names
     from dynsim.system.files import check_writable, discard
 
-    look = Look.of(size, font, style, title=not no_title, caption=not no_caption)
+    look = Look.of(size, font, style, title=not no_title, caption=not no_caption, panels=panels)
     values = parsed_overrides(overrides)
     loaded = [load_scenario(scenario, name, values) for name in variant_names(scenario)]
     folder = out or Path("results", loaded[0].name if loaded else "")
@@ -192,6 +194,7 @@ def compare(
                 wanted = [
                     Figures({name: record}, folder / name / "figures", format_, look)
                     for name, record in records.items()
+                    if not look.panels
                 ]
                 together = Figures(records, folder, format_, look, together=True)
                 page = draw_all([together, *wanted], Page(records, folder), quiet)
@@ -280,6 +283,7 @@ def plot(
     size: SizeOption = None,
     font: FontOption = None,
     style: StyleOption = None,
+    panels: PanelsOption = None,
     no_title: NoTitleOption = False,
     no_caption: NoCaptionOption = False,
     trust: TrustOption = False,
@@ -287,11 +291,13 @@ def plot(
     """Draw the figures of one record, or of several records and their overlay."""
     from dynsim.draw.figures.look import Look
 
-    look = Look.of(size, font, style, title=not no_title, caption=not no_caption)
+    look = Look.of(size, font, style, title=not no_title, caption=not no_caption, panels=panels)
     files = record_files(records)
     named = labelled(files, trust=trust)
     if len(named) > 1:  # before the single figures, because it rejects records that do not fit together
         draw(Figures(named, out or Path("figures"), format_, look, together=True), quiet=False)
+        if look.panels:
+            return
     for path, (label, record) in zip(files, named.items(), strict=True):
         folder = path.parent / "figures" if out is None else out if len(files) == 1 else out / label
         try:

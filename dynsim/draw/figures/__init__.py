@@ -112,6 +112,7 @@ def figure(
     size: float | tuple[float, float] | str | None = None,
     font: float | str | None = None,
     style: str | Path | Sequence[str | Path] | None = None,
+    panels: str | Sequence[str] | None = None,
 ) -> Figure:
     """Draw one figure of a record, or of several overlaid records, and return the matplotlib Figure.
 
@@ -133,6 +134,9 @@ def figure(
         Size of the letters [point], a font family, or both: 8, "serif", "serif 8". Default: 8.5 points.
     style : str, Path or sequence of them, optional
         Names or files of matplotlib style sheets.
+    panels : str or sequence of str, optional
+        Names of the panels to draw, or parts of them, such as "distance" or ["electrical energy", "work"]; the error
+        for an unknown name lists the panels. The figure is lower without the others. Default: all panels.
 
     Returns
     -------
@@ -142,7 +146,8 @@ def figure(
     Raises
     ------
     RecordError
-        If no figure has this name, the record has no data for it, or size, font or style cannot be used.
+        If no figure has this name, the record has no data for it, it has no such panel, or size, font or style cannot
+        be used.
 
     Notes
     -----
@@ -164,7 +169,7 @@ def figure(
     module = _module(next(iter(records.values()))) if isinstance(records, Mapping) else _module(records)
     # Comparisons of measured runs use the figures of simulated runs.
     home = importlib.import_module(SIMULATED) if several and module.__name__ == MEASURED else module
-    wanted = Look.of(size, font, style, title=title, caption=caption)
+    wanted = Look.of(size, font, style, title=title, caption=caption, panels=panels)
     shared = importlib.import_module("dynsim.draw.figures.style")
     with _drawable(), shared.look(wanted):
         makers = home.comparisons(records) if several else home.figures(records)
@@ -172,8 +177,9 @@ def figure(
             kind = "several records" if several else "such a record"
             raise RecordError(f"unknown figure {brief(name)} for {kind}; choices: {', '.join(makers)}")
         drawn: Figure | None = makers[name](records)
-    if drawn is None:
-        raise RecordError(f"the record has no data for the figure {name!r}")
+        if drawn is None:
+            raise RecordError(f"the record has no data for the figure {name!r}")
+        shared.with_panels([(name, drawn)])
     shared.literal(drawn)
     return drawn
 

@@ -26,9 +26,6 @@ LOADS, MARGIN, TRACTION = "wheel_load", "tip_margin", "traction_demand"
 # Axis limits: the traction demand is unbounded for a wheel without load, and the tip margin is unbounded if the ground
 # carries almost no load.
 TRACTION_TOP, MARGIN_LOW = 2.5, -2.0
-# Colours and line widths for the left wheel, right wheel and caster; the line of the left wheel is wider, so that it
-# remains visible at equal loads.
-LOOKS = ((style.BLUE, 2.0), (style.GREEN, 1.0), (style.ORANGE, 1.2))
 # Tracking: minimum ranges of the axes, so that rounding errors are not magnified.
 MIN_RANGES = {"position [m]": 1e-3, "heading [°]": 0.1, "error [mm]": 5e-3, "heading error [°]": 5e-3}
 MILLI = 1e3
@@ -112,9 +109,9 @@ def tracking(record: Record) -> Figure | None:
         _spread(np.hstack([target[:, :2], pose[:, :2]])) < MIN_RANGES["position [m]"]
         and _spread(heading) < MIN_RANGES["heading [°]"]
     )
-    # Round to a nanometre, because smaller differences of a stationary base are rounding errors.
-    away, turned = np.round(MILLI * error[:, :2], 6), np.round(180.0 / np.pi * error[:, 2], 6)
-    rms = [style.number(_rms(values), 3) for values in (*away.T, turned)]
+    away, turned = MILLI * error[:, :2], np.degrees(error[:, 2])
+    # A hundredth of the smallest range is the smallest number that is printed.
+    rms = [style.number(round(_rms(values), 4), 3) for values in (*away.T, turned)]
     curves: dict[str, list[Curve]] = {}
     if not is_stationary:
         # One of the lines is dashed, because x and y may coincide.
@@ -123,7 +120,7 @@ def tracking(record: Record) -> Figure | None:
         curves["heading [°]"] = _pair(heading[:, 0], heading[:, 1], "heading", style.BLACK, "-")
     curves["error [mm]"] = [
         (away[:, 0], {"color": style.BLUE, "label": f"ahead: rms {rms[0]} mm"}),
-        (away[:, 1], {"color": style.GREEN, "label": f"to the left: rms {rms[1]} mm"}),
+        (away[:, 1], {"color": style.GREEN, "linestyle": style.DASHES[1], "label": f"to the left: rms {rms[1]} mm"}),
     ]
     curves["heading error [°]"] = [(turned, {"color": style.BLACK, "label": f"rms {rms[2]}°"})]
     subject = "stationary base: actual − reference" if is_stationary else "base, reference and actual"
@@ -131,15 +128,11 @@ def tracking(record: Record) -> Figure | None:
     series = [[(record.time, values) for values, _ in drawn] for drawn in curves.values()]
     rows = style.time_rows(figure, series, record.settle_time)
     for (name, drawn), panels in zip(curves.items(), rows, strict=True):
-        values = np.stack([values for values, _ in drawn], axis=1)
-        least = MIN_RANGES[name]
         for axes in panels:
-            if _spread(values) < least:
-                middle = float(np.nanmean(values))
-                axes.set_ylim(middle - least, middle + least)
             axes.ticklabel_format(axis="y", useOffset=False)
             for curve, look in drawn:
                 style.line(axes, record.time, curve, **look)
+            style.at_least(axes, 2.0 * MIN_RANGES[name])
             if "error" in name:
                 axes.axhline(0.0, color=style.GREY, linewidth=0.6)
         panels[0].set_ylabel(name)
@@ -195,11 +188,11 @@ def _margin_label(name: str, record: Record) -> str:
 
 def _lines(axes: Axes, record: Record, signal: str, note: str, extreme: Callable[[Array], Any]) -> None:
     """Draw a line for each column, with its extreme value in the legend."""
-    for values, name, (colour, width) in zip(record[signal].T, record.labels[signal], LOOKS, strict=False):
+    for values, (name, look) in zip(record[signal].T, style.variant_styles(record.labels[signal]).items(), strict=True):
         known = np.isfinite(values).any()
         values = np.where(np.isfinite(values), values, np.nan)
         label = f"{name}: {note.format(style.number(float(extreme(values)), 3))}" if known else f"{name}: no values"
-        style.line(axes, record.time, values, color=colour, linewidth=width, label=label)
+        style.line(axes, record.time, values, label=label, **look)
 
 
 def _pair(target: Array, actual: Array, name: str, colour: str, dashes: Any) -> list[Curve]:
@@ -272,6 +265,7 @@ def top_view(record: Record) -> Figure | None:
     for axes in (world, own):
         axes.set_aspect("equal", adjustable="box", anchor="N")
     style.legend_below(figure, [world, own], 4)
+    figure.note("Circles: centre of pressure at the start (white) and at the end (black).")
     return figure
 
 

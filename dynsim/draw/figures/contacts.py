@@ -36,8 +36,9 @@ MARKS = {
 COLOUR = "#555555"
 # Maximum number of events with vertical lines; more lines would hide the curves.
 LINES = 40
-# Distance of the marks from the upper edge, and between rows of marks [point].
-BELOW, MARK_ROW = 4.0, 6.0
+# Distance of the marks from the upper edge, and between rows of marks; size of a mark [point].
+BELOW, MARK_ROW, MARK = 4.0, 6.0, 3.2
+SHARED = "Events that are closer than a mark is wide share the mark; the legend counts all."
 
 
 def marked(record: Record, names: Iterable[str] | None = None) -> list[Event]:
@@ -46,34 +47,44 @@ def marked(record: Record, names: Iterable[str] | None = None) -> list[Event]:
     return [event for event in record.events if event.kind in MARKS and (chosen is None or event.name in chosen)]
 
 
-def mark(axes: Axes, events: Sequence[Event], colour: str = COLOUR, *, row: int = 0, lines: bool = True) -> None:
+def mark(axes: Axes, events: Sequence[Event], colour: str = COLOUR, *, row: int = 0, lines: bool = True) -> bool:
     """Mark the events within the axes by a faint line and a marker in a row, counted down from the upper edge.
 
-    Rows with negative numbers are above the edge.
+    Rows with negative numbers are above the edge. Events of one kind that are closer than the width of a marker share
+    it.
+
+    Returns
+    -------
+    bool
+        Whether events share a marker.
     """
     low, high = axes.get_xlim()
     inside = [event for event in events if low <= event.time <= high]
     down = ScaledTranslation(0.0, -(BELOW + MARK_ROW * row) / 72.0, axes.figure.dpi_scale_trans)
     transform = axes.get_xaxis_transform() + down
-    look: dict[str, Any] = {"color": colour, "markersize": 3.2, "markeredgewidth": 0.0, "zorder": 6, "clip_on": False}
+    look: dict[str, Any] = {"color": colour, "markersize": MARK, "markeredgewidth": 0.0, "zorder": 6, "clip_on": False}
+    apart = (high - low) * MARK / (72.0 * axes.get_position().width * style.width())
+    marks: list[tuple[str, float]] = []
+    for kind in MARKS:
+        last = -np.inf
+        for time in sorted(event.time for event in inside if event.kind == kind):
+            if time - last >= apart:
+                marks.append((kind, last := time))
     for kind, (marker, _) in MARKS.items():
-        times = [event.time for event in inside if event.kind == kind]
-        if not times:
-            continue
-        axes.plot(times, [1.0] * len(times), marker, transform=transform, label="_event", **look)
-        if lines and len(inside) <= LINES:
-            for time in times:
-                axes.axvline(time, color=colour, linewidth=0.5, alpha=0.35 if row >= 0 else 0.2, zorder=0.5)
+        if times := [time for own, time in marks if own == kind]:
+            axes.plot(times, [1.0] * len(times), marker, transform=transform, label="_event", **look)
+    if lines and len(marks) <= LINES:
+        for _, time in marks:
+            axes.axvline(time, color=colour, linewidth=0.5, alpha=0.35 if row >= 0 else 0.2, zorder=0.5)
     axes.set_xlim(low, high)
+    return len(marks) < len(inside)
 
 
 def mark_all(figure: style.Drawing, rows: Sequence[Sequence[Axes]], record: Record) -> None:
     """Mark all events of a run in every panel, with a legend below the figure."""
     events = marked(record)
-    for panels in rows:
-        for axes in panels:
-            mark(axes, events)
-    explain(figure, events)
+    shared = [mark(axes, events) for panels in rows for axes in panels]
+    explain(figure, events, any(shared))
 
 
 def height_of_variants(records: Mapping[str, Record]) -> float:
@@ -87,23 +98,28 @@ def mark_variants(
     records: Mapping[str, Record],
     styles: Mapping[str, Mapping[str, Any]],
 ) -> None:
-    """Mark the events of several runs above every panel, one coloured row per run, with a legend below the figure.
+    """Mark the events of several runs above every panel, one row per run in the order and colours of the legend.
 
     Inside the panel the marks would cover the curves of other variants.
     """
     having = {name: events for name, record in records.items() if (events := marked(record))}
     everything = [event for events in having.values() for event in events]
+    shared = False
     for panels in rows if everything else ():
         for axes in panels:
             for row, (name, events) in enumerate(having.items()):
-                mark(axes, events, styles[name]["color"], row=-1 - row, lines=len(everything) <= LINES)
+                shared |= mark(
+                    axes, events, styles[name]["color"], row=row - len(having), lines=len(everything) <= LINES
+                )
             # A blank title reserves the space for the marks.
             axes.set_title(" ", fontsize=1.0, y=1.0, pad=MARK_ROW * len(having))
-    explain(figure, everything)
+    explain(figure, everything, shared)
 
 
-def explain(figure: style.Drawing, events: Sequence[Event]) -> None:
-    """Add the marks, with the number of events, to the legend below a figure."""
+def explain(figure: style.Drawing, events: Sequence[Event], shared: bool) -> None:
+    """Add the marks, with the number of events, to the legend below a figure; note if events share a mark."""
+    if shared:
+        figure.note(SHARED)
     count = Counter(event.kind for event in events)
     look: dict[str, Any] = {"color": COLOUR, "linestyle": "none", "markersize": 4.0, "markeredgewidth": 0.0}
     kinds = {f"{text} ({count[kind]})": marker for kind, (marker, text) in MARKS.items() if count[kind]}
@@ -156,6 +172,7 @@ def _forces(records: Mapping[str, Record], title: str) -> Figure | None:
     series = [[values for r in having[name].values() for values in _series(r, name)] for name in chosen]
     styles = style.variant_styles(list(records))
     rows = style.time_rows(figure, series, max(run.settle_time for run in runs))
+    shared = False
     for name, panels in zip(chosen, rows, strict=True):
         # Events of the transient panel would overlap each other in the panel of the whole run.
         begun = panels[0].get_xlim()[1] if len(panels) > 1 else -np.inf
@@ -164,28 +181,34 @@ def _forces(records: Mapping[str, Record], title: str) -> Figure | None:
                 force, colour = _force(record, name), str(styles[variant]["color"])
                 label = variant if many else labels[name, variant]
                 style.line(axes, record.time, force, label=label, **styles[variant])
-                for value in _extremes(record, name):
+                for value in _extremes(record, name) if alone else ():
                     axes.axhline(value, color=colour, linestyle=(0, (5, 3)), linewidth=0.7)
                 changes = marked(record, [name])
-                mark(axes, [e for e in changes if axes is panels[0] or e.time > begun], colour, row=row)
+                changes = [event for event in changes if axes is panels[0] or event.time > begun]
+                shared |= mark(axes, changes, colour, row=row - len(having[name]) * many)
                 if alone and is_unilateral(record):
                     _draw_modes(axes, record, name)
                 elif alone:
                     fill: dict[str, Any] = {"color": style.PULLING, "alpha": 0.3, "linewidth": 0, "interpolate": True}
                     axes.fill_between(record.time, force, 0.0, where=force < 0.0, label="_pulling", **fill)
-                if len(panels) > 1 and axes is panels[0]:
+                if alone and len(panels) > 1 and axes is panels[0]:
                     _draw_samples(axes, record, name, colour)
             if not all(map(is_unilateral, having[name].values())):
                 style.shade_below_zero(axes, "surface pulls")
         panels[0].set_ylabel(f"{name}\nnormal force [N]")
         if not many:
             style.legend_above(panels[-1], columns=2)
+        elif any(marked(run, [name]) for run in having[name].values()):
+            panels[-1].set_title(" ", fontsize=1.0, y=1.0, pad=MARK_ROW * len(having[name]))
     _note_sampling(figure, rows, runs)
+    if not many:
+        also = ", also as dashed lines" if alone else ""
+        figure.note(f"Legend: share of the run; range of the force over all integration steps{also}.")
     if many:
         style.legend_below(figure, [panels[-1] for panels in rows], 5)
     bands = {str(bar.get_label())[1:]: bar for panels in rows for bar in panels[-1].collections}
     figure.put_below({text: bands[text] for text in BANDS if text in bands}, 4)
-    explain(figure, [event for record in runs for event in marked(record, chosen)])
+    explain(figure, [event for record in runs for event in marked(record, chosen)], shared)
     return figure
 
 
@@ -209,7 +232,7 @@ def is_unilateral(record: Record) -> bool:
 def _share(record: Record, name: str) -> str:
     state, key = ("closed", "closed_fraction") if is_unilateral(record) else ("pulling", "pulling_fraction")
     contact = _summary(record, name)
-    return f"{state} {percent(contact[key])} of the run" if contact else f"{state} for an unknown time"
+    return f"{state} {percent(contact[key])}" if contact else f"{state} for an unknown time"
 
 
 def _modes(record: Record, name: str) -> str:
@@ -221,7 +244,9 @@ def _modes(record: Record, name: str) -> str:
 
 def _within(record: Record, name: str) -> str:
     extremes = _extremes(record, name)
-    return f"; all steps {style.number(extremes[0], 3)} … {style.number(extremes[1], 3)} N" if extremes.size else ""
+    scale = float(np.abs(extremes).max(initial=0.0))
+    low, high = (style.number(value, 3, scale) for value in extremes) if extremes.size else ("", "")
+    return f", {low} … {high} N" if extremes.size else ""
 
 
 def _extremes(record: Record, name: str) -> Array:
@@ -255,12 +280,11 @@ def _draw_samples(axes: Axes, record: Record, name: str, colour: str) -> None:
 
 
 def _note_sampling(figure: style.Drawing, rows: Sequence[Sequence[Axes]], records: Sequence[Record]) -> None:
-    """Add a note about the sampling interval and the dashed lines."""
+    """Add a note about the sampling interval."""
     steps = [float(np.median(np.diff(record.time))) for record in records if len(record) > 1]
     if steps:
         dots = any(line.get_marker() == "." for panels in rows for line in panels[0].get_lines())
-        sampled = f"Sampled every {style.number(1e3 * max(steps), 3)} ms{' (dots)' * dots}."
-        figure.note(f"{sampled} Dashed lines: extremes over all integration steps.")
+        figure.note(f"Sampled every {style.number(1e3 * max(steps), 3)} ms{' (dots)' * dots}.")
 
 
 def _force(record: Record, name: str) -> Array:

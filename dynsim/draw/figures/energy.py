@@ -18,25 +18,23 @@ from dynsim.record.measures import RESIDUAL_LIMIT, energy_turnover, hand_error, 
 
 # Terms of the ledger, in stacking order.
 TERMS = {
-    "heat_joule": ("Joule heat in the windings", "#E69F00"),
+    "heat_joule": ("Joule heat", "#E69F00"),
     "loss_gear": ("gear losses", "#56B4E9"),
     "loss_joint": ("joint losses", "#0072B2"),
     "heat_friction": ("contact friction", "#882255"),
-    "loss_impact": ("impacts of contacts", "#8C6D31"),
-    "loss_stop": ("impacts at joint stops", "#F0E442"),
-    "loss_damper": ("dampers of contacts and ties", "#44AA99"),
+    "loss_impact": ("contact impacts", "#8C6D31"),
+    "loss_stop": ("joint-stop impacts", "#F0E442"),
+    "loss_damper": ("dampers", "#44AA99"),
     "energy_elastic": ("Δ elastic energy", "#AA4499"),
-    "loss_scheme": ("loss of time stepping", "#999933"),
+    "loss_scheme": ("time stepping", "#999933"),
     "energy_kinetic": ("Δ kinetic energy", "#009E73"),
     "energy_potential": ("Δ potential energy", "#CC79A7"),
     "energy_magnetic": ("Δ magnetic energy", "#7F7F7F"),
 }
-# Largest ratio of final values for which a linear axis is used.
-LOG_RATIO = 8.0
+# Largest ratios of the variants' final energies, and of their distances from the target, for which an axis is linear.
+LOG_ENERGY, LOG_DISTANCE = 50.0, 8.0
 # Fraction of the energy turnover above which one term hides the others, which then get a separate panel.
 DOMINANT = 0.8
-# Terms below this fraction of the largest term are rounding errors.
-NOTHING = 1e-9
 # Net and drawn energy are shown as one curve if they differ by no more than this fraction of the maximum.
 DIFFER = 0.01
 # A residual below this fraction of its limit is only printed, not drawn.
@@ -61,6 +59,8 @@ def energy(record: Record) -> Figure | None:
     if apart:
         label = f"drawn, without recovery: {_joules(drawn)}"
         style.line(top, record.time, drawn, label=label, color=style.ORANGE, linestyle=(0, (4, 3)))
+    if net.min() >= 0.0:
+        top.set_ylim(bottom=0.0)
     top.set_ylabel("electrical\nenergy [J]")
     work = record["work_mechanical"]
     style.line(bottom, record.time, work, label=f"of the motors on the joints: {_joules(work)}", color=style.GREEN)
@@ -92,7 +92,7 @@ def energy_comparison(records: Mapping[str, Record]) -> Figure | None:
     over_time, total = (figure.add_subplot(cell) for cell in cells[:2])
     work = figure.add_subplot(cells[2], sharex=over_time)
     finals = np.array([record["energy_electrical"][-1] for record in shown.values()])
-    logarithmic = bool(finals.min() > 0.0 and finals.max() > LOG_RATIO * finals.min())
+    logarithmic = bool(finals.min() > 0.0 and finals.max() > LOG_ENERGY * finals.min())
     least = 0.02 * float(finals.min())
     styles = style.variant_styles(list(records))
     for name, record in shown.items():
@@ -102,6 +102,8 @@ def energy_comparison(records: Mapping[str, Record]) -> Figure | None:
         style.log_axis(over_time)
         # Values in the first milliseconds would extend the axis by many almost empty decades.
         over_time.set_ylim(least, 1.6 * finals.max())
+    elif min(float(record["energy_electrical"].min()) for record in shown.values()) >= 0.0:
+        over_time.set_ylim(bottom=0.0)
     over_time.set_ylabel("electrical\nenergy [J]")
     over_time.tick_params(labelbottom=False)
     work.axhline(0.0, color=style.GREY, linewidth=0.6)
@@ -180,7 +182,7 @@ def _stack(axes: Axes, time: Array, terms: Mapping[str, Array], supplied: Array,
         base = np.zeros(len(kept))
         for name, values in terms.items():
             part = clip(values[kept], 0.0)
-            if not np.abs(part).max(initial=0.0) > NOTHING * largest:
+            if not np.abs(part).max(initial=0.0) > style.NOTHING * largest:
                 continue
             text, colour = TERMS[name]
             known = axes.get_legend_handles_labels()[1]
@@ -189,7 +191,7 @@ def _stack(axes: Axes, time: Array, terms: Mapping[str, Array], supplied: Array,
                 time[kept], base, base + part, color=colour, linewidth=0.3, label=None if label in known else label
             )
             base = base + part
-    label = f"sum = {source}: {_joules(supplied, largest)}" if np.any(supplied) else f"{source}: none"
+    label = f"{source}: {_joules(supplied, largest)}" if np.any(supplied) else f"{source}: none"
     axes.plot(time[kept], supplied[kept], color=style.BLACK, linewidth=1.1, label=label)
 
 
@@ -242,12 +244,12 @@ def _totals(axes: Axes, names: Sequence[str], values: Array, colours: Sequence[s
     axes.set_ylim(len(names) - 0.4, -0.6)
     axes.grid(axis="y", visible=False)
     axes.set_xlabel("net electrical energy [J]")
+    axes.set_label("total energy")
 
 
 def _joules(values: Array, largest: float = 0.0) -> str:
-    """Format the last value in joules; as 0 if it is only a rounding error of the ledger's largest value."""
-    last = float(values[-1])
-    return f"{style.number(0.0 if abs(last) < NOTHING * largest else last)} J"
+    """Format the last value in joules."""
+    return f"{style.number(float(values[-1]), scale=largest)} J"
 
 
 # Motors. Maximum number with separate lines; if there are more, the envelope of all motors is drawn too.
@@ -497,8 +499,7 @@ def error(record: Record) -> Figure | None:
         axes.set_ylim(bottom=0.0)
     rows[0][0].set_ylabel(f"hand − {target_name(record)}\n[mm]")
     rows[1][0].set_ylabel(f"distance from\n{target_name(record)} [mm]")
-    for panels in zip(*rows, strict=True):
-        _mark_settle(panels, record)
+    _mark_settle(figure, rows, [record])
     contacts.mark_all(figure, rows, record)
     style.legend_above(rows[0][-1], columns=4)
     style.legend_above(rows[1][-1])
@@ -508,7 +509,7 @@ def error(record: Record) -> Figure | None:
 def error_comparison(records: Mapping[str, Record]) -> Figure | None:
     """Draw the tracking errors of all variants: distance from the target and vertical error.
 
-    The axis of the distance is logarithmic if the settled distances differ by more than ``LOG_RATIO``.
+    The axis of the distance is logarithmic if the settled distances differ by more than ``LOG_DISTANCE``.
     """
     shown = {name: record for name, record in records.items() if hand_target(record) is not None}
     if not shown:
@@ -526,19 +527,19 @@ def error_comparison(records: Mapping[str, Record]) -> Figure | None:
         for name, record in shown.items():
             style.line(distance, record.time, norms[name], label=_error_label(name, record), **styles[name])
             style.line(vertical, record.time, deviations[name][:, 2], **styles[name])
-        _mark_settle((distance, vertical), next(iter(shown.values())))
+    _mark_settle(figure, rows, list(shown.values()))
     _scale_distances(rows[0], [norms[name][record.time >= settle] for name, record in shown.items()])
     rows[0][0].set_ylabel("distance from\ntarget [mm]")
     rows[1][0].set_ylabel("vertical\nerror [mm]")
     contacts.mark_variants(figure, rows, shown, styles)
-    style.legend_below(figure, rows[0][-1:], 2)
+    style.legend_below(figure, [rows[0][-1], rows[1][-1]], 5)
     return figure
 
 
 def _scale_distances(panels: Sequence[Axes], settled: Sequence[Array]) -> None:
     """Set the axes of distances, (n,) [mm] per variant, so that the settled ones of all variants can be read."""
     typical = [float(np.median(values)) for values in settled if values.size]
-    if not typical or not 0.0 < LOG_RATIO * min(typical) < max(typical):
+    if not typical or not 0.0 < LOG_DISTANCE * min(typical) < max(typical):
         for axes in panels:
             axes.set_ylim(bottom=0.0)
         return
@@ -567,7 +568,7 @@ def _planes(low: Array, high: Array) -> tuple[Sequence[tuple[int, int]], str]:
     if len(flat) != 1:
         return PLANES, ""
     (k,) = flat
-    constant = f"{style.number(0.5 * (low[k] + high[k]), 3)} m"
+    constant = f"{style.number(0.5 * (low[k] + high[k]), 3, scale=1.0)} m"
     within = f", within {style.number(0.5 * MILLI * size[k], 2)} mm" if size[k] > HELD else ""
     return [plane for plane in PLANES if k not in plane], f"Coordinate {'xyz'[k]}: {constant}{within}."
 
@@ -634,15 +635,19 @@ def _add_starts(axes: Axes) -> None:
 
 
 def _error_label(name: str, record: Record) -> str:
-    settle = record.settle_time
-    rms = hand_error(record, settle)["hand_error_rms_m"]
-    return name if rms is None or not np.isfinite(rms) else f"{name}: rms {MILLI * rms:.3g} mm from {settle:g} s on"
+    rms = hand_error(record, record.settle_time)["hand_error_rms_m"]
+    return name if rms is None or not np.isfinite(rms) else f"{name}: {style.number(MILLI * rms, 3, scale=1.0)} mm"
 
 
-def _mark_settle(panels: Sequence[Axes], record: Record) -> None:
-    """Draw a line at the settling time in every panel; only the first has a legend entry, away from the curves."""
-    settle = record.settle_time
-    if max(0.0, record.time[0]) < settle < min(float(record.time[-1]), panels[0].get_xlim()[1]):
-        for axes in panels:
-            label = f"settled from {settle:g} s on" if axes is panels[0] else None
+def _mark_settle(figure: style.Drawing, rows: Sequence[Sequence[Axes]], records: Sequence[Record]) -> None:
+    """Draw a line at the settling time, from which the rms values in the legend count, or note the time."""
+    settle, end = max(run.settle_time for run in records), max(float(run.time[-1]) for run in records)
+    text = f"rms from {settle:g} s on" if settle > 0.0 else "rms of the whole run"
+    shown = False
+    for axes in (axes for panels in rows for axes in panels):
+        if max(0.0, records[0].time[0]) < settle < min(end, axes.get_xlim()[1]):
+            label = text if axes is rows[-1][-1] else None
             axes.axvline(settle, color=style.GREY, linestyle=":", linewidth=1.0, label=label)
+            shown |= label is not None
+    if not shown:
+        figure.note(f"Numbers in the legend: {text}.")

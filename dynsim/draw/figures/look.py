@@ -33,6 +33,8 @@ class Look:
         Names or files of matplotlib style sheets; later ones take precedence.
     title, caption : bool
         Whether the figure has a title above, and notes below the axes.
+    panels : tuple of str
+        Names of panels to draw, or parts of them; empty: all panels.
     """
 
     width: float | None = None
@@ -42,6 +44,7 @@ class Look:
     styles: tuple[str, ...] = ()
     title: bool = True
     caption: bool = True
+    panels: tuple[str, ...] = ()
 
     @classmethod
     def of(
@@ -52,6 +55,7 @@ class Look:
         *,
         title: bool = True,
         caption: bool = True,
+        panels: str | Sequence[str] | None = None,
     ) -> Look:
         """Return the look that a user describes.
 
@@ -65,6 +69,8 @@ class Look:
             Names or files of matplotlib style sheets; in a text, commas separate them.
         title, caption : bool, optional
             Whether the figure has a title above, and notes below the axes.
+        panels : str or sequence of str, optional
+            Names of panels to draw, or parts of them; in a text, commas separate them. Default: all panels.
 
         Raises
         ------
@@ -73,13 +79,14 @@ class Look:
         """
         width, height = _size(size)
         family, points = _font(font)
-        if style is None:
-            sheets: tuple[str, ...] = ()
-        elif isinstance(style, str):
-            sheets = tuple(name.strip() for name in style.split(",") if name.strip())
-        else:
-            sheets = (str(style),) if isinstance(style, Path) else tuple(map(str, style))
-        return cls(width, height, family, points, sheets, title, caption)
+        sheets = _list((str(style),) if isinstance(style, Path) else style)
+        return cls(width, height, family, points, sheets, title, caption, _list(panels))
+
+
+def _list(names: str | Sequence[str | Path] | None) -> tuple[str, ...]:
+    if isinstance(names, str):
+        names = [name.strip() for name in names.split(",")]
+    return tuple(filter(None, map(str, names or ())))
 
 
 def _size(size: float | tuple[float, float] | str | None) -> tuple[float | None, float | None]:

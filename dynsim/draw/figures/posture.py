@@ -374,10 +374,10 @@ def posture_comparison(records: Mapping[str, Record]) -> Figure | None:
     low, high = extent_of(plane, everything, some)
     size = high - low
     # Upright arms are drawn next to each other.
-    most = (2 if style.narrow() else 4) if size[1] > size[0] else (1 if style.narrow() else 2)
+    most = (2 if style.narrow() else 4) if size[1] > size[0] else (1 + (len(shown) > 4) if style.narrow() else 2)
     columns = min(len(shown), most)
     lines = -(-len(shown) // columns)
-    across = style.width() - FULL if columns == 1 else (style.width() - 1.5) / columns
+    across = style.width() - FULL if columns == 1 else (style.width() - 0.65) / columns - 0.15
     framed, scale = _with_labels((low, high), list(shown.values()), plane, 72.0 * np.array([across, 3.2]))
     size = framed[1] - framed[0]
     each = float(np.clip(across * size[1] / size[0], 0.8, 3.2))
@@ -632,9 +632,9 @@ def _within(grid: Array, low: Array, high: Array) -> Array:
 def _contact_mark(force: float) -> dict[str, Any]:
     """Return the marker of a contact: blue triangle up if pushed, red triangle down if pulled, otherwise grey dot."""
     if force < 0.0:
-        marker, colour, label = "v", style.PULLING, "contact, surface pulls"
+        marker, colour, label = "v", style.PULLING, "surface pulls"
     elif force > 0.0:
-        marker, colour, label = "^", style.BLUE, "contact, surface pushes"
+        marker, colour, label = "^", style.BLUE, "surface pushes"
     else:
         marker, colour, label = "o", style.GREY, "contact, open" if force == 0.0 else "contact"
     return {"marker": marker, "color": colour, "label": label, "markersize": 7, "markeredgecolor": "white"}

@@ -50,12 +50,14 @@ DEGREES = 180.0 / np.pi
 
 def draw(record: Record, folder: Path, kind: str = "png") -> list[Path]:
     """Draw all figures of one run and the animation; return the files."""
-    return [*style.save_all(figures(record), record, folder, kind), animate(record, folder / "animation.gif")]
+    written = style.save_all(figures(record), record, folder, kind)
+    return written if style.wanted_panels() else [*written, animate(record, folder / "animation.gif")]
 
 
 def draw_comparison(records: Mapping[str, Record], folder: Path, kind: str = "png") -> list[Path]:
     """Draw overlays of variants and, for experiments of [T], comparisons with the paper; return the files."""
-    return write_tables(records, folder) + style.save_all(comparisons(records), records, folder, kind)
+    tables = [] if style.wanted_panels() else write_tables(records, folder)
+    return tables + style.save_all(comparisons(records), records, folder, kind)
 
 
 def figures(record: Record) -> dict[str, Callable[[Record], Figure]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import textwrap
 import warnings
@@ -30,6 +31,7 @@ from matplotlib.ticker import AutoLocator, FuncFormatter, LogFormatter, LogLocat
 from numpy.typing import NDArray
 
 from dynsim.draw.figures.look import Look
+from dynsim.draw.figures.panels import chosen, explained, named, regrid
 from dynsim.errors import RecordError
 from dynsim.record import Record
 from dynsim.system.files import replacing
@@ -51,8 +53,8 @@ NOTE = "#555555"
 # Colour of parts of links that are below a surface because they have no contact point.
 DEEP = "#882255"
 VARIANT_COLOURS = (BLUE, GREEN, ORANGE, PURPLE, SKY, BLACK, "#8C6D31")
-# Line styles of variants that share a colour.
-DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1, 1)), (0, (5, 1, 1, 1)), (0, (8, 3)), (0, (3, 1, 1, 1, 1, 1)))
+# Line styles of variants, in addition to colours, or of variants that share a colour.
+DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (5, 1, 1, 1)), (0, (1, 1)), (0, (8, 3)), (0, (3, 1, 1, 1, 1, 1)))
 AXIS_COLOURS = {"x": BLUE, "y": GREEN, "z": ORANGE}
 
 # Width of a figure on a page [inch]; in a figure below NARROW, which fits a column of a paper, panels are below each
@@ -73,9 +75,9 @@ _SIZES = {
 _COORDINATE = re.compile(r"(height |roll |pitch |yaw )?\$(x|y|z|\\alpha|\\beta|\\gamma)\$( \[(m|mm|rad|mrad|°)\])?")
 # Space between the edge of a figure, and its title and notes [inch].
 EDGE = 0.07
+# Spaces before units, before brackets, and in ranges, at which a line is not broken.
+_UNIT = re.compile(r"(?<=\d) (?=(?:[mk]?[smgNWJAV]|mm|N m|kg|rad|Hz|°|%)(?!\w)|…)|(?<=…) | (?=\[)|(?<=N) (?=m\b)")
 _GREEK = {"alpha": "α", "beta": "β", "gamma": "γ"}
-# Space between a number and its unit, at which a line is not broken.
-_UNIT = re.compile(r"(\d) (?=(?:[mk]?[smgNWJAV]|mm|N m|kg|rad|Hz|°|%)(?!\w))")
 # Mean width of a letter as a multiple of its size, for the breaking of long lines.
 LETTER = 0.56
 DPI = 170
@@ -102,6 +104,8 @@ _LOOK: Any = {
 LINE_POINTS = 4000
 # A transient panel shows TRANSIENT_ROOM times the transient, unless this exceeds TRANSIENT_MAX_SHARE of the run.
 TRANSIENT_ROOM, TRANSIENT_MAX_SHARE = 1.2, 0.8
+# Values below this fraction of the scale of a quantity are rounding errors.
+NOTHING = 1e-9
 # Height of a legend row as a multiple of the size of its letters.
 LEGEND_ROW = 1.67
 
@@ -223,12 +227,13 @@ def broken(text: str, across: float | None = None, points: float | None = None, 
 
 
 def _filled(text: str, room: float, size: float, even: bool) -> str:
-    count, text = max(int(room / (LETTER * size)), 12), _UNIT.sub("\\1\u00a0", text)
+    count, text = max(int(room / (LETTER * size)), 12), _UNIT.sub("\u00a0", text)
     lines = textwrap.wrap(text, count)
     while count > 12 and any(text_width(line, size) > room for line in lines):
         count -= 1
         lines = textwrap.wrap(text, count)
-    while even and count > 12 and len(shorter := textwrap.wrap(text, count - 1)) == len(lines):
+    longest = max(map(len, text.split()), default=0)
+    while even and count > max(12, longest) and len(shorter := textwrap.wrap(text, count - 1)) == len(lines):
         count, lines = count - 1, shorter
     return "\n".join(lines).replace("\u00a0", " ")
 
@@ -285,6 +290,15 @@ class Drawing(Figure):
         sentence = ": ".join(filter(None, [subject, "; ".join(filter(None, parts))]))
         return "\n".join(filter(None, [sentence and f"{sentence[0].upper()}{sentence[1:]}.", self.notes]))
 
+    def entitle(self, title: str) -> None:
+        """Set the subject, and the title above the panels if the look has titles."""
+        self.subject = title
+        if (_drawn.get() or Look()).title and title:
+            size, before = _size("figure.titlesize"), max(_lines(self.get_suptitle()), 1)
+            text = broken(title, self.get_figwidth() - 2.0 * EDGE, size, even=True)
+            self.suptitle(text, fontsize=size)
+            self.grow(1.2 * size * (_lines(text) - before))
+
     def note(self, *notes: str) -> None:
         """Add notes to the caption."""
         self.notes = "\n".join([*filter(None, [self.notes]), *notes])
@@ -313,6 +327,42 @@ class Drawing(Figure):
         self._below = self.legend(list(self._entries.values()), labels, ncols=columns, **anchor)
         self._below.set_in_layout(False)
         self.grow(legend_row() * (self._rows - before))
+
+    def keep(self, kept: Sequence[Axes]) -> None:
+        """Remove all axes but ``kept``, which keep their height, and legend entries that explain only the others."""
+        own, grows, self.grows = self.get_figheight(), self.grows, True
+        self.set_figheight(self.needed)
+        self.draw_without_rendering()
+        before = {axes: _room(axes) for axes in kept}
+        entries = dict(self._entries)
+        if not any(axes.get_legend() for axes in kept):
+            for legend in filter(None, (axes.get_legend() for axes in self.axes)):
+                texts = (text.get_text().replace("\n", " ") for text in legend.get_texts())
+                entries |= dict(zip(texts, legend.legend_handles, strict=True))
+        if self._below is not None:
+            self._below.remove()
+        self.grow(legend_row() * (1 - self._rows))
+        self._below, self._rows, self._entries = None, 1, {}
+        self.put_below(explained(entries, kept), 5)
+        regrid(self, kept)
+        scenario, colon, subject = self.subject.partition(": ")
+        early = subject.partition(" (incomplete")
+        self.entitle(f"{scenario}{colon}{', '.join(named(self))}{early[1]}{early[2]}")
+        # Panels keep their height; at a fixed scale they use the width of the panels that were beside them. Labels of
+        # panels at a fixed scale need no space if there is more than enough, so the height is found by iteration.
+        for _ in range(3):
+            self.draw_without_rendering()
+            rows = {}
+            for axes, (wide, high) in before.items():
+                width, height = _room(axes)
+                scale = 1.0 if axes.get_aspect() == "auto" else min(width / wide, max(3.0 / high, 1.0))
+                rows[round(axes.get_position(original=True).y1, 3)] = scale * high - height
+            if abs(sum(rows.values())) < 0.05:
+                break
+            self.grow(72.0 * sum(rows.values()))
+        self.grows = grows
+        if not grows:
+            self.set_figheight(own)
 
     def grow(self, points: float) -> None:
         """Make the figure higher [point], unless the user set its height."""
@@ -351,6 +401,8 @@ class Drawing(Figure):
         # The width of axes with a fixed aspect follows from their height.
         both = [axes.yaxis for axes in self.axes] + [axes.xaxis for axes in self.axes if axes.get_aspect() == "auto"]
         automatic = [(axis, ticks) for axis in both if isinstance(ticks := axis.get_major_locator(), AutoLocator)]
+        # Others have a number of ticks that was set.
+        automatic = [(axis, ticks) for axis, ticks in automatic if vars(ticks)["_nbins"] == "auto"]
         for axis, locator in automatic:
             locator.set_params(nbins=int(np.clip(0.85 * axis.get_tick_space(), 1, 9)))
         with warnings.catch_warnings(record=True) as caught:
@@ -363,9 +415,17 @@ class Drawing(Figure):
         for warning in caught:
             if "collapsed" in str(warning.message) and not self.grows:
                 size = f"size {self.get_figwidth():.3g}x{self.get_figheight():.3g}"
-                least = f"set the width only, or a height of {self.needed:.2g} in"
+                least = f"set the width only, a height of {self.needed:.2g} in, or fewer panels"
                 raise RecordError(f"{size}: no space for the axes of this figure; {least}")
             warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
+
+
+def _room(axes: Axes) -> tuple[float, float]:
+    """Return the width and height of the cell of axes [inch]; the height of one row if the cell has several."""
+    cell, box, figure = axes.get_subplotspec(), axes.get_position(original=True), axes.get_figure(root=True)
+    assert cell is not None
+    assert figure is not None
+    return box.width * figure.get_figwidth(), box.height * figure.get_figheight() / len(cell.rowspan)
 
 
 def _words(label: str) -> str:
@@ -397,13 +457,9 @@ def new_figure(height: float, title: str, *, page: float = WIDTH) -> Drawing:
     own = float(matplotlib.rcParams["figure.figsize"][1]) if _has_own_size() and wanted.width is None else 0.0
     figure = Drawing(figsize=(wide, wanted.height or max(own, height)), layout="constrained")
     figure.grows = wanted.height is None
-    figure.needed, figure.subject = height, title
+    figure.needed = height
     FigureCanvasAgg(figure)
-    if wanted.title and title:
-        size = _size("figure.titlesize")
-        text = broken(title, wide - 2.0 * EDGE, size, even=True)
-        figure.suptitle(text, fontsize=size)
-        figure.grow(1.2 * size * (_lines(text) - 1))
+    figure.entitle(title)
     return figure
 
 
@@ -447,9 +503,25 @@ def save(figure: Figure, path: Path) -> Path:
 def save_all(makers: Mapping[str, Callable[[T], Figure | None]], of: T, folder: Path, kind: str) -> list[Path]:
     """Draw and save every figure for which the record or records have data; return the files."""
     with look():
-        return [
-            save(figure, folder / f"{name}.{kind}") for name, make in makers.items() if (figure := make(of)) is not None
-        ]
+        drawn = ((name, figure) for name, make in makers.items() if (figure := make(of)) is not None)
+        return [save(figure, folder / f"{name}.{kind}") for name, figure in with_panels(drawn)]
+
+
+def wanted_panels() -> tuple[str, ...]:
+    """Return the names of the only panels to draw; empty for all panels."""
+    return (_drawn.get() or Look()).panels
+
+
+def with_panels(drawn: Iterable[tuple[str, Figure]]) -> Iterable[tuple[str, Figure]]:
+    """Reduce figures to the panels of the look, if it names any; figures without such a panel are omitted."""
+    if not (wanted := wanted_panels()):
+        return drawn
+    figures = dict(drawn)
+    kept = chosen(figures, wanted)
+    for name, axes in kept.items():
+        figure: Any = figures[name]
+        figure.keep(axes)
+    return [(name, figures[name]) for name in kept]
 
 
 def title(record: Record, subject: str) -> str:
@@ -472,17 +544,16 @@ def spaced(name: str) -> str:
 def variant_styles(names: Sequence[T]) -> dict[T, dict[str, Any]]:
     """Return the colour, width and line style of each variant, or of each curve of one run, by position.
 
-    Line styles differ only if there are more than seven curves. Later curves are on top and thinner, so that equal
-    curves remain visible.
+    Line styles differ, so that curves can be distinguished in greyscale, and equal curves remain visible. Pairs of
+    colour and line style repeat only after several turns of the colours.
     """
     colours = _colours()
-    count = len(colours)
-    dashes = DASHES[:4]
+    turn = math.lcm(len(colours), len(DASHES))
     return {
         name: {
-            "color": colours[k % count],
-            "linestyle": dashes[(k // count) % len(dashes)],
-            "linewidth": 1.0 + 1.6 * 0.4**k if len(names) > 1 else 1.4,
+            "color": colours[k % len(colours)],
+            "linestyle": DASHES[(k + k // turn) % len(DASHES)],
+            "linewidth": float(matplotlib.rcParams["lines.linewidth"]),
         }
         for k, name in enumerate(names)
     }
@@ -549,9 +620,9 @@ def family_styles(names: Sequence[str]) -> tuple[dict[str, dict[str, Any]], dict
     return looks, entries
 
 
-def number(value: float, digits: int = 4) -> str:
-    """Format a number with a true minus sign, as on the axes."""
-    return f"{value:.{digits}g}".replace("-", "−")
+def number(value: float, digits: int = 4, scale: float = 0.0) -> str:
+    """Format a number with a true minus sign, as on the axes; as 0 if it is a rounding error of the ``scale``."""
+    return f"{0.0 if abs(value) < NOTHING * scale else value:.{digits}g}".replace("-", "−")
 
 
 def log_axis(axes: Axes, which: str = "y") -> None:
@@ -601,12 +672,15 @@ def fitted_legend(labels: Sequence[str], columns: int) -> tuple[list[str], int, 
     handle = (matplotlib.rcParams["legend.handlelength"] + 2.8) * size
     available = 72.0 * 0.97 * width()
     lines = [broken(label, (available - handle) / 72.0, size) for label in labels]
-    widest = max((text_width(line, size) for label in lines for line in label.split("\n")), default=0.0) + handle
-    columns = max(1, min(columns, len(lines), int(available // widest)))
-    # A legend is filled column by column, and its rows are as high as their highest label.
-    per_column = -(-len(lines) // columns)
-    heights = [max(lines[k].count("\n") + 1 for k in range(row, len(lines), per_column)) for row in range(per_column)]
-    return lines, columns, sum(heights)
+    widths = [max(text_width(line, size) for line in label.split("\n")) + handle for label in lines]
+    # A legend is filled column by column; each column is as wide as its widest label.
+    for count in range(max(min(columns, len(lines)), 1), 0, -1):
+        parts = [part for part in np.array_split(np.arange(len(lines)), count) if len(part)]
+        wide = sum(max(widths[k] for k in part) for part in parts)
+        # Fewer columns with as many rows are easier to read.
+        if wide <= available and (count == 1 or -(-len(lines) // (count - 1)) > -(-len(lines) // count)):
+            break
+    return lines, count, max((sum(lines[k].count("\n") + 1 for k in part) for part in parts), default=0)
 
 
 def legend_beside(axes: Axes, columns: int = 2) -> None:
