@@ -683,6 +683,13 @@ def test_markers_of_lines_are_not_cut_by_the_frame():
         assert not any(line.get_clip_on() for line in axes.lines)
 
 
+def test_axis_of_lines_has_all_values_even_if_runs_failed():
+    rows = [*ROWS, {"variant": "one", "a": 5.0, "b": "x", "mass": 1.0, "status": "failed"}]
+    figure = pictures.lines(pictures.Sweep("test", rows, ["a"], ["mass"]))
+    assert figure is not None
+    assert all(axes.get_xlim()[1] > 5.0 for axes in figure.axes)
+
+
 def test_colour_bars_stand_below_their_column():
     figure = pictures.heat_map(pictures.Sweep("test", ROWS, ["a", "b"], ["mass"]))
     assert figure is not None

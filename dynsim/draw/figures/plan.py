@@ -21,7 +21,7 @@ from dynsim.draw.geometry.shapes import outline
 from dynsim.record.quantities import rounded
 
 # Length of the arrow of the largest force, and of the number at its tail, relative to the length of the view.
-ARROW, TAIL = 0.08, 0.06
+ARROW, TAIL = 0.08, 0.07
 # An arm that leaves its vertical plane by less than this fraction of its length is not drawn from above.
 FLAT = 0.02
 # Values whose ratio exceeds this are drawn on a logarithmic axis.

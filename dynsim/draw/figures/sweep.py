@@ -175,6 +175,7 @@ def lines(sweep: Sweep) -> Figure | None:
                 shaded = True
         axes.set_ylabel(style.broken(drawn.label, _PANEL))
         # Markers are not on the axes; words are in the middle of their columns.
+        axes.dataLim.update_from_data_x(at, ignore=False)  # runs at the ends may have failed
         axes.margins(x=0.02 if numeric else 0.5 / len(levels))
         _scale(axes, "y", drawn.scale * _values(sweep.rows, metric))
         _clip(figure, axes, drawn, drawn.scale * _values(sweep.rows, metric))
@@ -396,18 +397,19 @@ def pareto(sweep: Sweep) -> Figure | None:
     _scale(axes, "y", points[:, 1])
     style.legend_below(figure, [axes], 5)
     firsts = [(points == at).all(axis=1).argmax() for at in front]
-    if len(front) <= _NUMBERED and all("run" in row for row in rows):
+    few = len(rows) < len(sweep.rows) - sum(map(_failed, sweep.rows))
+    text = f"{len(rows)} runs{' have both numbers' if few else ''}."
+    if numbered := len(front) <= _NUMBERED and all("run" in row for row in rows):
         _number_runs(figure, axes, front, [str(rows[k]["run"]) for k in firsts])
     if alone:
         run = rows[firsts[0]]
-        about = [str(run.get("variant", "")), *(sweep.value(key, run[key]) for key in sweep.grid)]
-        which = ", ".join(filter(None, [f"number {run['run']} in the table" if "run" in run else "", *about]))
-        figure.note(f"{len(rows)} runs. Best run ({which}): least energy and least error.")
+        values = [sweep.value(key, run[key]).replace(" = ", "\u00a0=\u00a0") for key in sweep.grid]
+        about = [f"number {run['run']} in the table" if numbered else "", str(run.get("variant", "")), *values]
+        text += f" Best run ({', '.join(filter(None, about))}): least energy and least error."
     else:
-        figure.note(
-            f"{len(rows)} runs. Pareto front: no run is better in both. Numbers: runs as in the table, the first of "
-            "equal runs."
-        )
+        text += " Pareto front: no run is better in both."
+        text += " Numbers: runs as in the table, the first of equal runs." if numbered else ""
+    figure.note(text)
     return figure
 
 
