@@ -24,9 +24,8 @@ from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.unilateral import UnilateralArrays
 from dynsim.dynamics.tree import support as ks
 from dynsim.engine.link_sensors import AppliedWrench, add_link_sensors
-from dynsim.engine.negligible import without_negligible
 from dynsim.engine.prepare import Prepared
-from dynsim.engine.ring import counted_within, time_shares
+from dynsim.engine.ring import counted_within, time_shares, without_negligible
 from dynsim.engine.target_distance import hand_distance
 from dynsim.engine.warnings import warnings_of
 from dynsim.errors import RecordError

@@ -1,4 +1,4 @@
-"""Event counts and statistics of a run that keeps only its last samples, in a ring buffer.
+"""Events that count, and the statistics of a run that keeps only its last samples, in a ring buffer.
 
 The kernels count from the beginning of the run. Within the ring, events are counted; times, fractions and extremes are
 computed from the samples. Three numbers are unknown: the losses of single contacts, the losses of single stops, and the
@@ -20,7 +20,7 @@ from dynsim.engine.prepare import Prepared
 from dynsim.integrators import run as ki
 from dynsim.integrators.stepping import tables as kt
 from dynsim.model.description import Array
-from dynsim.record import Event
+from dynsim.record import Event, Record
 
 _COUNTS = {
     "lift_off": ku.LIFT_OFFS,
@@ -29,6 +29,15 @@ _COUNTS = {
     "bounce": ku.BOUNCES,
     "chatter": ku.CHATTERED,
 }
+# Motion below which slip and openings are not counted [m or rad]: the distance up to which a contact counts as closed
+# at the start. At the limit of friction, rounding lets points start to slip at 1e-11 m/s and stop at the next tick.
+NEGLIGIBLE = 1e-6
+# Samples within an opening or a slip of a joint from which its extent is known; a parabola through three samples is at
+# most a third higher than the largest of them.
+_INSIDE = 3
+# Duration up to which the joint positions before and after a slip show its extent [s].
+_SHORT = 0.02
+_PAIRS = {("slip_start", "slip_stop"): ku.SLIP_STARTS, ("lift_off", "landing"): ku.LIFT_OFFS}
 _MODES = {ka.OPEN: ku.TIME_OPEN, ka.SLIDING: ku.TIME_SLIDING, ka.STICKING: ku.TIME_STICKING}
 
 
@@ -114,3 +123,55 @@ def _struck(prepared: Prepared, event: Event) -> int:
     q = run.states("q")[row, robot.position_index[robot.joint_names.index(event.name)]]
     own = [k for k, stop in enumerate(prepared.stops) if stop.joint == event.name]
     return min(own, key=lambda k: abs(q - prepared.stops[k].position))
+
+
+def without_negligible(record: Record, prepared: Prepared, happened: Sequence[Event]) -> tuple[list[Event], Prepared]:
+    """Return the events that count, and the run with as many events in its tally.
+
+    A slip is omitted with its end, and a lift-off with the landing that follows it. The samples around and within the
+    pair must show that the slip, or the gap, is below :data:`NEGLIGIBLE`; otherwise the pair is kept.
+
+    Parameters
+    ----------
+    record : Record
+        Record with positions, gaps and slip distances.
+    prepared : Prepared
+        Prepared run under the unilateral law.
+    happened : sequence of Event
+        Events of the run in chronological order.
+    """
+    unilateral = prepared.system.unilateral
+    if unilateral is None or not len(record):
+        return list(happened), prepared
+    contacts = {contact.name: k for k, contact in enumerate(prepared.contacts)}
+    joints = {dry.joint: record.labels["q"].index(dry.joint) for dry in prepared.dry}
+    times = np.array([event.time for event in happened])
+    before, after = np.searchsorted(record.time, times, "left") - 1, np.searchsorted(record.time, times, "left")
+    open_at = prepared.run.outputs("contact")[:, :, kst.OUT_MODE] == ka.OPEN
+    tally, omitted, last = unilateral.tally.copy(), set[int](), dict[str, int]()
+    for end, event in enumerate(happened):
+        begin = last.get(event.name)
+        last[event.name] = end
+        column = None if begin is None else _PAIRS.get((happened[begin].kind, event.kind))
+        if begin is None or column is None or after[end] >= len(record):
+            continue
+        span = slice(max(int(before[begin]), 0), int(after[end]) + 1)
+        contact, joint = contacts.get(event.name), joints.get(event.name)
+        # A contact and a joint may have the same name; the contact is then known to be open.
+        if contact is not None and joint is not None:
+            if not open_at[span, contact].all():
+                continue
+            contact = None
+        inside = span.stop - span.start - 2 >= _INSIDE
+        if contact is None:
+            extent = np.ptp(record["q"][span, joint]) if inside or event.time - happened[begin].time <= _SHORT else 1.0
+        elif column == ku.SLIP_STARTS:
+            extent = np.ptp(record["contact_slip_distance"][span, contact])
+        else:
+            extent = record["contact_gap"][span, contact].max() if inside else 1.0
+        if extent < NEGLIGIBLE:
+            omitted |= {begin, end}
+            if contact is not None:
+                tally[contact, [column, *([ku.LANDINGS] if column == ku.LIFT_OFFS else [])]] -= 1.0
+    kept = [event for k, event in enumerate(happened) if k not in omitted]
+    return kept, replace(prepared, system=prepared.system._replace(unilateral=unilateral._replace(tally=tally)))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import dynsim
-from dynsim.engine.negligible import LEAST
+from dynsim.engine.ring import NEGLIGIBLE
 
 BLOCK = """\
 name: block
@@ -44,7 +44,7 @@ def test_slips_of_less_than_a_micrometre_do_not_count(excess: float, counted: bo
     record = pulled(tmp_path, [[0, 0, 0], [peak, 0, 0], [0, 0, 0], [0, 0, 0]], [0.0, 0.4, 0.8, 1.2])
     contact, kinds = record.summary["contacts"][0], Counter(event.kind for event in record.events)
     slid = record["contact_slip_distance"][-1, 0]
-    assert (slid > LEAST) == counted
+    assert (slid > NEGLIGIBLE) == counted
     assert slid > 0.0
     assert contact["slip_distance_m"] == slid
     assert contact["slip_starts"] == kinds["slip_start"] == kinds["slip_stop"] == int(counted)
@@ -57,7 +57,7 @@ def test_openings_of_less_than_a_micrometre_do_not_count(excess: float, counted:
     record = pulled(tmp_path, [[0, 0, 0], [0, 0, peak], [0, 0, 0], [0, 0, 0]], [0.0, 0.4, 0.8, 1.2])
     contact, kinds = record.summary["contacts"][0], Counter(event.kind for event in record.events)
     assert record["contact_gap"].max() > 0.0
-    assert (record["contact_gap"].max() > LEAST) == counted
+    assert (record["contact_gap"].max() > NEGLIGIBLE) == counted
     assert contact["lift_offs"] == contact["landings"] == kinds["lift_off"] == kinds["landing"] == int(counted)
 
 
@@ -73,4 +73,4 @@ def test_wheels_of_a_pushing_snake_do_not_slip_by_rounding() -> None:
         following = [event for event in record.events if event.name == slip.name and event.time > slip.time][:1]
         begin, end = np.searchsorted(record.time, [slip.time, following[0].time if following else np.inf])
         if end < len(record) and following[0].kind == "slip_stop":
-            assert np.ptp(distance[max(begin - 1, 0) : end + 1, wheels[slip.name]]) >= LEAST
+            assert np.ptp(distance[max(begin - 1, 0) : end + 1, wheels[slip.name]]) >= NEGLIGIBLE
