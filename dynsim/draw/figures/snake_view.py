@@ -45,7 +45,7 @@ SHARES = LinearSegmentedColormap.from_list("shares", [LIFT, GROUND])
 # Minimum height of a top view relative to its width, because a straight robot appears as a thin line.
 MIN_HEIGHT = 0.3
 # Font size of tick labels of postures [point]; least width of their panels, greatest and smallest height [inch].
-SMALL, CELL, TALLEST, LOWEST = 6.5, 1.6, 4.6, 0.5
+SMALL, CELL, TALLEST, LOWEST = 6.5, 1.6, 4.6, 0.35
 # If a point of the body rises or sinks by more than this, there is a side view [m].
 RISES = 0.01
 # Errors below this are rounding errors [mm or °]; ratio of errors above which their axis is logarithmic.
@@ -427,6 +427,8 @@ def error_axis(axis: Axes, *errors: NDArray[np.float64]) -> None:
         return
     axis.set_ylim(0.7 * low, 1.5 * high)
     style.log_axis(axis)
+    locator: Any = axis.yaxis.get_major_locator()
+    locator.set_params(numticks=6)  # otherwise low panels have labels at two decades only
 
 
 def moments(record: Record, count: int) -> NDArray[np.int64]:
