@@ -8,7 +8,8 @@ from pathlib import Path
 import matplotlib
 import pytest
 from cycler import cycler
-from support.messages import raises
+from support.layout import layout_faults
+from support.messages import lines_with, raises
 
 import dynsim
 from dynsim.cli import main
@@ -126,6 +127,13 @@ def test_caption_has_the_notes_even_if_they_are_not_drawn(record: Record) -> Non
     shown = ["5 ms" in " ".join(text.get_text() for text in figure.texts) for figure in figures]
     assert shown == [True, False]
     assert figures[0].get_figheight() > figures[1].get_figheight()
+
+
+@pytest.mark.parametrize(("points", "fault"), [(-3.0, True), (0.5, True), (2.0, False)])
+def test_layout_faults_include_text_near_the_edge(record: Record, points: float, fault: bool) -> None:
+    figure = drawn(record)
+    figure.text(points / 72.0 / figure.get_figwidth(), 0.5, "iii", rotation=90)
+    assert bool(lines_with(layout_faults(figure), "iii", "edge")) is fault
 
 
 def test_caption_names_subject_run_and_axes(record: Record) -> None:
