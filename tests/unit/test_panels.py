@@ -61,8 +61,8 @@ def test_each_panel_of_a_comparison_alone(records: dict[str, Record], name: str,
 def test_panels_keep_their_height_and_their_legend(records: dict[str, Record]) -> None:
     everything = drawn(records, "compare_energy", size=3.4)
     figure = drawn(records, "compare_energy", size=3.4, panels="work")
-    for one in (everything, figure):
-        one.draw_without_rendering()
+    for drawing in (everything, figure):
+        drawing.draw_without_rendering()
     height = everything.axes[2].get_window_extent().height
     assert figure.axes[0].get_window_extent().height == pytest.approx(height, rel=0.05)
     assert legend(figure) == legend(everything) == ["braced", "free"]

@@ -29,6 +29,7 @@ TRACTION_TOP, MARGIN_LOW = 2.5, -2.0
 # Tracking: minimum ranges of the axes, so that rounding errors are not magnified.
 MIN_RANGES = {"position [m]": 1e-3, "heading [°]": 0.1, "error [mm]": 5e-3, "heading error [°]": 5e-3}
 MILLI = 1e3
+_MINIMUM = "Minimum of the tip margin: from {:g} s on."
 # Values over time, and how they are drawn.
 Curve = tuple[Array, dict[str, Any]]
 
@@ -61,7 +62,7 @@ def overturning(record: Record) -> Figure | None:
             _mark_tipping(axes, [record], [style.PULLING])
         panels[0].set_ylabel(label)
         style.legend_above(panels[-1], columns=4)
-    note = []
+    note = [_MINIMUM.format(record.settle_time)]
     if np.nanmax(traction, initial=0.0) > TRACTION_TOP:
         note.append(f"Traction demand: cut off at {TRACTION_TOP:g}, which a wheel with almost no load exceeds.")
     if bare.any():
@@ -92,6 +93,7 @@ def margin_comparison(records: Mapping[str, Record]) -> Figure | None:
     panels[0].set_ylabel("tip margin")
     contacts.mark_variants(figure, [panels], shown, styles)
     style.legend_below(figure, panels[-1:], 1)
+    figure.note(_MINIMUM.format(max(record.settle_time for record in some)))
     return figure
 
 
@@ -174,7 +176,7 @@ def _verdict(record: Record) -> str:
     more = f"{len(times)} times, first " if len(times) > 1 else ""
     settle = record.settle_time
     if record.time[-1] > settle and overturns_settled(record, settle) is None:
-        return f"only the initial transient is below zero, {more}at {style.number(times[0], 3)} s"
+        return f"below 0 only at the start, {more}at {style.number(times[0], 3)} s"
     return f"tips over {more}at {style.number(times[0], 3)} s"
 
 
@@ -182,7 +184,7 @@ def _margin_label(name: str, record: Record) -> str:
     """Return a label with the minimum margin after the start, and whether the base tips."""
     settle = record.settle_time
     late = record[MARGIN][record.time >= settle]
-    least = f" min {style.number(float(np.nanmin(late)), 3)} from {settle:g} s on;" if np.isfinite(late).any() else ""
+    least = f" min {style.number(float(np.nanmin(late)), 3)};" if np.isfinite(late).any() else ""
     return f"{name}:{least} {_verdict(record)}"
 
 

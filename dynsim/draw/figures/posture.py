@@ -256,11 +256,14 @@ def contact_labels(body: Skeleton, plane: SidePlane, scale: float) -> list[Label
     points = [point for point in points if point[0].body not in body.objects]
     if len(points) > LABELLED:
         return []
+    largest = max((abs(force) for *_, force, _ in points if not np.isnan(force)), default=0.0)
     for contact, surface, position, force, at in sorted(points, key=lambda entry: float(entry[4][0])):
         along, up = plane.axes @ surface.gradient(position)
         steep = abs(along) > abs(up)
         side = (-1 if along > 0.0 else 1, 0) if steep else (0, 1 if up < 0.0 else -1)
-        text = contact.name if np.isnan(force) else f"{contact.name}\n{style.number(force, 3)} N"
+        # Less than a thousandth of the largest force is printed as 0.
+        value = style.number(0.0 if abs(force) < 1e-3 * largest else force, 3)
+        text = contact.name if np.isnan(force) else f"{contact.name}\n{value} N"
         label = Label(text, at, side, 0)
         while any(label.overprints(other, scale) for other in labels):
             label = replace(label, level=label.level + 1)
@@ -350,7 +353,8 @@ def posture(record: Record) -> Figure | None:
         grid = figure.add_gridspec(1, 2, wspace=0.15)
     if not style.narrow():
         _space_view(figure.add_subplot(grid[0], projection="3d"), body, (low, high), wide)
-    side = figure.add_subplot(grid[-1])
+        figure.axes[0].set_label("view in space")
+    side = figure.add_subplot(grid[-1], label="side view")
     _side_view(side, body, plane, scale, colour=ARM_COLOUR)
     _frame_side(side, plane, extent, body.scene.surfaces)
     if note:
