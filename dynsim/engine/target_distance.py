@@ -9,18 +9,20 @@ of the voltages that the loop balances,
 
     k_p (q_r − q) = R/K (τ_weight + τ_contacts + τ_loads + τ_stop + τ_friction) + u_motion + (u_command − u),
 
-with the torques that the motor carries, K at the joint, and the part of the command beyond the limits of the motor.
+with the torques that the motor carries, also those of joints coupled to its joint, K at the joint, and the part of the
+command beyond the limits of the motor.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from dynsim.compile.model import Model
 from dynsim.compile.posture import load_torques
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.drive.law import asked_of, evaluate_reference, fed_forward, servo_drag
@@ -45,6 +47,8 @@ PART, EXPLAINED, UNEXPLAINED, OPPOSED = 0.25, 0.6, 0.1, 0.3
 FAR, MAIN = 0.5, 0.75
 # Smallest part of a cause for which a joint is named.
 NAMED = 0.2
+# Planned voltages differ from the voltages of the weight by less than this part if they carry the weight alone.
+SAME = 1e-3
 # Nodes and weights on [0, 1] of the mean Jacobian (Gauss, third order).
 NODES = ((0.5 - 0.15**0.5, 5.0 / 18.0), (0.5, 8.0 / 18.0), (0.5 + 0.15**0.5, 5.0 / 18.0))
 
@@ -57,6 +61,8 @@ TEXTS = {
     "limit": ("motors of {} at their limits of voltage, current or torque", "use larger motors, or slow down"),
     "stop": ("joint stops of {}", "change the path or the limits"),
     "friction": ("friction at rest of {}", "raise the gains"),
+    "brake": ("closed brakes of {}", "open the brakes, or change the path"),
+    "command": ("commands that replace the controller of {}", "set references instead of commands"),
     "motion": ("motion of {}", "run until the arm settles, slow down, or use controller.feed_forward: dynamics"),
     "base": ("deviation of the base from its path", "slow down the base, or raise the gains of its wheels"),
     "free": ("motion of {} without position control", "add motors, or a brace that does not slip"),
@@ -88,8 +94,11 @@ def hand_chain(robot: Robot) -> list[int]:
 
 
 def hand_reach(robot: Robot) -> float:
-    """Return the length of the chain from the first joint to the hand [m]."""
-    lengths = (np.linalg.norm(robot.links[k].p_PJ) for k in hand_chain(robot)[1:])
+    """Return the length of the chain from the first joint to the hand, with sliders at their further limits [m]."""
+    links = [robot.links[k] for k in hand_chain(robot)]
+    lengths = [float(np.linalg.norm(link.p_PJ)) for link in links[1:]]
+    sliders = [max(-link.lower, link.upper) for link in links if link.kind == "prismatic"]
+    lengths += [length for length in sliders if np.isfinite(length)]
     return float(np.linalg.norm(robot.attach(*robot.hand)[1]) + sum(lengths))
 
 
@@ -115,8 +124,8 @@ def named_causes(parts: Parts) -> list[DistanceCause]:
             return []
         large, joints = ["deflection"], {joint for cause in static for joint in known[cause]}
         known["deflection"] = {joint: sum(known[cause].get(joint, 0.0) for cause in static) for joint in joints}
-    # Contacts would take over the forces of motors, stops and friction, in an unknown way.
-    if {"limit", "stop", "friction"} & set(large) and sum(map(abs, reaction.values())) > OPPOSED:
+    # Contacts would take over the forces of motors, stops, brakes and friction, in an unknown way.
+    if {"limit", "stop", "friction", "brake"} & set(large) and sum(map(abs, reaction.values())) > OPPOSED:
         return []
     return [_cause(cause, known[cause]) for cause in large]
 
@@ -161,13 +170,14 @@ def hand_causes(
     parts: Parts = defaultdict(dict)
     # Coordinates are set to their references one group after the other: position loops, other joints, base.
     referenced = q.copy()
+    places, motions = list(robot.position_index), _coupled_motions(model)
     for k, loop in loops.items():
-        referenced[robot.position_index[k]] = loop.reference
+        referenced[places] += motions[:, k] * (loop.reference - q[places[k]])
     nodes = [w * model.point_jacobian(*robot.hand, referenced + x * (q - referenced)) for x, w in NODES]
     rates = np.sum(nodes, axis=0)
     for k, loop in loops.items():
         for cause, share in loop.parts.items():
-            parts[cause][robot.links[k].joint] = float(weight @ rates[:, k] * share)
+            parts[cause][robot.links[k].joint] = float(weight @ rates @ motions[:, k] * share)
     if sensed:
         causes = [_cause(cause, parts[cause]) for cause in ("limit", "stop") if cause in parts]
         return [cause for cause in causes if cause.share >= PART]
@@ -179,7 +189,7 @@ def hand_causes(
         return named_causes(parts)
     ends = (*robot.position_index[1:], len(q))
     for k in chain:
-        if k not in loops:
+        if k not in loops and not any(motions[k, other] for other in loops):
             coordinates = slice(robot.position_index[k], ends[k])
             referenced[coordinates] = robot.initial[coordinates]
             before, then = hand(referenced), before
@@ -192,7 +202,7 @@ def hand_causes(
         parts["base"][""] = float(weight @ (then - before))
     parts["reference"][""] = float(weight @ (before - target))
     causes = named_causes(parts)
-    weights = model.bias_forces(referenced, np.zeros(model.n))
+    weights = model.bias_forces(referenced, np.zeros(model.n)) @ motions
     for k, loop in loops.items():
         off = abs(float(q[robot.position_index[k]]) - loop.reference)
         # The joint may have left a posture in which its weight was larger.
@@ -219,14 +229,19 @@ def hand_distance(record: Record, prepared: Prepared, settle: float, begun: floa
     return {**errors, "hand_error_causes": [cause._asdict() for cause in causes], "hand_reach_m": reach}
 
 
-def off_target(summary: dict[str, Any], time: float) -> list[str]:
-    """Warn of a hand far from its target at the start of a run or at its end ``time`` [s], with the causes."""
+def off_target(summary: dict[str, Any], time: float, begun: float, from_start: bool) -> list[str]:
+    """Warn of a hand far from its target at the start of a run or at its end ``time`` [s], with the causes.
+
+    A run that continues another one at ``begun`` > 0 [s] does not jump. ``from_start`` is true if the path begins
+    relative to the hand.
+    """
     warnings = []
     start, end, reach = summary["hand_error_start_m"], summary["hand_error_end_m"], summary.get("hand_reach_m", 0.0)
-    if start is not None and start > _limit(START_LIMIT, reach):
+    if start is not None and begun == 0.0 and start > _limit(START_LIMIT, reach):
+        frame = "" if from_start else "use controller.hand.path.frame: start, or "
         warnings.append(
-            f"hand: starts {_beyond(start, START_LIMIT, reach)} from its path and jumps there; use "
-            "controller.hand.path.frame: start, or begin the path at the hand"
+            f"hand: starts {_beyond(start, START_LIMIT, reach)} from its path and jumps there; "
+            f"{frame}begin the path at the hand"
         )
     if end is not None and end > _limit(END_LIMIT, reach):
         causes = [DistanceCause(**cause) for cause in summary["hand_error_causes"]]
@@ -256,7 +271,8 @@ def _limit(share: float, reach: float) -> float:
 
 
 def _beyond(distance: float, share: float, reach: float) -> str:
-    return f"{1e3 * distance:.3g} mm (limit {1e3 * _limit(share, reach):.3g} mm, {100.0 * share:g} % of its reach)"
+    part = f", {100.0 * share:g} % of its reach" if share * reach > LEAST else ""
+    return f"{1e3 * distance:.3g} mm (limit {1e3 * _limit(share, reach):.3g} mm{part})"
 
 
 def because(causes: Sequence[DistanceCause]) -> str:
@@ -299,20 +315,33 @@ def _loops(record: Record, prepared: Prepared, chain: Sequence[int]) -> dict[int
     )
     seen.joints[:, ka.Q], seen.joints[:, ka.QD] = q[places], v
     evaluate_reference(drives, reference, time, seen)
-    # Torques that the motors carry, by cause, (n,).
-    gravity = model.bias_forces(q, still)
-    moving = model.inverse_dynamics(q, v, vdot) - gravity + model.armature * vdot + model.damping * v
+    braked, motions = model.armature == ka.BRAKED, _coupled_motions(model)
+    armature = np.where(braked, 0.0, model.armature)
+    # Torques that the motors carry, by cause, (n,); motors also carry the torques of joints coupled to theirs.
+    gravity = model.bias_forces(q, still) @ motions
+
+    def moving_torques(q: Array, v: Array, vdot: Array) -> Array:
+        whole = model.inverse_dynamics(q, v, vdot) + armature * vdot + model.damping * v
+        return np.asarray((whole - model.bias_forces(q, still)) @ motions)
+
+    moving = moving_torques(q, v, vdot)
     loads = [load for load in prepared.loads if len(load.coefficients)]
     carried, touched = load_torques(model, q, loads, time), np.zeros(model.n)
     for contact, force in zip(prepared.contacts, record["contact_force"][-1], strict=True):
         if force.any():
             touched -= contact_point(model, contact, q)[1].T @ force
-    stopped, rubbing = (-_by_joint(record, name) for name in ("stop_force", "joint_friction"))
+    carried, touched = carried @ motions, touched @ motions
+    stopped, rubbing = (-_by_joint(record, name) @ motions for name in ("stop_force", "joint_friction"))
+    plan = _plan(prepared, seen, time, moving_torques)
     loops = {}
     for a, (k, kind, mode, sampled) in enumerate(drives.table[:, COLUMNS].tolist()):
         motor = drives.motor[a]
         servo = kind == ka.POSITION_SERVO and mode == ka.POSITION_MODE
-        if k not in chain or sampled == ka.GIVEN or not (servo or kind == ka.DC_MOTOR) or not motor[ka.K_P] > 0.0:
+        if not motions[chain, k].any() or not (servo or kind == ka.DC_MOTOR) or not motor[ka.K_P] > 0.0:
+            continue
+        if sampled == ka.GIVEN:
+            wanted = seen.motors[a, ka.Q_REF]
+            loops[k] = _Loop(wanted, 0.0, {"command": q[places[k]] - wanted})
             continue
         volts, ahead = motor[ka.RESISTANCE] / motor[ka.K_M], seen.motors[a, ka.V_REF] - v[k]
         asked = asked_of(drives, reference, time, seen, a)
@@ -326,7 +355,7 @@ def _loops(record: Record, prepared: Prepared, chain: Sequence[int]) -> dict[int
             "limit": asked - voltage[a],
         }
         # A motor at its limit is too weak, unless it pushes against a stop or a contact.
-        beyond = parts["limit"]
+        beyond = 0.0 if braked[k] else parts["limit"]
         against = (
             "stop" if stopped[k] != 0.0 else max(parts, key=lambda cause: (cause != "limit") * parts[cause] * beyond)
         )
@@ -335,35 +364,82 @@ def _loops(record: Record, prepared: Prepared, chain: Sequence[int]) -> dict[int
             parts["limit"] = 0.0
         shift = 0.0
         if balance is not None:  # The shift of the reference balances static forces at the start.
-            weight, load = volts * model.bias_forces(robot.initial, still)[k], 0.0
+            weight, load = volts * (model.bias_forces(robot.initial, still) @ motions)[k], 0.0
             if loads:
-                load = volts * load_torques(model, robot.initial, loads)[k]
+                load = volts * (load_torques(model, robot.initial, loads) @ motions)[k]
             drop = motor[ka.RESISTANCE] * balance.current[a]
             if len(reference.voltage):
                 weight, drop = 0.0, load
             for cause, part in (("sag", weight), ("load", load), ("contact", drop - weight - load)):
                 parts[cause] -= part
             shift = drop / motor[ka.K_P]
-        if len(reference.voltage):
-            there = q.copy()
-            there[[places[j] for j in drives.table[:, ka.DRIVEN]]] = seen.motors[:, ka.Q_REF]
-            weight = volts * model.bias_forces(there, still)[k]
-            parts["sag"] -= weight
-            # The plan has inertia and brace forces, which are not known separately.
-            both = (
-                parts["motion"]
-                + parts.pop("contact")
-                - (fed_forward(reference.voltage, reference.grid, time, a, 0.0) - weight)
-            )
-            parts["motion" if seen.motors[:, ka.V_REF].any() else "contact"] = both
+        for cause, part in plan.get(a, {}).items():
+            parts[cause] -= part
         wanted = seen.motors[a, ka.Q_REF] - shift
         remainder = motor[ka.K_P] * (wanted - q[places[k]]) - sum(parts.values())
         # All other forces that act between the samples of a continuous controller are forces of ties and of the caller.
         others = robot.ties or len(loads) < len(prepared.loads)
-        cause = "load" if others and not (robot.couplings or sampled) else ""
+        cause = "load" if others and not (robot.couplings or sampled or braked[k]) else ""
         parts[cause] = parts.get(cause, 0.0) + remainder
+        if braked[k]:
+            parts = _braked(parts)
         loops[k] = _Loop(wanted, volts / motor[ka.K_P], {cause: -part / motor[ka.K_P] for cause, part in parts.items()})
     return loops
+
+
+def _plan(
+    prepared: Prepared, seen: Any, time: float, moving_torques: Callable[[Array, Array, Array], Array]
+) -> dict[int, dict[str, float]]:
+    """Return the parts of the planned voltages at a time [s]: weight, motion and braces, by motor [V]."""
+    model, drives, reference = prepared.model, prepared.system.drives, prepared.system.reference
+    if not len(reference.voltage):
+        return {}
+    # Plans require a motor on every joint, and a stationary base.
+    q, (v, after), joints = model.robot.initial.copy(), np.zeros((2, model.n)), drives.table[:, ka.DRIVEN]
+    q[np.array(model.robot.position_index)[joints]] = seen.motors[:, ka.Q_REF]
+    v[joints] = seen.motors[:, ka.V_REF]
+    later: Any = SimpleNamespace(motors=seen.motors.copy())
+    step = 1e-3 * float(reference.grid[1])
+    evaluate_reference(drives, reference, time + step, later)
+    after[joints] = later.motors[:, ka.V_REF]
+    motor = drives.motor
+    volts = motor[:, ka.RESISTANCE] / motor[:, ka.K_M]
+    planned = np.array([fed_forward(reference.voltage, reference.grid, time, a, 0.0) for a in range(len(motor))])
+    weight = volts * model.bias_forces(q, np.zeros(model.n))[joints]
+    motion = volts * moving_torques(q, v, (after - v) / step)[joints] + motor[:, ka.K_M] * v[joints]
+    # Motors whose references were replaced have no plan.
+    used = [a for a in range(len(motor)) if reference.voltage[:, a].any()]
+    if np.abs(planned - weight)[used].max(initial=0.0) <= SAME * np.abs(planned).max():
+        motion[:] = 0.0  # a plan of the weight alone
+    pressing = planned - weight - motion
+    return {a: {"sag": weight[a], "motion": motion[a], "contact": pressing[a]} for a in used}
+
+
+def _braked(parts: dict[str, float]) -> dict[str, float]:
+    """Return the parts of a joint with a closed brake, which carries all forces that the motor does not balance.
+
+    A brake that carries part of the static forces follows from them, as a brace does.
+    """
+    static = {cause: parts.pop(cause) for cause in ("sag", "contact", "load")}
+    forces, brake = sum(static.values()), sum(parts.values())
+    if brake * forces >= 0.0:
+        return static | {"brake": brake}
+    if abs(brake) > abs(forces):
+        return {"brake": brake + forces}
+    return {cause: part * (1.0 + brake / forces) for cause, part in static.items()}
+
+
+def _coupled_motions(model: Model) -> Array:
+    """Return the rates of all joints per rate of each joint, with the joints coupled to it, (n, n)."""
+    motions, names = np.eye(model.n), model.joint_names
+    for _ in model.robot.couplings:  # a leader may follow another joint
+        for coupling in model.robot.couplings:
+            motions[names.index(coupling.joint)] = coupling.ratio * motions[names.index(coupling.leader)]
+    for coupling in model.robot.couplings:
+        joint = names.index(coupling.joint)
+        leader = int(np.flatnonzero(motions[joint])[0]) if motions[joint].any() else joint
+        motions[:, joint] = motions[:, leader] / motions[joint, leader] if leader != joint else 0.0
+    return motions
 
 
 def _by_joint(record: Record, name: str) -> Array:

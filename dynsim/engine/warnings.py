@@ -119,7 +119,9 @@ def warnings_of(
     warnings += _beyond_stops(robot, prepared.stops, prepared.control)
     warnings += [*robot.notes, *without_effect(scenario, bool(robot.motors))]
     warnings += _overloaded(motors)
-    warnings += off_target(summary, float(record.time[-1]) if len(record) else 0.0)
+    hand = getattr(scenario.config.controller, "hand", None)
+    from_start = getattr(hand, "from_start", False)
+    warnings += off_target(summary, float(record.time[-1]) if len(record) else 0.0, begun, from_start)
     return warnings if prepared.balance is None else [*warnings, *prepared.balance.warnings]
 
 

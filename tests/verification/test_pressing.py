@@ -204,6 +204,15 @@ def test_refused(overrides, names):
         build.controller(scenario(**overrides), model)
 
 
+def test_plan_without_braces_that_is_too_fast_names_its_own_key():
+    case = dynsim.load_scenario(
+        "six_axis_arm", overrides={"controller.feed_forward": "dynamics", "plant.motor.voltage_limit_V": 0.05}
+    )
+    with raises(DynsimError, "controller.feed_forward: at t", "no motor torques", "voltage_limit_V") as error:
+        dynsim.Simulation(case)
+    assert "brace" not in str(error.value)
+
+
 def test_a_brace_in_the_air_is_refused(tmp_path):
     """Nothing would carry what is planned for it."""
     raised = {"plant.base.position_m": [0.0, 0.0, 0.3], "controller.hand.path.center_m": [1.5, 1.5, 0.7]}

@@ -232,6 +232,146 @@ def test_planned_voltages_leave_only_the_unplanned_load() -> None:
         assert list(causes) == ["load"]
 
 
+PLANS = ("gravity", "dynamics")
+
+
+@pytest.mark.parametrize("plan", PLANS)
+@pytest.mark.parametrize("duration", [0.7, 4.0])  # on the path, and at rest
+def test_wall_is_the_cause_with_planned_voltages(plan: str, duration: float) -> None:
+    """Without the wall the planned voltages leave a hundredth of the distance."""
+    wall = {"surfaces": {"wall": {"type": "plane", "point_m": [LENGTH + 0.02, 0, 0], "normal": [-1, 0, 0]}}}
+    point = {"tip": {"body": "link_2", "point_m": [0, 0, LENGTH], "surface": "wall"}}
+    chain, hand = [SLIDER, LINK | {"initial_deg": 90.0}], {"path": AT_REST | {"to_m": [0.12, 0, 0]}}
+    for enabled in (True, False):
+        point["tip"]["enabled"] = enabled
+        contacts = {"law": "unilateral", "points": point}
+        sections = {"contacts": contacts, "hand": hand, "control": {"feed_forward": plan}, **wall}
+        distance, causes, _ = result(chain, ["joint_1", "joint_2"], 1000.0, duration_s=duration, **sections)
+        if enabled:
+            assert distance > 0.05
+            assert list(causes) == ["contact"]
+            free = distance
+        else:
+            assert distance < 0.01 * free
+
+
+def test_joint_without_its_planned_voltage_sags() -> None:
+    """A reference that the caller sets replaces the plan of its motor, so that the loop carries the weight."""
+    simulation = dynsim.Simulation(scenario(LEVEL, ["joint_1"], control={"feed_forward": "gravity"}))
+    simulation.set_reference("joint_1", np.pi / 2)
+    simulation.advance(4.0)
+    summary = simulation.record().summary
+    assert summary["hand_error_end_m"] == pytest.approx(LENGTH * R / K * MASS * GRAVITY * LENGTH / 2 / 100.0, rel=0.01)
+    assert [cause["cause"] for cause in summary["hand_error_causes"]] == ["sag"]
+
+
+def after(change: Any, *args: Any, **more: Any) -> tuple[float, list[tuple[str, tuple[str, ...]]], list[str]]:
+    """Distance [m], causes with their joints, and warnings of a run in which the caller changes something at once."""
+    simulation = dynsim.Simulation(scenario(*args, **more))
+    change(simulation)
+    simulation.advance(4.0)
+    summary = simulation.record().summary
+    causes = [(cause["cause"], cause["joints"]) for cause in summary["hand_error_causes"]]
+    return summary["hand_error_end_m"], causes, [text for text in summary["warnings"] if text.startswith("hand")]
+
+
+@pytest.mark.parametrize("law", ["bilateral", "unilateral"])
+@pytest.mark.parametrize("limit", [{}, {"voltage_limit_V": 5.0}])
+def test_closed_brake_is_the_cause_even_if_the_motor_saturates(law: str, limit: dict[str, float]) -> None:
+    sections = turn(30.0) | {"contacts": {"law": law}}
+    chain = [LINK | {"motor": MOTOR | limit}]
+    distance, causes, (warning,) = after(lambda s: s.set_brake("joint_1", closed=True), chain, [], **sections)
+    assert distance == pytest.approx(2.0 * LENGTH * np.sin(np.deg2rad(15.0)), rel=1e-6)
+    assert causes == [("brake", ("joint_1",))]
+    assert mentions(warning, "brakes of joint_1", "open the brakes")
+    assert after(lambda _: None, chain, [], **sections)[0] < 2e-3
+
+
+def test_brake_that_keeps_a_sagging_joint_is_not_the_cause() -> None:
+    """The arm sags before its brake closes, which then carries nothing."""
+    simulation = dynsim.Simulation(scenario(LEVEL, ["joint_1"]))
+    simulation.advance(2.0)
+    simulation.set_brake("joint_1", closed=True)
+    simulation.advance(4.0)
+    assert [cause["cause"] for cause in simulation.record().summary["hand_error_causes"]] == ["sag"]
+
+
+def test_command_of_the_caller_is_the_cause() -> None:
+    distance, causes, (warning,) = after(lambda s: s.set_command("joint_1", 0.0), [LINK], [], **turn(30.0))
+    assert distance > 0.1
+    assert causes == [("command", ("joint_1",))]
+    assert mentions(warning, "commands", "joint_1")
+
+
+def coupled(ratio: float, lead: str) -> tuple[dict[str, Any], str]:
+    """Resolved scenario and URDF of two level links of a URDF arm; the joint without a motor follows the other one."""
+    other = {"joint_1": "joint_2", "joint_2": "joint_1"}[lead]
+    inertia = '<inertia ixx="0.004" iyy="0.004" izz="0.0004" ixy="0" ixz="0" iyz="0"/>'
+    body = '<link name="{}"><inertial><origin xyz="0 0 0.15"/><mass value="0.4"/>' + inertia + "</inertial></link>"
+    joint = (
+        '<joint name="{0}" type="revolute"><parent link="{1}"/><child link="{2}"/><origin xyz="0 0 {3}"/>'
+        '<axis xyz="0 1 0"/><limit lower="-3" upper="3" effort="0" velocity="0"/>{4}</joint>'
+    )
+    mimic = {other: f'<mimic joint="{lead}" multiplier="{ratio}"/>'}
+    parts = [body.format("a"), body.format("b"), joint.format("joint_1", "base", "a", 0.2, mimic.get("joint_1", ""))]
+    parts.append(joint.format("joint_2", "a", "b", 0.3, mimic.get("joint_2", "")))
+    urdf = f'<robot name="arm"><link name="base"/>{"".join(parts)}</robot>'
+    still = {lead: {"times_s": [0.0, 1.0], "angles_deg": [40.0, 40.0]}}
+    data = scenario([LINK], [], k_p=200.0, control={"joints": still}).resolved
+    data["plant"] = {
+        "type": "urdf_arm", "file": "arm.urdf", "motor": {"type": "wang_minami"}, "damping_N_m_s_per_rad": 0.5,
+        "initial_deg": {lead: 40.0, other: 40.0 * ratio}, "hand": {"body": "b", "point_m": [0, 0, 0.3]},
+    }  # fmt: skip
+    return data, urdf
+
+
+@pytest.mark.parametrize(("ratio", "lead"), [(1.5, "joint_1"), (-0.5, "joint_1"), (0.7, "joint_2")])
+def test_weight_of_coupled_joints_is_sag_of_the_leader(tmp_path: Any, ratio: float, lead: str) -> None:
+    data, urdf = coupled(ratio, lead)
+    (tmp_path / "arm.urdf").write_text(urdf, encoding="utf-8")
+    data["plant"]["file"] = str(tmp_path / "arm.urdf")
+    summary = dynsim.simulate(scenario_from_resolved(data)).summary
+    assert summary["hand_error_end_m"] > 5e-3
+    ((cause, share, joints),) = [tuple(cause.values()) for cause in summary["hand_error_causes"]]
+    assert (cause, joints) == ("sag", (lead,))
+    assert share == pytest.approx(1.0, abs=0.01)
+    data["plant"]["gravity_m_s2"] = [0, 0, 0]
+    assert dynsim.simulate(scenario_from_resolved(data)).summary["hand_error_end_m"] < 1e-6
+
+
+def test_reach_of_sliders_includes_their_travel() -> None:
+    """Without limits the reach of a gantry is zero, and the text of the warning gives only the least distance."""
+    chain = [SLIDER | {"axis": axis, "limit_m": [-0.4, 0.1]} for axis in "xy"] + [SLIDER | {"axis": "z"}]
+    joints = ["joint_1", "joint_2", "joint_3"]
+    summary = result(chain, joints)[2].summary
+    assert summary["hand_reach_m"] == pytest.approx(0.8)
+    for slider in chain:
+        slider.pop("limit_m", None)
+    summary = result(chain, joints)[2].summary
+    assert summary["hand_reach_m"] == 0.0
+    (warning,) = [text for text in summary["warnings"] if text.startswith("hand:")]
+    assert "(limit 1 mm)" in warning
+
+
+def test_continued_run_does_not_start_off_its_path() -> None:
+    arm = scenario(LEVEL, ["joint_1"], 10.0)
+    simulation = dynsim.Simulation(arm)
+    simulation.advance(2.0)
+    continued = dynsim.Simulation(arm, state=simulation.state)
+    continued.advance(3.0)
+    summary = continued.record().summary
+    assert summary["hand_error_start_m"] > 0.05
+    assert not [text for text in summary["warnings"] if "starts" in text]
+
+
+def test_path_relative_to_the_start_is_not_advised_again() -> None:
+    hand = {"path": AT_REST | {"origin_m": [0.0, 0.0, -0.1]}}
+    warnings = result([LINK, LINK | {"initial_deg": 45.0}], ["joint_1", "joint_2"], hand=hand)[2].summary["warnings"]
+    (start,) = [text for text in warnings if "starts" in text]
+    assert mentions(start, "begin the path at the hand")
+    assert "frame" not in start
+
+
 def test_brace_that_is_pushed_sideways_is_not_called_sag() -> None:
     """The friction of the elbow turns the vertical joint, which carries no weight."""
     record = dynsim.simulate(dynsim.load_scenario("brace_on_shapes", "flat"))

@@ -297,10 +297,12 @@ def _pressing_torques(
     planner, tables = pressing(model, times, q, v, braces, min_N)
     torques, _, solved = planner.least_heat(q, v, vdot, tables)
     if solved < len(times):
+        key, subject = ("brace", f"forces of {', '.join(braces)}") if braces else ("feed_forward", "motor torques")
+        fix = "change the forces, slow down" if braces else "slow down, use gravity"
         raise ModelError(
-            f"controller.brace: at t = {times[solved]:.3f} s no forces of {', '.join(braces)} carry the motion within "
-            "the motor limits; change the forces, slow down, or raise a voltage_limit_V or peak_current_A",
-            keys=("controller", "brace"),
+            f"controller.{key}: at t = {times[solved]:.3f} s no {subject} carry the motion within the motor limits; "
+            f"{fix}, or raise a voltage_limit_V or peak_current_A",
+            keys=("controller", key),
         )
     return torques
 
