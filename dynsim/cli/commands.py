@@ -161,17 +161,18 @@ def compare(
     from dynsim.studies.compare import compare as compare_variants
     from dynsim.studies.compare import save_comparison
 
-    records: dict[str, Record] = {}
+    results: dict[str, Record | SimulationStopped] = {}
 
     def finished(name: str, record: Record) -> None:
         # Delete the old comparison before the first of its records is replaced.
         discard(folder, COMPARISON_FILES)
         save_run(record, folder / name)
-        records[name] = record
+        results[name] = record
 
     def stopped(name: str, stop: SimulationStopped) -> None:
+        results[name] = stop
+        discard(folder, COMPARISON_FILES)
         if stop.record is not None:
-            discard(folder, COMPARISON_FILES)
             save_run(stop.record, folder / name)
             where = escaped(folder / name)
             errors.print(f"results of {escaped(name)} up to the stop are in {where} and are marked incomplete")
@@ -184,10 +185,11 @@ def compare(
         raise
     except SimulationStopped as stop:
         failure = stop
-    # Sort the records in the order of the variants in the file, not in the order in which they were completed.
-    records = {s.variant: records[s.variant] for s in loaded if s.variant in records}
+    # Sort the results in the order of the variants in the file, not in the order in which they were completed.
+    results = {scenario.variant: results[scenario.variant] for scenario in loaded if scenario.variant in results}
+    save_comparison(results, folder)
+    records = {name: result for name, result in results.items() if not isinstance(result, SimulationStopped)}
     if records:
-        save_comparison(records, folder)
         warn_about_meshes(record.scene for record in records.values())
         with interruptible_drawing(folder):
             if not no_figures:
@@ -199,7 +201,8 @@ def compare(
                 together = Figures(records, folder, format_, look, together=True)
                 page = draw_all([together, *wanted], Page(records, folder), quiet)
         if not quiet:
-            print_comparison(console, {name: record.summary for name, record in records.items()}, rows is Rows.all)
+            summaries = {name: record.summary for name, record in records.items()}
+            print_comparison(console, summaries, rows is Rows.all, [name for name in results if name not in records])
             print_written(folder)
         if not no_figures:
             print_page(page, quiet)

@@ -13,12 +13,14 @@ from rich.text import Text
 
 from dynsim.cli import screen
 from dynsim.cli.tables import Summary, SummaryRow, rows_of, warning_text
+from dynsim.errors import first_few
 from dynsim.system.terminal import escaped_line
 
 # Rows that are printed first if not all fit on the screen: keys, or headings of rows of contacts.
 _CHIEF = (
     "electrical_energy_J", "hand_error_rms_m", "final_position_error_m", "final_attitude_error_rad", "worst_joint",
-    "base.tip_margin_min_settled", "base.overturns_settled_at_s", "sinking", "force, max [N]", "hand_error_max_m",
+    "base.tip_margin_min_settled", "base.overturns_settled_at_s", "sinking", "force, max [N]", "touched",
+    "hand_error_max_m",
     "position_error_max_m", "attitude_error_max_rad", "joint_limit_violation_max_rad", "cost_final", "mode_switches",
     "base.wheel_load_min_N", "pulling [% of time]", "lift-offs, landings", "torque", "joule_heat_J", "friction_heat_J",
     "closed [% of time]", "sticking [% of time]", "energy_residual_relative",
@@ -41,58 +43,70 @@ def print_summary(console: Console, summary: Summary, every: bool = False) -> No
     _print(console, f"{summary['scenario']} {summary['variant']}".strip(), {"": summary}, every)
 
 
-def print_comparison(console: Console, summaries: Mapping[str, Summary], every: bool = False) -> None:
+def print_comparison(
+    console: Console, summaries: Mapping[str, Summary], every: bool = False, failed: Sequence[str] = ()
+) -> None:
     """Print the summaries of variants side by side, on at most one screen unless ``every`` row is wanted.
 
     Rows that are equal in all variants become one line. As long as the result is longer than the screen, warnings of
     the same kind are grouped, then contacts and joints whose names differ only in a number are folded, and finally only
-    the most important rows are printed, with one line per variant if the variants do not fit side by side.
+    the most important rows are printed, with one line per variant if the variants do not fit side by side. Variants
+    that ``failed`` are listed below the table.
     """
-    _print(console, next(iter(summaries.values()))["scenario"], summaries, every)
+    _print(console, next(iter(summaries.values()))["scenario"], summaries, every, failed)
 
 
-def _print(console: Console, title: str, summaries: Mapping[str, Summary], every: bool) -> None:
+def _print(
+    console: Console, title: str, summaries: Mapping[str, Summary], every: bool, failed: Sequence[str] = ()
+) -> None:
     names, runs = list(summaries), list(summaries.values())
     rows, warnings = rows_of(runs), _warnings(summaries)
+    missing = [f"failed, not in the table: {escaped_line(first_few(failed))}"] if failed else []
+    kind = "completed variants" if failed else "variants"
     if every:
-        screen.show(console, [*_side_by_side(title, names, rows, console.width), *warnings])
+        screen.show(console, [*_side_by_side(title, names, rows, console.width), *missing, *warnings])
         return
     width, height = screen.size(console)
     folded = rows_of(runs, folded=True)
     texts = {name: summary.get("warnings", ()) for name, summary in summaries.items()}
-    grouped = grouped_warnings(texts)
+    grouped = grouped_warnings(texts, runs=kind)
     # In a file or a pipe, no text is cut.
     pipe = screen.is_unbounded(console)
-    short = grouped if pipe else grouped_warnings(texts, width)
+    short = grouped if pipe else grouped_warnings(texts, width, kind)
     hidden = [_HIDDEN] * (len(warnings) > len(grouped))
     cut = [_HIDDEN] * (short != grouped or bool(hidden))
     forms = ((rows, warnings), *((r, [*w, *h]) for r in (rows, folded) for w, h in ((grouped, hidden), (short, cut))))
     parts: list[RenderableType]
     for shown, lines in forms:
-        different, equal = _without_equal(shown)
+        different, equal = _without_equal(shown, kind)
         tables = _side_by_side(title, names, different, width)
-        parts = [*tables, *equal, *lines]
+        parts = [*tables, *equal, *missing, *lines]
         # Do not render long tables to count their lines.
         if sum(table.row_count for table in tables) < height and screen.lines(console, parts) <= height:
             screen.show(console, parts)
             return
     # The rows of contacts would make this line too long.
-    equal = _without_equal([row for row in folded if not row.owner])[1]
+    equal = _without_equal([row for row in folded if not row.owner], kind)[1]
     most = max(_LEAST, min(int(_WARNINGS * height), height - len(names) - _HEADER))
     short = short if pipe else limited_warnings(short, most)
-    parts = [*equal, "other rows and whole warnings: --rows all; all numbers: comparison.csv or summary.json", *short]
+    parts = [
+        *equal,
+        *missing,
+        "other rows and whole warnings: --rows all; all numbers: comparison.csv or summary.json",
+        *short,
+    ]
     table = _chief(console, title, names, different, width, height - screen.lines(console, parts))
     screen.show(console, [table, *parts])
 
 
-def _without_equal(rows: Sequence[SummaryRow]) -> tuple[list[SummaryRow], list[str]]:
+def _without_equal(rows: Sequence[SummaryRow], kind: str) -> tuple[list[SummaryRow], list[str]]:
     """Return the rows that differ between variants, and a line with all others, if there are several variants."""
     equal = [row for row in rows if len(row.cells) > 1 and len(set(row.cells)) == 1]
     texts = []
     for row in equal:
         name, _, unit = row.label.partition(" [")
         texts.append(f"{escaped_line(name)} {row.cells[0]} {escaped_line(unit.removesuffix(']'))}".strip())
-    return [row for row in rows if row not in equal], [f"equal in all variants: {'; '.join(texts)}"] if equal else []
+    return [row for row in rows if row not in equal], [f"equal in all {kind}: {'; '.join(texts)}"] if equal else []
 
 
 def _side_by_side(title: str, names: Sequence[str], rows: Sequence[SummaryRow], width: int) -> list[Table]:
@@ -115,7 +129,7 @@ def _side_by_side(title: str, names: Sequence[str], rows: Sequence[SummaryRow], 
         left -= across
     tables = []
     for block in blocks:
-        tables.append(table := screen.new_table(title, show_header=len(names) > 1))
+        tables.append(table := screen.new_table(title, show_header=any(names)))
         table.add_column("", no_wrap=True)
         for k in block:
             table.add_column(escaped_line(names[k]), justify="right", no_wrap=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rich.console import Console
@@ -195,25 +195,67 @@ def rows_of(summaries: Sequence[Summary], folded: bool = False) -> list[SummaryR
     return rows
 
 
-def _kinds(names: Iterable[str]) -> dict[str, list[str]]:
-    """Group names that differ only in a number; a group of several is named ``wheel × 14``."""
+def _kind(name: str) -> str:
+    """Return the part of a name before its first number."""
+    return re.sub(r"[_ .]*\d.*", "", name) or name
+
+
+def _kind_of_stop(stop: Summary) -> str:
+    return f"{_kind(stop['joint'])}, {'revolute' if stop['unit'] == 'rad' else 'prismatic'} stops"
+
+
+def _kinds(kinds: Mapping[str, str]) -> dict[str, list[str]]:
+    """Group names by their kinds; a group of several is named ``wheel × 14``."""
     groups: dict[str, list[str]] = {}
-    for name in names:
-        groups.setdefault(re.sub(r"[_ .]*\d.*", "", name) or name, []).append(name)
+    for name, kind in kinds.items():
+        groups.setdefault(kind, []).append(name)
     return {f"{kind} × {len(group)}" if len(group) > 1 else group[0]: group for kind, group in groups.items()}
 
 
-def _merged(runs: Sequence[Mapping[str, Summary]]) -> list[dict[str, Summary]]:
-    """Merge the entries of each kind: extremes, means of means and fractions, sums of counts and losses."""
-    kinds = _kinds(dict.fromkeys(name for entries in runs for name in entries))
+def _merged(runs: Sequence[Mapping[str, Summary]], kinds: Mapping[str, str]) -> list[dict[str, Summary]]:
+    """Merge the entries of each kind: extremes, means of means and fractions, sums of counts and losses.
 
-    def merge(entries: Sequence[Summary]) -> Summary:
-        keys = dict.fromkeys(key for entry in entries for key in entry)
-        values = {key: [entry[key] for entry in entries if entry.get(key) is not None] for key in keys}
-        return {key: _fold(key, numbers) for key, numbers in values.items() if numbers}
+    Entries that were not touched in a run do not count, so that the numbers of a run do not depend on the other runs;
+    ``count`` of a kind of several is the number of touched entries, ``of`` that of the kind in all runs.
+    """
 
-    groups = [{kind: [run[name] for name in names if name in run] for kind, names in kinds.items()} for run in runs]
-    return [{kind: merge(entries) for kind, entries in group.items() if entries} for group in groups]
+    def merge(entries: Sequence[Summary], of: int) -> Summary:
+        touched = [entry for entry in entries if entry["closed_fraction"] > 0.0 or entry.get("hits")]
+        keys = dict.fromkeys(key for entry in touched or entries for key in entry)
+        values = {key: [entry[key] for entry in touched or entries if entry.get(key) is not None] for key in keys}
+        folded = {key: _fold(key, numbers) for key, numbers in values.items() if numbers}
+        return folded | ({"count": len(touched), "of": of} if of > 1 else {})
+
+    groups = _kinds(kinds)
+    merged = []
+    for run in runs:
+        present = {kind: [run[name] for name in names if name in run] for kind, names in groups.items()}
+        merged.append({kind: merge(entries, len(groups[kind])) for kind, entries in present.items() if entries})
+    return merged
+
+
+# How rows of several contacts or stops are folded, if their headings do not state it.
+_FOLDS = {
+    "pulling": "max",
+    **dict.fromkeys(("closed", "sticking"), "mean"),
+    **dict.fromkeys(("lift-offs, landings", "bounces, slip starts", "loss at impacts", "hits"), "sum"),
+}
+
+
+def _row(key: str, owner: str, entries: Sequence[Summary | None], cells: list[str]) -> SummaryRow:
+    """Return a row of contacts or stops; the heading of a folded row states how it was folded."""
+    name, bracket, unit = key.partition(" [")
+    if name in _FOLDS and any(entry and "count" in entry for entry in entries):
+        name = f"{name}, {_FOLDS[name]}"
+    return SummaryRow(key, owner, f"{name}{bracket}{unit}", cells)
+
+
+def _count_rows(owner: str, entries: Sequence[Summary | None]) -> Iterator[SummaryRow]:
+    """Yield the number of touched contacts or stops of a kind in each run, unless all of them are always touched."""
+    if any(entry and entry.get("count") != entry.get("of") for entry in entries):
+        yield SummaryRow(
+            "touched", owner, "number touched", [str(entry["count"]) if entry else "–" for entry in entries]
+        )
 
 
 def _fold(key: str, values: Sequence[Any]) -> Any:
@@ -338,17 +380,18 @@ def _contact_rows(runs: Sequence[Mapping[str, Summary]], folded: bool) -> Iterat
     kept = [name for name in names if closing[name] or any("gap_min_m" in contact for contact in having[name])]
     runs = [{name: run[name] for name in kept if name in run} for run in runs]
     if folded:
-        yield from _contact_rows(_merged(runs), folded=False)
+        yield from _contact_rows(_merged(runs, {name: _kind(name) for name in kept}), folded=False)
         return
     for name in kept:
         contacts = [run.get(name) for run in runs]
         if not all(contact["closed_fraction"] > 0.0 for contact in having[name]):
             cells = [_number(c.get("gap_min_m"), 1e3, 3) if c and not c["closed_fraction"] else "–" for c in contacts]
             yield SummaryRow("gap", name, "never touches, min gap [mm]", cells)
+        yield from _count_rows(name, contacts)
         for heading, show, real in _CONTACT_ROWS if closing[name] else ():
             if real is None or any(_is_unilateral(contact) == real for contact in having[name]):
                 cells = [show(c) if c and real in (None, _is_unilateral(c)) else "–" for c in contacts]
-                yield SummaryRow(heading, name, heading, cells)
+                yield _row(heading, name, contacts, cells)
 
 
 # Rows of a joint stop: heading and format.
@@ -362,17 +405,19 @@ _STOP_ROWS: tuple[tuple[str, Callable[[Summary], str]], ...] = (
 
 def _stop_rows(runs: Sequence[Mapping[str, Summary]], folded: bool) -> Iterator[SummaryRow]:
     """Yield the rows of all joint stops that were hit in any run, for one mapping of names to stops per run."""
-    runs = _merged(runs) if folded else runs
+    if folded:
+        runs = _merged(runs, {name: _kind_of_stop(stop) for run in runs for name, stop in run.items()})
     for name, stop in {name: stop for run in runs for name, stop in run.items()}.items():
+        stops = [run.get(name) for run in runs]
+        yield from _count_rows(name, stops)
         for heading, show in _STOP_ROWS:
-            cells = [show(run[name]) if name in run else "–" for run in runs]
-            yield SummaryRow(heading, name, heading.format(**stop), cells)
+            yield _row(heading.format(**stop), name, stops, [show(s) if s else "–" for s in stops])
 
 
 def _stop_name(stop: Summary) -> str:
     limit = stop["limit"]
     position = f"{math.degrees(limit):.4g}°" if stop["unit"] == "rad" else f"{limit:.4g} {stop['unit']}"
-    return f"{stop['joint']}, stop at {position}"
+    return f"{stop['joint']}, {stop['stop']} stop at {position}"
 
 
 def _motor_rows(summaries: Sequence[Summary], folded: bool) -> Iterator[SummaryRow]:
@@ -389,7 +434,7 @@ def _motor_rows(summaries: Sequence[Summary], folded: bool) -> Iterator[SummaryR
         loads = [{joint: motor[rms] / motor[nominal] for joint, motor in motors.items()} for motors in rated]
         joints = list(dict.fromkeys(joint for load in loads for joint in load))
         if folded:
-            for kind, members in _kinds(joints).items():
+            for kind, members in _kinds({joint: _kind(joint) for joint in joints}).items():
                 cells = [_spread([100.0 * load[joint] for joint in members if joint in load]) for load in loads]
                 yield SummaryRow(quantity, kind, f"rms {quantity} [% of nominal]", cells)
             continue

@@ -584,7 +584,7 @@ def _clamped_joints(run: SnakeRun, record: Record) -> list[dict[str, Any]]:
     at_limit = np.minimum(d.upper - phi, phi - d.lower) < AT_LIMIT
     if not (run.state.counts[ss.CLAMPED] and at_limit.any() and record["position_error"][-1] > LEAST):
         return []
-    joints = tuple(name for name, at in zip(d.joint_names, at_limit, strict=True) if at)
+    joints = [name for name, at in zip(d.joint_names, at_limit, strict=True) if at]
     return [DistanceCause("clamped", 1.0, joints)._asdict()]
 
 

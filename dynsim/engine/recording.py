@@ -305,6 +305,7 @@ def _joint_stops(record: Record, prepared: Prepared, duration: float) -> list[di
             stops.append(
                 {
                     "joint": stop.joint,
+                    "stop": "lower" if stop.side > 0.0 else "upper",
                     "limit": stop.position,
                     "unit": units[stop.joint][0],
                     "force_max": float(force.max(initial=0.0)),

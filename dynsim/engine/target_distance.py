@@ -82,7 +82,7 @@ class DistanceCause(NamedTuple):
 
     cause: str
     share: float
-    joints: tuple[str, ...]
+    joints: list[str]
 
 
 def hand_chain(robot: Robot) -> list[int]:
@@ -133,7 +133,7 @@ def named_causes(parts: Parts) -> list[DistanceCause]:
 def _cause(cause: str, joints: dict[str, float]) -> DistanceCause:
     part = sum(joints.values())
     largest = sorted(((own, joint) for joint, own in joints.items() if joint), reverse=True)
-    return DistanceCause(cause, round(part, 3), tuple(joint for own, joint in largest if own >= NAMED * part))
+    return DistanceCause(cause, round(part, 3), [joint for own, joint in largest if own >= NAMED * part])
 
 
 def hand_causes(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import json
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -125,7 +126,9 @@ def csv_table(names: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> str:
 
 
 def csv_cell(value: Any) -> Any:
-    """Return a cell of a table; a text that a spreadsheet would compute as a formula gets an apostrophe in front."""
+    """Return a cell of a table: lists and mappings as JSON, formulas of spreadsheets with an apostrophe in front."""
+    if isinstance(value, (list, tuple, dict)):
+        return json.dumps(value, ensure_ascii=False)
     if isinstance(value, str) and value.startswith(("=", "+", "-", "@", "\t", "\r")) and not NUMBER.fullmatch(value):
         return f"'{value}"
     return value

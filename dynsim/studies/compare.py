@@ -13,7 +13,7 @@ from dynsim.record import Record
 from dynsim.record.csv_rows import csv_table
 from dynsim.scenario import Scenario, load_scenario, variant_names
 from dynsim.studies.processes import WorkerInterrupted, WorkerLost, run_in_processes
-from dynsim.studies.sweep import flat
+from dynsim.studies.sweep import FAILED, OK, flat
 from dynsim.system.arguments import names_wrong_types
 from dynsim.system.files import json_text, replace_together
 
@@ -92,14 +92,14 @@ def compare(
         except WorkerLost as lost:
             stops[name] = SimulationStopped(f"{name}: {lost}")
         except SimulationStopped as stop:
-            if stopped is not None:
-                stopped(name, stop)
             stops[name] = stop
         else:
             if record is not None:
                 if finished is not None:
                     finished(name, record)
                 records[name] = record
+        if name in stops and stopped is not None:
+            stopped(name, stops[name])
 
     if jobs > 1:
 
@@ -136,22 +136,35 @@ def _combined_stop(stops: Mapping[str, SimulationStopped], left: list[str], inte
     return combined
 
 
-def save_comparison(records: Mapping[str, Record], folder: Path) -> None:
+def save_comparison(results: Mapping[str, Record | SimulationStopped], folder: Path) -> None:
     """Write ``comparison.json``, ``comparison.csv``, and the tables that compare a shipped snake scenario with [T].
+
+    Parameters
+    ----------
+    results : mapping of str to Record or SimulationStopped
+        Variants in the order of the file. A variant that stopped has the numbers up to the stop in the CSV file only.
+    folder : Path
+        Output folder.
 
     Raises
     ------
     RecordError
         If a file cannot be written.
     """
-    summaries = {name: record.summary for name, record in records.items()}
+    records = {name: result for name, result in results.items() if isinstance(result, Record)}
+    reasons = {name: str(result) for name, result in results.items() if not isinstance(result, Record)}
+    runs = []
+    for name, result in results.items():
+        record = result if isinstance(result, Record) else result.record
+        ended = {"variant": name, "status": FAILED if name in reasons else OK, "reason": reasons.get(name, "")}
+        runs.append((flat(record.summary) if record else {}) | ended)
     # Variants may have different entries, because the entries of contacts depend on the contact law.
-    runs = [flat(summary) | {"variant": name} for name, summary in summaries.items()]
-    names = dict.fromkeys(["variant", *(key for run in runs for key in run if key != "warnings")])
+    names = dict.fromkeys(["variant", "status", "reason", *(key for run in runs for key in run if key != "warnings")])
     table = csv_table([*names, "warnings"], runs)
-    content = json_text({"variants": summaries})
+    failed = {"failed": reasons} if reasons else {}
+    content = json_text({"variants": {name: record.summary for name, record in records.items()}, **failed})
     replace_together(folder, {"comparison.json": content.encode("utf-8"), "comparison.csv": table.encode("utf-8")})
-    if all("mode" in record for record in records.values()):
+    if records and all("mode" in record for record in records.values()):
         from dynsim.snake.published import write_tables  # the import takes 0.15 s
 
         write_tables(records, folder)

@@ -28,7 +28,14 @@ from dynsim.system.files import check_writable, held_folder, json_text, replacin
 # reproducible, and numbers of the model, which do not depend on the motion.
 _EXCLUDED = ("scenario", "variant", "dynsim_version", "integration_wall_s", "real_time_factor", "model")
 # Lists whose entries are named after their parts; the keys of an entry that contain the names.
-_NAMED = {"motors": ("joint",), "contacts": ("name",), "joint_stops": ("joint",), "sinking": ("body", "surface")}
+_NAMED = {
+    "motors": ("joint",),
+    "contacts": ("name",),
+    "joint_stops": ("joint", "stop"),
+    "sinking": ("body", "surface"),
+    "hand_error_causes": ("cause",),
+    "final_position_error_causes": ("cause",),
+}
 
 
 def flat(summary: Mapping[str, Any]) -> dict[str, Any]:
@@ -44,8 +51,7 @@ def _entries(key: str, value: Any) -> Iterator[tuple[str, Any]]:
     if isinstance(value, list) and key in _NAMED:
         for entry in value:
             name = ".".join(entry[part] for part in _NAMED[key])
-            if key == "joint_stops":
-                name += f".stop_{1e3 * entry['limit']:.0f}_m{entry['unit']}"
+            name = f"{name}_stop" if key == "joint_stops" else f"{key}.{name}" if key.endswith("_causes") else name
             yield from _entries(name, {part: number for part, number in entry.items() if part not in _NAMED[key]})
     elif isinstance(value, list) and all(isinstance(entry, str) for entry in value):
         yield key, "; ".join(value)

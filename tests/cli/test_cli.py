@@ -315,6 +315,13 @@ def test_a_variant_that_stops_does_not_keep_the_others_from_the_comparison(tmp_p
     check_message(saved, "bad", "out/bad")
     check_message(error, re.compile(r"^error: bad: .*\bt = "))
     assert list(json.loads((tmp_path / "out" / "comparison.json").read_text())["variants"]) == ["one", "two"]
+    with (tmp_path / "out" / "comparison.csv").open(newline="") as stream:
+        ended = {row["variant"]: (row["status"], row["reason"]) for row in csv.DictReader(stream)}
+    assert list(ended) == ["one", "bad", "two"]
+    assert ended["one"] == ended["two"] == ("ok", "")
+    assert ended["bad"][0] == "failed"
+    assert ended["bad"][1] in error
+    assert "failed, not in the table: bad" in result.stdout
     assert says(result.stdout, "energy row")
     assert not Record.load(tmp_path / "out" / "bad" / "record.h5").complete
 

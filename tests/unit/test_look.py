@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import matplotlib
 import pytest
 from cycler import cycler
+from matplotlib.legend import Legend
 from support.layout import layout_faults
 from support.messages import lines_with, raises
 
@@ -27,7 +29,7 @@ def record() -> Record:
     return dynsim.simulate(load_scenario("elbow_comparison", "two_elbows", changes))
 
 
-def drawn(record: Record, name: str = "tracking_error", **options: object) -> Drawing:
+def drawn(record: Record | dict[str, Record], name: str = "tracking_error", **options: object) -> Drawing:
     figure = dynsim.figure(record, name, **options)
     assert isinstance(figure, Drawing)
     return figure
@@ -150,6 +152,8 @@ def test_caption_names_subject_run_and_axes(record: Record) -> None:
         ({"size": "wide"}, ("size", "wide", "3.4x2.4")),
         ({"size": 0.2}, ("size", "0.2", "1", "40")),
         ({"size": (3.0, 2.0, 1.0)}, ("size", "pair")),
+        ({"size": True}, ("size", "True", "pair")),
+        ({"size": 10**400}, ("size", "40")),
         ({"font": "nosuchfont 8"}, ("font", "nosuchfont")),
         ({"font": "serif 80"}, ("font", "80", "40")),
         ({"font": ""}, ("font", "family")),
@@ -181,9 +185,61 @@ def test_unusable_option_is_an_error_and_leaves_files(
 
 
 def test_height_without_space_is_an_error(record: Record) -> None:
-    figure = drawn(record, "motors", size=(3.4, 1.2))
-    with raises(RecordError, "size", "3.4x1.2", f"{figure.needed:.2g} in"):
-        figure.draw_without_rendering()
+    with raises(RecordError, "size", "3.4x1.2", f"{drawn(record, 'motors', size=3.4).needed:.2g} in"):
+        drawn(record, "motors", size=(3.4, 1.2))
+
+
+@pytest.mark.parametrize(
+    ("sheet", "words"),
+    [
+        ("axes.facecolr: eeeeee", ("axes.facecolr", "line 1")),
+        ("lines.linewidth: 1\nfont.size: blah", ("font.size", "line 2", "blah")),
+        ("text.usetex: True", ("text.usetex", "mathtext.fontset")),
+    ],
+)
+def test_unusable_style_sheet_is_an_error(record: Record, tmp_path: Path, sheet: str, words: tuple[str, ...]) -> None:
+    (tmp_path / "bad.mplstyle").write_text(sheet)
+    with raises(RecordError, "bad.mplstyle", *words):
+        drawn(record, style=tmp_path / "bad.mplstyle")
+
+
+def test_latex_is_not_used_for_names(record: Record, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also for labels of ticks that are created when the file is written."""
+    monkeypatch.setenv("PATH", str(tmp_path))  # without LaTeX
+    with matplotlib.rc_context({"text.usetex": True}):
+        drawn(record, "hand_path").savefig(tmp_path / "path.png")
+        assert matplotlib.rcParams["text.usetex"]
+    assert (tmp_path / "path.png").stat().st_size > 10_000
+
+
+def test_threads_draw_with_their_own_look_and_leave_settings(record: Record) -> None:
+    before, interval = dict(matplotlib.rcParams), sys.getswitchinterval()
+    looks = [(5.0, None), (9.0, "ggplot"), (13.0, "dark_background"), (20.0, None)]
+
+    def size(points: float, sheet: str | None) -> float:
+        return drawn(record, "energy", font=points, style=sheet, size=3.4).axes[0].yaxis.label.get_fontsize()
+
+    one_by_one = [size(*wanted) for wanted in looks * 2]
+    sys.setswitchinterval(1e-5)
+    try:
+        with ThreadPoolExecutor(len(looks)) as pool:
+            sizes = list(pool.map(size, *zip(*looks * 2, strict=True)))
+    finally:
+        sys.setswitchinterval(interval)
+    assert sizes == one_by_one
+    assert dict(matplotlib.rcParams) == before
+
+
+@pytest.mark.parametrize(
+    "name", ["compare_energy", "compare_hand_path", "compare_tracking_error", "compare_contact_forces"]
+)
+def test_names_with_underscores_or_blanks_have_legend_entries(record: Record, name: str) -> None:
+    figure = drawn({"_slow": record, "plain": record, "": record}, name)
+    legends = [legend for legend in [*figure.findobj(Legend)] if legend is not None]
+    texts = [text.get_text().strip() for legend in legends for text in legend.get_texts()]
+    texts += [label.get_text() for axes in figure.axes for label in axes.get_xticklabels() + axes.get_yticklabels()]
+    for shown in ("_slow", "plain", "(no name)"):
+        assert any(text.startswith(shown) for text in texts)
 
 
 def test_look_without_options_is_the_default() -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import csv
 import io
+import json
 import re
 from pathlib import Path
 
@@ -12,8 +14,10 @@ from support.messages import check_message, lines_with, mentions, says
 
 import dynsim
 from dynsim.cli.comparison import print_comparison, print_summary
-from dynsim.cli.tables import print_starts
+from dynsim.cli.tables import print_starts, rows_of
 from dynsim.record import Record
+from dynsim.record.csv_rows import csv_table
+from dynsim.studies.sweep import flat
 from dynsim.system.terminal import Terminal
 
 ARM = """\
@@ -194,11 +198,87 @@ def test_all_rows_are_printed_on_request() -> None:
 
 def test_contacts_of_a_kind_are_folded_to_their_extremes_means_and_sums() -> None:
     text = shown({"v1": snake(1), "v2": snake(2)})
-    (mean,) = lines_with(text, "wheel × 14", "mean")
+    (mean,) = lines_with(text, "wheel × 14", "force, mean")
     assert mean.split()[-2:] == ["13.50", "14.50"]
     assert lines_with(text, "force, max")[0].split()[-2:] == ["55.00", "56.00"]
     assert "105, 14" in lines_with(text, "lift-offs, landings")[0]
     assert lines_with(text, "psi × 8")[0].split()[-6:] == ["55…90,", "mean", "72", "105…140,", "mean", "122"]
+
+
+def test_folded_cells_of_a_run_do_not_depend_on_the_other_runs() -> None:
+    """Contacts that close only in another variant count neither as zeros nor as open."""
+
+    def run(*closed: int) -> dict:
+        contacts = [{**contact, "closed_fraction": 0.0, "normal_force_mean_N": 0.0} for contact in snake(0)["contacts"]]
+        for k in closed:
+            contacts[k] = {**snake(0)["contacts"][k], "closed_fraction": 0.5}
+        return {"scenario": "arm", "contacts": contacts}
+
+    alone, together = rows_of([run(3)], True), rows_of([run(3), run(0, 1), run()], True)
+    for key, cell in (("force, mean [N]", "9.00"), ("closed [% of time]", "50.0"), ("lift-offs, landings", "4, 0")):
+        assert [row.cells for row in alone if row.key == key] == [[cell]]
+        assert [row.cells[0] for row in together if row.key == key] == [cell]
+    assert [(row.label, row.cells) for row in together if row.key == "touched"] == [
+        ("wheel × 3: number touched", ["1", "2", "0"])
+    ]
+    assert "wheel × 3: closed, mean [% of time]" in [row.label for row in together]
+
+
+def test_folded_stops_mix_no_forces_with_torques() -> None:
+    stops = [
+        {
+            "joint": joint, "stop": side, "limit": 0.01, "unit": unit, "force_max": force, "force_unit": force_unit,
+            "hits": 1, "closed_fraction": 0.5,
+        }
+        for joint, side, unit, force, force_unit in (
+            ("joint_1", "lower", "m", 1.9, "N"), ("joint_1", "upper", "m", 1.2, "N"),
+            ("joint_2", "lower", "rad", 6.5, "N m"), ("joint_3", "upper", "rad", 3.0, "N m"),
+        )
+    ]  # fmt: skip
+    rows = {row.label: row.cells for row in rows_of([{"scenario": "arm", "joint_stops": stops}], folded=True)}
+    assert rows["joint, prismatic stops × 2: force, max [N]"] == ["1.9"]
+    assert rows["joint, revolute stops × 2: force, max [N m]"] == ["6.5"]
+    assert rows["joint, revolute stops × 2: hits, sum"] == ["2"]
+
+
+def test_stops_whose_limits_round_to_the_same_number_are_two(beyond: Record) -> None:
+    (stop,) = beyond.summary["joint_stops"]
+    assert stop["stop"] == "upper"
+    both = {
+        "scenario": "arm",
+        "joint_stops": [{**stop, "stop": side, "hits": k} for k, side in ((1, "lower"), (2, "upper"))],
+    }
+    assert [row.cells for row in rows_of([both]) if row.key == "hits"] == [["1"], ["2"]]
+    numbers = flat(both)
+    assert [numbers[f"joint_1.{side}_stop.hits"] for side in ("lower", "upper")] == [1, 2]
+
+
+def test_columns_of_causes_are_named_after_the_cause() -> None:
+    causes = [
+        [{"cause": "motion", "share": 0.9, "joints": ["joint_2", "joint_3"]}],
+        [{"cause": "sag", "share": 0.6, "joints": []}, {"cause": "motion", "share": 0.4, "joints": ["joint_1"]}],
+    ]
+    first, second = (flat({"hand_error_causes": entries}) for entries in causes)
+    assert first == {"hand_error_causes.motion.share": 0.9, "hand_error_causes.motion.joints": "joint_2; joint_3"}
+    assert (second["hand_error_causes.motion.share"], second["hand_error_causes.sag.share"]) == (0.4, 0.6)
+
+
+def test_cells_of_lists_are_json() -> None:
+    rows = csv.reader(io.StringIO(csv_table(["key"], [{"key": ["a", True]}, {"key": ("b",)}, {"key": {"c": None}}])))
+    assert [json.loads(cell) for (cell,) in list(rows)[1:]] == [["a", True], ["b"], {"c": None}]
+
+
+def test_failed_variants_are_listed_and_the_only_other_one_is_named() -> None:
+    output = io.StringIO()
+    print_comparison(Terminal(file=output, width=100, emoji=False), {"v1": snake(1)}, failed=["tips", "falls"])
+    assert lines_with(output.getvalue(), "failed, not in the table: tips, falls")
+    assert [line for line in output.getvalue().splitlines() if line.split() == ["v1"]]
+    output = io.StringIO()
+    runs = {f"v{k}": snake(k, wheels=1) for k in range(1, 19, 2)}
+    print_comparison(Terminal(file=output, width=100, emoji=False), runs, failed=["tips"])
+    text = " ".join(output.getvalue().split())
+    assert "equal in all completed variants:" in text
+    assert "9 of 9 completed variants: the head sags" in text
 
 
 def test_rows_that_are_equal_in_all_variants_are_in_one_line() -> None:

@@ -7,6 +7,7 @@ reaches its target.
 from __future__ import annotations
 
 import io
+import json
 import re
 from typing import Any
 
@@ -18,6 +19,7 @@ import dynsim
 from dynsim.cli.comparison import print_summary
 from dynsim.engine.target_distance import PART, UNEXPLAINED, DistanceCause, because, named_causes
 from dynsim.scenario.reading import scenario_from_resolved
+from dynsim.system.files import json_text
 from dynsim.system.terminal import Terminal
 
 K, R, LENGTH, MASS, GRAVITY = 2.0, 1.0, 0.5, 1.0, 9.81
@@ -72,7 +74,7 @@ def test_sag_equals_weight_over_stiffness() -> None:
     sag = -np.pi / 2 + record["q"][-1, 0]
     assert 100.0 * sag == pytest.approx(R / K * MASS * GRAVITY * LENGTH / 2 * np.cos(sag), rel=1e-4)
     assert distance == pytest.approx(2.0 * LENGTH * np.sin(sag / 2), rel=1e-6)
-    assert causes["sag"] == DistanceCause("sag", pytest.approx(1.0, abs=0.01), ("joint_1",))
+    assert causes["sag"] == DistanceCause("sag", pytest.approx(1.0, abs=0.01), ["joint_1"])
     assert len(causes) == 1
     output = io.StringIO()
     print_summary(Terminal(file=output, emoji=False), record.summary)
@@ -375,18 +377,16 @@ def test_path_relative_to_the_start_is_not_advised_again() -> None:
 def test_brace_that_is_pushed_sideways_is_not_called_sag() -> None:
     """The friction of the elbow turns the vertical joint, which carries no weight."""
     record = dynsim.simulate(dynsim.load_scenario("brace_on_shapes", "flat"))
+    # A loaded record has the same summary.
+    assert json.loads(json_text(record.summary)) == record.summary
     (cause,) = record.summary["hand_error_causes"]
-    assert (cause["cause"], cause["joints"]) == ("contact", ("joint_1",))
+    assert (cause["cause"], cause["joints"]) == ("contact", ["joint_1"])
 
 
 def test_unexplained_distances_have_no_cause() -> None:
     assert named_causes({"sag": {"a": 0.8}, "": {"a": 0.2}}) == []
     assert named_causes({"sag": {"a": 0.8}, "": {"a": UNEXPLAINED, "b": -UNEXPLAINED}}) == []
-    assert (
-        named_causes({"sag": {"a": PART - 0.01}, "limit": {"a": PART - 0.01}, "stop": {"a": 1.02 - 2 * PART}})
-        == [DistanceCause("stop", pytest.approx(0.52), ("a",))]
-        or True
-    )
+    assert named_causes({"sag": {"a": PART - 0.01}, "limit": {"a": PART - 0.01}, "stop": {"a": 1.02 - 2 * PART}}) == []
     small = {cause: {"a": 0.2} for cause in ("sag", "limit", "stop", "friction", "motion")}
     assert named_causes(small) == []
     assert "no single cause" in because([])
@@ -429,6 +429,6 @@ def test_clamped_joints_of_kinematic_snake_are_the_cause() -> None:
         return summary["final_position_error_m"], [cause["joints"] for cause in summary["final_position_error_causes"]]
 
     distance, joints = causes("saturate", 0.675)
-    assert (distance > 6e-3, joints) == (True, [("theta8",)])
+    assert (distance > 6e-3, joints) == (True, [["theta8"]])
     assert causes("saturate", 1.5) == (pytest.approx(1.9e-3, abs=1e-4), [])
     assert causes("unlimited", 0.675) == (pytest.approx(0.0, abs=1e-4), [])

@@ -29,6 +29,8 @@ MODULES: dict[str, tuple[set[str], ...]] = {
     MEASURED: ({"q_goal"}, {"record_time"}, {"torque_estimate"}),
     SIMULATED: ({"hand_position"}, {"current"}, {"energy_residual"}),
 }
+# Legend entry of a record whose name is blank.
+UNNAMED = "(no name)"
 
 
 def draw(record: Record, folder: Path, kind: str = "png", look: Look | None = None) -> list[Path]:
@@ -88,7 +90,7 @@ def draw_comparison(
     RecordError
         In the same cases as for :func:`draw`, and if the records are of different kinds.
     """
-    drawn = {name: record for name, record in records.items() if len(record)}
+    drawn = {name: record for name, record in _with_names(records).items() if len(record)}
     # In a comparison, measured runs are drawn in the same way as simulated runs, which have the same signals.
     arm = importlib.import_module(SIMULATED)
     own = [_module(record, name) for name, record in drawn.items()]
@@ -151,7 +153,11 @@ def figure(
 
     Notes
     -----
-    Settings in ``matplotlib.rcParams`` that differ from matplotlib's defaults remain, such as ``font.family``.
+    Settings in ``matplotlib.rcParams`` that differ from matplotlib's defaults remain, such as ``font.family``, except
+    ``text.usetex``: names are drawn literally, without LaTeX.
+
+    Several threads may call this function; the calls are executed one after the other, because ``rcParams`` belong to
+    the process. Meanwhile, no other thread may change ``rcParams`` or draw with matplotlib directly.
 
     Examples
     --------
@@ -166,6 +172,8 @@ def figure(
         raise RecordError("the record has no samples")
     if several and not records:
         raise RecordError("no records to draw")
+    if isinstance(records, Mapping):
+        records = _with_names(records)
     module = _module(next(iter(records.values()))) if isinstance(records, Mapping) else _module(records)
     # Comparisons of measured runs use the figures of simulated runs.
     home = importlib.import_module(SIMULATED) if several and module.__name__ == MEASURED else module
@@ -180,8 +188,15 @@ def figure(
         if drawn is None:
             raise RecordError(f"the record has no data for the figure {name!r}")
         shared.with_panels([(name, drawn)])
-    shared.literal(drawn)
+        shared.literal(drawn)
+        if wanted.height is not None:
+            drawn.draw_without_rendering()  # raises if the height leaves no space for the axes
     return drawn
+
+
+def _with_names(records: Mapping[str, Record]) -> dict[str, Record]:
+    """Return the records with a text for names that are empty or blank, which a legend would omit."""
+    return {name if name.strip() else UNNAMED: record for name, record in records.items()}
 
 
 @contextmanager
@@ -191,7 +206,7 @@ def _drawable() -> Iterator[None]:
         yield
     except DynsimError:
         raise
-    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RuntimeError) as error:
         text = " ".join(str(error).split())
         raise RecordError(f"the record cannot be drawn: {type(error).__name__}: {text}") from error
 

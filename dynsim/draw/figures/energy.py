@@ -468,11 +468,12 @@ def _paths(records: Mapping[str, Record], title: str) -> Figure | None:
             axes.plot(*position.T, label=name, **styles[name])
             axes.plot(*position[0], **START)
     _add_starts(panels[0])
-    handles, labels = panels[0].get_legend_handles_labels()
-    if corner and len(labels) <= CORNER:
+    entries = style.legend_entries(panels[:1])
+    if corner and len(entries) <= CORNER:
         free = figure.add_subplot(grid[0, 1])
         free.set_axis_off()
-        free.legend(handles, [style.broken(label, 1.1) for label in labels], loc="center")
+        labels = [style.broken(style.visible(label), 1.1) for label in entries]
+        free.legend(entries.values(), labels, loc="center")
     else:
         style.legend_below(figure, panels[:1], 4)
     if note:

@@ -98,9 +98,10 @@ def _size(size: float | tuple[float, float] | str | None) -> tuple[float | None,
             raise RecordError(f"size {brief(size)}: must be WIDTH or WIDTHxHEIGHT, such as 3.4, 3.4x2.4 or 86x60mm")
         values = [float(part) * INCHES[match[3] or ""] for part in match.groups()[:2] if part]
     else:
-        values = [float(part) for part in (size if isinstance(size, Sequence) else (size,))]
-        if len(values) > 2 or not values:
+        parts = size if isinstance(size, Sequence) else (size,)
+        if not 1 <= len(parts) <= 2 or any(isinstance(part, bool) for part in parts):
             raise RecordError(f"size {brief(size)}: must be a width, or a pair of width and height [inch]")
+        values = [float(min(part, 2.0 * MOST)) for part in parts]
     for value in values:
         if not LEAST <= value <= MOST:
             raise RecordError(f"size {brief(size)}: each side must be between {LEAST:g} and {MOST:g} inches")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import re
 import textwrap
@@ -11,6 +12,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
+from threading import RLock
 from typing import Any, TypeVar
 
 import matplotlib
@@ -19,12 +21,15 @@ from cycler import cycler
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import Collection
 from matplotlib.colors import to_hex
+from matplotlib.container import Container
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties, findfont, get_font
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.legend import Legend
 from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 from matplotlib.text import Text
 from matplotlib.textpath import text_to_path
 from matplotlib.ticker import AutoLocator, FuncFormatter, LogFormatter, LogLocator, NullFormatter, NullLocator
@@ -78,6 +83,8 @@ EDGE = 0.07
 # Spaces before units, before brackets, and in ranges, at which a line is not broken.
 _UNIT = re.compile(r"(?<=\d) (?=(?:[mk]?[smgNWJAV]|mm|N m|kg|rad|Hz|°|%)(?!\w)|…)|(?<=…) | (?=\[)|(?<=N) (?=m\b)")
 _GREEK = {"alpha": "α", "beta": "β", "gamma": "γ"}
+# Labels that matplotlib gives to artists without a label.
+_AUTOMATIC = re.compile(r"_(nolegend_|child\d+|container\d+)")
 # Mean width of a letter as a multiple of its size, for the breaking of long lines.
 LETTER = 0.56
 DPI = 170
@@ -111,6 +118,8 @@ LEGEND_ROW = 1.67
 
 
 _drawn: ContextVar[Look | None] = ContextVar("look of the figures", default=None)
+# ``matplotlib.rcParams`` belongs to the process, so only one thread at a time may change it.
+_settings = RLock()
 
 
 @contextmanager
@@ -118,6 +127,8 @@ def look(wanted: Look | None = None) -> Iterator[None]:
     """Apply a look in a ``with`` block; the look of an outer block takes precedence.
 
     Settings of matplotlib that a user changed, in ``rcParams`` or by a style sheet, remain; dynsim sets the others.
+    LaTeX is not used, because names of variants and joints contain letters that are commands there. Other threads that
+    use this function wait until the block ends.
 
     Raises
     ------
@@ -128,7 +139,8 @@ def look(wanted: Look | None = None) -> Iterator[None]:
         yield
         return
     wanted = wanted or Look()
-    with matplotlib.rc_context():
+    with _settings, matplotlib.rc_context():
+        matplotlib.rcParams["text.usetex"] = False
         _apply_styles(wanted.styles)
         changed = _changed((*_LOOK, *_SIZES, "font.size", "mathtext.fontset"))
         points = wanted.points or (matplotlib.rcParams["font.size"] if "font.size" in changed else POINTS)
@@ -170,12 +182,39 @@ def _apply_styles(sheets: Sequence[str]) -> None:
 
     for sheet in sheets:
         try:
-            matplotlib.style.use(sheet)
+            # Matplotlib only logs unknown settings and invalid values.
+            with _logged("matplotlib") as faults:
+                matplotlib.style.use(sheet)
         except (OSError, ValueError) as error:
             text = " ".join(str(error).split())
             raise RecordError(
                 f"style {sheet!r}: {text}; choices: a file, or {', '.join(matplotlib.style.available)}"
             ) from error
+        if faults:
+            raise RecordError(f"style {sheet!r}: {faults[0]}; correct or remove this setting")
+        if matplotlib.rcParams["text.usetex"]:
+            raise RecordError(
+                f"style {sheet!r}: text.usetex: True is not supported, because names are drawn literally; remove it, "
+                "and use font.family: serif with mathtext.fontset: cm for letters like those of LaTeX"
+            )
+
+
+@contextmanager
+def _logged(name: str) -> Iterator[list[str]]:
+    """Collect the first lines of the warnings that a library logs in the block, instead of printing them."""
+    texts: list[str] = []
+
+    def keep(record: logging.LogRecord) -> bool:
+        if record.levelno >= logging.WARNING:
+            texts.append(record.getMessage().strip().partition("\n")[0])
+        return False
+
+    logger = logging.getLogger(name)
+    logger.addFilter(keep)
+    try:
+        yield texts
+    finally:
+        logger.removeFilter(keep)
 
 
 def _check_family(family: str) -> None:
@@ -490,7 +529,7 @@ def save(figure: Figure, path: Path) -> Path:
     literal(figure)
     figure.set_dpi(DPI)
     kind = path.suffix.removeprefix(".")
-    with replacing(path) as stream, matplotlib.rc_context({"svg.hashsalt": path.stem}):
+    with _settings, replacing(path) as stream, matplotlib.rc_context({"svg.hashsalt": path.stem}):
         if kind == "png":
             # This draws once; ``savefig`` would draw twice, the first time for the layout.
             FigureCanvasAgg(figure).print_png(stream)
@@ -671,7 +710,7 @@ def fitted_legend(labels: Sequence[str], columns: int) -> tuple[list[str], int, 
     size = _size("legend.fontsize")
     handle = (matplotlib.rcParams["legend.handlelength"] + 2.8) * size
     available = 72.0 * 0.97 * width()
-    lines = [broken(label, (available - handle) / 72.0, size) for label in labels]
+    lines = [broken(visible(label), (available - handle) / 72.0, size) for label in labels]
     widths = [max(text_width(line, size) for line in label.split("\n")) + handle for label in lines]
     # A legend is filled column by column; each column is as wide as its widest label.
     for count in range(max(min(columns, len(lines)), 1), 0, -1):
@@ -688,13 +727,13 @@ def legend_beside(axes: Axes, columns: int = 2) -> None:
     if narrow():
         legend_above(axes, columns)
         return
-    unique = _named([axes])
-    axes.legend(unique.values(), unique.keys(), loc="center left", bbox_to_anchor=(1.0, 0.5))
+    unique = legend_entries([axes])
+    axes.legend(unique.values(), map(visible, unique), loc="center left", bbox_to_anchor=(1.0, 0.5))
 
 
 def legend_above(axes: Axes, columns: int = 3) -> None:
     """Place the legend above the axes, where it hides no curves, with space for all of its rows."""
-    unique = _named([axes])
+    unique = legend_entries([axes])
     labels, columns, rows = fitted_legend(list(unique), columns)
     look: dict[str, Any] = {"ncols": columns, "borderaxespad": 0.0}
     legend = axes.legend(unique.values(), labels, loc="lower right", bbox_to_anchor=(1.0, 1.0), **look)
@@ -705,16 +744,24 @@ def legend_above(axes: Axes, columns: int = 3) -> None:
 
 def legend_below(figure: Drawing, panels: Sequence[Axes], columns: int) -> None:
     """Place one legend for several panels below the figure."""
-    figure.put_below(_named(panels), columns)
+    figure.put_below(legend_entries(panels), columns)
 
 
-def _named(panels: Sequence[Axes]) -> dict[str, Any]:
+def legend_entries(panels: Sequence[Axes]) -> dict[str, Any]:
     """Return the entries of the legends of panels by label, each once."""
     unique: dict[str, Any] = {}
     for axes in panels:
-        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
-            unique.setdefault(label, handle)
+        for artist in [*axes.get_children(), *axes.containers]:
+            label = artist.get_label() if isinstance(artist, (Line2D, Patch, Collection, Container)) else ""
+            # A name may begin with an underscore, as the labels that matplotlib sets itself.
+            if label and not _AUTOMATIC.fullmatch(str(label)):
+                unique.setdefault(str(label), artist)
     return unique
+
+
+def visible(label: str) -> str:
+    """Return a label that legends of matplotlib before 3.10 do not omit."""
+    return f" {label}" if label.startswith("_") else label
 
 
 def sparse(points: Array) -> Array:

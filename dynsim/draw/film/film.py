@@ -121,12 +121,12 @@ class Strip:
         axes.set_xlim(start, end if end > start else start + 1.0)
         axes.set_ylim(*_limits([record[name] for record in having.values()]))
         if several or len(axes.lines) > 1:
-            handles, labels = axes.get_legend_handles_labels()
+            entries = style.legend_entries([axes])
             # The range of all columns is the first entry, because it is drawn behind the lines.
             most = max((self._size[1] - 20) // LEGEND_ROW, 1)
-            self.legend = tuple(labels[:most])
+            self.legend = tuple(entries)[:most]
             look: dict[str, Any] = {"bbox_to_anchor": (1.0, 1.0), "fontsize": 6.5, "borderaxespad": 0.2}
-            axes.legend(handles[:most], labels[:most], loc="upper left", **look)
+            axes.legend([*entries.values()][:most], map(style.visible, self.legend), loc="upper left", **look)
         style.literal(figure)
         canvas.draw()
         self._image = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
