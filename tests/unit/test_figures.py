@@ -501,12 +501,12 @@ def test_real_contact_figure_names_modes_and_marks_events(real: Record) -> None:
     for kind in kinds:
         assert f"{contacts.MARKS[kind][1]} (" in texts(figure)
     # The panel of the whole run; that of the transient shows what is in it.
-    marks = [line for line in figure.axes[-1].get_lines() if line.get_label() == "_event"]
+    marks = [line for line in figure.axes[-1].get_lines() if line.get_label() == f"{style.UNLISTED}event"]
     shown = sorted(float(t) for line in marks for t in line.get_xdata())
     (start, whole), begun = figure.axes[-2:], figure.axes[-2].get_xlim()[1]
     times = sorted(event.time for event in real.events if event.name == "elbow_7")
     assert shown == [time for time in times if time > begun]
-    marks = [line for line in start.get_lines() if line.get_label() == "_event"]
+    marks = [line for line in start.get_lines() if line.get_label() == f"{style.UNLISTED}event"]
     assert sorted(float(t) for line in marks for t in line.get_xdata()) == [time for time in times if time <= begun]
     # Nothing lies on the bands.
     assert not any(axes.child_axes for axes in figure.axes)
@@ -519,12 +519,12 @@ def test_every_time_figure_marks_the_events_of_contacts(real: Record, braced: Re
         for axes in figure.axes:
             if axes.get_title(loc="left").startswith("with "):
                 continue  # the small panel aside
-            marks = [line for line in axes.get_lines() if line.get_label() == "_event"]
+            marks = [line for line in axes.get_lines() if line.get_label() == f"{style.UNLISTED}event"]
             low, high = axes.get_xlim()
             assert sum(len(line.get_xdata()) for line in marks) == sum(low <= e.time <= high for e in real.events)
         # Nothing happens to what is glued.
         for axes in drawn(draw(braced)).axes:
-            assert "_event" not in [line.get_label() for line in axes.get_lines()]
+            assert f"{style.UNLISTED}event" not in [line.get_label() for line in axes.get_lines()]
 
 
 def test_comparisons_mark_the_events_of_every_run_in_its_colour(real: Record, braced: Record) -> None:
@@ -535,7 +535,7 @@ def test_comparisons_mark_the_events_of_every_run_in_its_colour(real: Record, br
     for draw, panels in ((energy.error_comparison, (0, 1)), (energy.energy_comparison, (0, 2))):
         figure = drawn(draw(records))
         for axes in (figure.axes[k] for k in panels):
-            marks = [line for line in axes.get_lines() if line.get_label() == "_event"]
+            marks = [line for line in axes.get_lines() if line.get_label() == f"{style.UNLISTED}event"]
             shown = {name: [l for l in marks if l.get_color() == colour] for name, colour in colours.items()}
             assert shown["glued"] == []
             for name in ("real", "other"):

@@ -140,10 +140,10 @@ def test_layout_faults_include_text_near_the_edge(record: Record, points: float,
 
 def test_caption_names_subject_run_and_axes(record: Record) -> None:
     assert drawn(record).caption.splitlines()[0] == (
-        "Tracking error (elbow_comparison / two_elbows): hand − target [mm], distance from target [mm] over time [s]."
+        "Tracking error (elbow comparison / two_elbows): hand − target [mm], distance from target [mm] over time [s]."
     )
     path = drawn(record, "hand_path", title=False).caption
-    assert path == "Hand path (elbow_comparison / two_elbows): y [m], z [m] over x [m]; z [m] over y [m]."
+    assert path == "Hand path (elbow comparison / two_elbows): y [m], z [m] over x [m]; z [m] over y [m]."
 
 
 @pytest.mark.parametrize(

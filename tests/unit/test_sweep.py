@@ -45,6 +45,7 @@ from dynsim.studies import sweep as module
 from dynsim.studies.processes import WorkerInterrupted, WorkerLost, run_in_processes
 from dynsim.studies.sweep import JOURNAL, LOST, SweepRow, numbers, run_sweep
 from dynsim.studies.sweep_plan import Axis, Law, Plan
+from dynsim.system.terminal import Terminal
 
 PENDULUM = read_scenario("single_pendulum")
 SHORT = {"duration_s": 0.2}
@@ -115,6 +116,7 @@ def test_printed_table_has_warnings_of_each_kind_and_no_rounding_errors(
         SweepRow(k, None, {LENGTH: 1.0 + k}, "ok", "", {ENERGY: value}, texts[k % 2].format(k))
         for k, value in enumerate([4.0, 1e-12, -3.5e-17, 4.0])
     ]
+    monkeypatch.setattr(sweep_command, "console", Terminal(emoji=False))  # a pipe without COLUMNS
     sweep_command._print_table("pendulum", rows, plan(Axis(LENGTH, (1.0, 2.0, 3.0, 4.0))), ())
     printed = capsys.readouterr().out
     assert [line.split()[-1] for line in printed.splitlines() if re.match(r"  [0-3] ", line)] == ["4", "0", "0", "4"]

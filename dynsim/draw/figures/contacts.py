@@ -72,7 +72,7 @@ def mark(axes: Axes, events: Sequence[Event], colour: str = COLOUR, *, row: int 
                 marks.append((kind, last := time))
     for kind, (marker, _) in MARKS.items():
         if times := [time for own, time in marks if own == kind]:
-            axes.plot(times, [1.0] * len(times), marker, transform=transform, label="_event", **look)
+            axes.plot(times, [1.0] * len(times), marker, transform=transform, label=f"{style.UNLISTED}event", **look)
     if lines and len(marks) <= LINES:
         for _, time in marks:
             axes.axvline(time, color=colour, linewidth=0.5, alpha=0.35 if row >= 0 else 0.2, zorder=0.5)
@@ -190,7 +190,9 @@ def _forces(records: Mapping[str, Record], title: str) -> Figure | None:
                     _draw_modes(axes, record, name)
                 elif alone:
                     fill: dict[str, Any] = {"color": style.PULLING, "alpha": 0.3, "linewidth": 0, "interpolate": True}
-                    axes.fill_between(record.time, force, 0.0, where=force < 0.0, label="_pulling", **fill)
+                    axes.fill_between(
+                        record.time, force, 0.0, where=force < 0.0, label=f"{style.UNLISTED}pulling", **fill
+                    )
                 if alone and len(panels) > 1 and axes is panels[0]:
                     _draw_samples(axes, record, name, colour)
             if not all(map(is_unilateral, having[name].values())):
@@ -328,5 +330,5 @@ def _draw_modes(axes: Axes, record: Record, name: str) -> None:
     for mode, (text, colour) in enumerate(BANDS.items()):
         spans = [(begin, end - begin) for begin, end, which in bands if which == mode]
         if spans:
-            axes.broken_barh(spans, (0.0, 1.0), color=colour, label=f"_{text}", **look)
+            axes.broken_barh(spans, (0.0, 1.0), color=colour, label=f"{style.UNLISTED}{text}", **look)
     axes.set_xlim(limits)

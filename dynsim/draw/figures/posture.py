@@ -520,7 +520,7 @@ def _draw_mount(axes: Axes, line: Array, size: float, *, down: bool) -> None:
     axes.plot(*line.T, color=style.GREY, lw=5.0, solid_capstyle="butt", zorder=1.6)
     low = z - size if down else z
     look: dict[str, Any] = {"facecolor": "white", "edgecolor": style.GREY, "hatch": "//////", "lw": 0.0, "zorder": 1.4}
-    axes.add_patch(Rectangle((x - 2.0 * size, low), 4.0 * size, size, label="_ground", **look))
+    axes.add_patch(Rectangle((x - 2.0 * size, low), 4.0 * size, size, label=f"{style.UNLISTED}ground", **look))
     axes.plot([x - 2.0 * size, x + 2.0 * size], [z, z], color=style.GREY, lw=1.2, zorder=1.5)
 
 

@@ -380,16 +380,20 @@ def _finish(axes: Array, record: Record) -> None:
         axis.set_xlim(record.time[0], record.time[-1])
         for state, (name, colour) in enumerate(STATES.items()):
             if state > 0 and "gripper_state" in record:
-                style.shade(axis, record.time, record["gripper_state"] == state, colour, f"_{name}")
+                style.shade(axis, record.time, record["gripper_state"] == state, colour, f"{style.UNLISTED}{name}")
         for kind, times in happened.items():
             for time in times:
-                axis.axvline(time, color="#555555", ls=EVENTS[kind], lw=0.8, label=f"_{kind}")
+                axis.axvline(time, color="#555555", ls=EVENTS[kind], lw=0.8, label=f"{style.UNLISTED}{kind}")
         if axis.get_legend_handles_labels()[1]:
             style.legend_beside(axis)
     # Add one legend below all panels.
-    named = {h.get_label(): h for h in (*axes[0].collections, *axes[0].lines) if str(h.get_label()).startswith("_")}
+    named = {
+        h.get_label(): h
+        for h in (*axes[0].collections, *axes[0].lines)
+        if str(h.get_label()).startswith(style.UNLISTED)
+    }
     texts = [*STATES, *EVENTS]
-    shown = {text: named[f"_{text}"] for text in texts if f"_{text}" in named}
+    shown = {text: named[style.UNLISTED + text] for text in texts if style.UNLISTED + text in named}
     if shown:
         axes[0].figure.put_below(shown, 7)
 

@@ -83,8 +83,10 @@ EDGE = 0.07
 # Spaces before units, before brackets, and in ranges, at which a line is not broken.
 _UNIT = re.compile(r"(?<=\d) (?=(?:[mk]?[smgNWJAV]|mm|N m|kg|rad|Hz|°|%)(?!\w)|…)|(?<=…) | (?=\[)|(?<=N) (?=m\b)")
 _GREEK = {"alpha": "α", "beta": "β", "gamma": "γ"}
-# Labels that matplotlib gives to artists without a label.
-_AUTOMATIC = re.compile(r"_(nolegend_|child\d+|container\d+)")
+# Labels of artists that are in no legend begin with this.
+UNLISTED = "_unlisted "
+# Also labels that matplotlib gives to artists without a label.
+_UNLISTED = re.compile(rf"_(nolegend_|child\d+|container\d+)|{UNLISTED}.*")
 # Mean width of a letter as a multiple of its size, for the breaking of long lines.
 LETTER = 0.56
 DPI = 170
@@ -754,7 +756,7 @@ def legend_entries(panels: Sequence[Axes]) -> dict[str, Any]:
         for artist in [*axes.get_children(), *axes.containers]:
             label = artist.get_label() if isinstance(artist, (Line2D, Patch, Collection, Container)) else ""
             # A name may begin with an underscore, as the labels that matplotlib sets itself.
-            if label and not _AUTOMATIC.fullmatch(str(label)):
+            if label and not _UNLISTED.fullmatch(str(label)):
                 unique.setdefault(str(label), artist)
     return unique
 
