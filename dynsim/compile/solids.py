@@ -63,7 +63,8 @@ def passes_through(robot: Robot, contact: Contact, q: Array) -> bool:
     parents = {link.name: link.parent for link in robot.links}
     name = parents[link.name]
     while name is not None:
-        points.append(placed[name][1])
+        if name not in robot.carriers:  # the rows of a free joint connect no bodies
+            points.append(placed[name][1])
         name = parents[name]
     for end, start in pairwise(points):
         first, last = _inside(contact.surface, start, end - start)
