@@ -6,13 +6,13 @@ variables and their targets; joint angles and limits; and cost, smallest singula
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from dynsim.draw import film
@@ -20,32 +20,35 @@ from dynsim.draw.figures import snake_tasks, style, tanaka2019
 from dynsim.draw.figures.snake_view import (
     BODY,
     COORDINATE_NAMES,
+    COST,
+    DEGREES,
     GROUND,
     HEAD,
     NUMBERED,
-    ROUNDING,
     View,
+    above_edge,
     curve_styles,
     error_axis,
     greek,
     interval_starts,
     is_numbered,
     limit_line,
+    margin_axes,
     mode_chart,
     mode_starts,
     mode_steps,
     moments,
+    moving,
     overlaid,
     overlay_margins,
     posture_grid,
 )
 from dynsim.record import Record
 from dynsim.snake.lifting import snake_geometry
-from dynsim.snake.published import write_tables
+from dynsim.snake.published import used_limit, write_tables
 
 # Number of postures in an animation, in a row, and overlaid in one picture.
 FRAMES, IN_A_ROW, IN_A_PICTURE = 50, 6, 7
-DEGREES = 180.0 / np.pi
 
 
 def draw(record: Record, folder: Path, kind: str = "png") -> list[Path]:
@@ -84,28 +87,69 @@ def comparisons(records: Mapping[str, Record]) -> dict[str, Callable[[Mapping[st
 
 
 def comparison(records: Mapping[str, Record]) -> Figure:
-    """Draw cost, largest yaw angle relative to its limit, support margin and head error of all variants."""
+    """Draw cost, largest yaw angle relative to its limit, support margin and head error of all variants.
+
+    Up to six variants have curves over time. More variants have one bar each, from the smallest to the largest value.
+    """
     title = style.comparison_title(list(records.values()), "cost, angles, margin and error")
-    figure = style.new_figure(6.6 + 0.2 * (len(records) > 6), title)
+    figure = style.new_figure(6.6, title)
     axes = figure.subplots(4, 1, sharex=True)
-    looks, entries = style.family_styles(list(records))
+    errors = {name: 1e3 * record["position_error"] for name, record in records.items()}
+    curves = {
+        name: (record["cost"], used_limit(record), 1e3 * record["support_margin"], errors[name])
+        for name, record in records.items()
+    }
     if len(records) <= len(style.DASHES):
         looks = curve_styles(list(records))
-        entries = {name: Line2D([], [], **look) for name, look in looks.items()}
-    overlay_margins(axes[:3], records, looks)
-    errors = {name: 1e3 * record["position_error"] for name, record in records.items()}
-    for name, record in records.items():
-        axes[3].plot(record.time, errors[name], **looks[name])
-    error_axis(axes[3], *errors.values())
-    axes[3].set_ylabel("position error\n[mm]")
-    axes[-1].set_xlabel("time [s]")
-    axes[-1].set_xlim(0.0, max(record.time[-1] for record in records.values()) or None)
+        # Earlier curves are wider, so that equal curves remain visible.
+        for k, look in enumerate(looks.values()):
+            look["linewidth"] = 1.0 + 0.35 * (len(looks) - 1 - k)
+        overlay_margins(axes[:3], records, looks)
+        for name, record in records.items():
+            axes[3].plot(record.time, errors[name], **looks[name])
+        axes[-1].set_xlabel("time [s]")
+        axes[-1].set_xlim(0.0, max(record.time[-1] for record in records.values()) or None)
+        style.legend_below(figure, axes[:1], 6)
+        same = [" and ".join(pair) for pair in combinations(curves, 2) if _coincide(*(curves[name] for name in pair))]
+        figure.note(*([f"Curves that coincide: {', '.join(same)}."] if same else []))
+    else:
+        _bars(figure, axes, curves)
+        margin_axes(axes[:3])
+    error_axis(axes[3], "position error", "mm", *errors.values())
+    if len(records) > len(style.DASHES):
+        for mark in axes[3].lines:
+            # Marks on the lower edge would be cut.
+            mark.set_visible(float(mark.get_ydata()[0]) > 1.1 * axes[3].get_ylim()[0])
     figure.align_ylabels(axes)
-    figure.put_below(entries, 6)
-    exact = [name for name, error in errors.items() if error.max() < ROUNDING]
-    if exact and axes[3].get_yscale() == "log":
-        figure.note(f"Position errors below {ROUNDING:g} mm are not shown ({len(exact)} of {len(records)} variants).")
     return figure
+
+
+def _coincide(first: Sequence[NDArray[np.float64]], second: Sequence[NDArray[np.float64]]) -> bool:
+    """Return whether all curves of two runs differ by less than a hundredth of their range."""
+    pairs = list(zip(first, second, strict=True))
+    return all(len(a) == len(b) and np.abs(a - b).max() <= 0.01 * max(np.ptp(a), np.ptp(b)) for a, b in pairs)
+
+
+def _bars(figure: style.Drawing, axes: Sequence[Axes], curves: Mapping[str, Sequence[NDArray[np.float64]]]) -> None:
+    """Draw the range of each quantity of each variant; variants with the same stem are next to each other."""
+    parts = style.families(list(curves))
+    stems, endings = (list(dict.fromkeys(part)) for part in zip(*parts.values(), strict=True))
+    looks, entries = curve_styles(endings), {}
+    for name, (stem, ending) in parts.items():
+        k, colour = endings.index(ending), looks[ending]["color"]
+        x = stems.index(stem) + 0.8 * ((k + 0.5) / len(endings) - 0.5)
+        for axis, values in zip(axes, curves[name], strict=True):
+            axis.vlines(x, values.min(), values.max(), color=colour, lw=1.5)
+            (mark,) = axis.plot(x, values[-1], "osD^v<>"[k % 7], color=colour, ms=3.5, mec="white", mew=0.3)
+        entries[f"…_{ending}" if ending else style.ALONE] = mark
+    if len(endings) > 1:
+        figure.put_below(entries, 6)
+    axes[-1].set_xticks(range(len(stems)), stems, rotation=90 * (sum(map(len, stems)) > 10.0 * style.width()))
+    axes[-1].set_xlim(-0.6, len(stems) - 0.4)
+    axes[-1].set_xlabel("variant")
+    for axis in axes:
+        axis.grid(axis="x", visible=False)
+    figure.note("Bars: range over the run; marks: value at its end.")
 
 
 def strips(records: Mapping[str, Record]) -> Figure:
@@ -134,28 +178,34 @@ def overview(record: Record) -> Figure:
 
 
 def tracking(record: Record) -> Figure:
-    """Draw the six coordinates of the controlled point with their targets, and the errors."""
-    columns = 1 if style.narrow() else 2
-    figure = style.new_figure(6.3 if columns == 2 else 8.4, style.title(record, "tracking of the target"))
-    axes = figure.subplots(8 // columns, columns, sharex=True, squeeze=False)
+    """Draw the coordinates of the controlled point that vary, with their targets, and the errors."""
+    shown, note = moving([record])
+    columns = 1 if style.narrow() or len(shown) % 2 else 2
+    rows = (len(shown) + 2) // columns
+    figure = style.new_figure(min(1.5 * rows + 0.8, 8.4), style.title(record, "tracking of the target"))
+    axes = figure.subplots(rows, columns, sharex=True, squeeze=False)
     panels, time = list(axes.T.ravel()), record.time
-    parts = (("position", range(3), 1.0, "m", 2e-3), ("attitude", range(3, 6), DEGREES, "°", 0.2))
-    for k, (part, coordinates, scale, unit, least) in enumerate(parts):
-        *own, last = panels[4 * k : 4 * k + 4]
-        for i, axis in zip(coordinates, own, strict=True):
-            axis.plot(time, scale * record["w"][:, i], color=GROUND, label="controlled point")
-            axis.plot(time, scale * record["w_target"][:, i], "--", color=HEAD, lw=0.9, label="target")
-            style.at_least(axis, least)
-            axis.set_ylabel(f"{COORDINATE_NAMES.get(record.labels['w'][i], record.labels['w'][i])} [{unit}]")
-            style.shade(axis, time, record["gripper"] > 0, "#EEEEEE", "gripper closed")
-        error = (1e3 if unit == "m" else scale) * record[f"{part}_error"]
-        last.plot(time, error, color=BODY)
-        error_axis(last, error)
-        last.set_ylabel(f"{part} error\n[{'mm' if unit == 'm' else unit}]")
+    for i, axis in zip(shown, panels, strict=False):
+        values, target = record["w"][:, i], record["w_target"][:, i]
+        scale, unit = (1.0, "m") if i < 3 else (DEGREES, "°")
+        if i < 3 and np.ptp([values.min(), values.max(), *target]) < 0.2:
+            scale, unit = 1e3, "mm"
+        axis.plot(time, scale * values, color=GROUND, label="controlled point")
+        axis.plot(time, scale * target, "--", color=HEAD, lw=0.9, label="target")
+        axis.set_ylabel(f"{COORDINATE_NAMES.get(record.labels['w'][i], record.labels['w'][i])} [{unit}]")
+    for axis, part, scale, unit in zip(
+        panels[len(shown) :], ("position", "attitude"), (1e3, DEGREES), ("mm", "°"), strict=False
+    ):
+        error = scale * record[f"{part}_error"]
+        axis.plot(time, error, color=BODY, label="error")
+        error_axis(axis, f"{part} error", unit, error)
+    for axis in panels:
+        style.shade(axis, time, record["gripper"] > 0, "#EEEEEE", "gripper closed")
     for axis in axes[-1]:
         axis.set_xlabel("time [s]")
     figure.align_ylabels(axes)
-    style.legend_below(figure, panels[:1], 3)
+    style.legend_below(figure, panels, 4)
+    figure.note(*filter(None, [note]))
     return figure
 
 
@@ -200,14 +250,15 @@ def redundancy(record: Record) -> Figure:
     if many:
         mode_steps(axes[1, 0], record)
     cost.plot(record.time, record["cost"], color=GROUND)
-    cost.set_ylabel("cost V")
-    cost.set_ylim(bottom=0)
+    cost.set_ylabel(COST)
+    above_edge(cost)
     dense = len(mode_starts(record)) > NUMBERED
     _over_time(sigma, record, record["sigma_min"], dense)
     sigma.set_ylabel("smallest singular\nvalue of B̃")
     sigma.set_ylim(bottom=0)
     _over_time(margin, record, 1e3 * record["support_margin"], dense)
-    margin.set_ylim(bottom=min(0.0, 1e3 * float(record["support_margin"].min())) - 4)
+    low, high = 1e3 * record["support_margin"].min(), 1e3 * record["support_margin"].max()
+    margin.set_ylim(min(0.0, low) - 4.0, high + 0.1 * (high - min(0.0, low)) + 1.0)
     limit_line(margin, 0.0, "tips below zero")
     margin.set_ylabel("support margin\n[mm]")
     margin.set_xlabel("time [s]")

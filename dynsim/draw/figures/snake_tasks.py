@@ -8,9 +8,21 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from dynsim.draw.figures import style
-from dynsim.draw.figures.snake_view import BODY, GROUND, HEAD, TARGET, curve_styles, greek, object_bodies, pair_wheels
+from dynsim.draw.figures.snake_view import (
+    BODY,
+    BOUND,
+    LIMIT,
+    TARGET,
+    above_edge,
+    curve_styles,
+    greek,
+    interval_starts,
+    object_bodies,
+    pair_wheels,
+)
 from dynsim.draw.figures.style import Array
 from dynsim.record import Record
 from dynsim.record.measures import GRIPPER_STATES
@@ -19,7 +31,9 @@ from dynsim.record.quaternion import continuous, of_turn, product, rotated
 
 # Number of servos (with the largest rms torques) that have separate colours; maximum number of objects in a figure.
 LOADED, OBJECTS = 4, 4
-FAINT = "#B0B0B0"
+FAINT = "#C4C4C4"
+# A limit is drawn if it is at most this multiple of the largest value; otherwise it is in a note.
+NEAR = 3.0
 # Colours of the bands for the states of the gripper.
 STATES = dict(zip(GRIPPER_STATES, ("#FFFFFF", "#FDEFD3", "#E1F3EC", "#FAE6F0"), strict=True))
 # Line styles of the events of the gripper.
@@ -63,6 +77,7 @@ def _kinds(record: Record) -> dict[tuple[float, float, float], list[dict[str, An
 def servos(record: Record) -> Figure:
     """Draw the shaft torques with stall torque, nominal torque and gear friction; servos of one type share a panel.
 
+    The curves of the most loaded servos are means over short intervals; the range of all servos includes every sample.
     If a joint is driven back, the gear friction adds to the torque of the motor, and the back EMF to its voltage. The
     shaft torque may then exceed the stall torque.
     """
@@ -73,32 +88,53 @@ def servos(record: Record) -> Figure:
     title = style.title(record, "servo torques and limits")
     figure = style.new_figure(0.9 + 2.9 * sum(heights) + legends, title)
     axes = figure.subplots(len(kinds), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]
+    starts, far = interval_starts(len(record)), list[str]()
     for axis, ((stall, nominal, friction), motors) in zip(axes, kinds.items(), strict=True):
         order = sorted(motors, key=lambda motor: -motor["torque_rms_N_m"])
         looks = curve_styles([motor["joint"] for motor in order[:LOADED]])
-        for k, motor in enumerate(order):
+        columns = [record.labels["torque"].index(motor["joint"]) for motor in order]
+        torques = record["torque"][:, columns]
+        time, low, high = record.time[starts], *(_each(f, torques, starts) for f in (np.minimum, np.maximum))
+        edges = np.append(time, record.time[-1])
+        means = _each(np.add, torques, starts) / np.diff(starts, append=len(torques))[:, None]
+        for motor, values in zip(order, means.T[:LOADED], strict=False):
             name = motor["joint"]
-            values = record["torque"][:, record.labels["torque"].index(name)]
-            label = f"{greek(name)} rms {motor['torque_rms_N_m']:.2f} N m" if name in looks else None
-            # The most loaded servos are on top.
-            look = looks.get(name, {"color": FAINT, "linewidth": 0.6})
-            axis.plot(record.time, values, label=label, zorder=3.0 - 0.01 * k, **look)
-        if len(order) > LOADED:
-            axis.plot([], [], color=FAINT, lw=0.6, label=f"{len(order) - LOADED} others")
-        _both(axis, stall, f"stall {stall:g} N m", color=HEAD, ls="--", lw=0.9)
-        if nominal:
-            _both(axis, nominal, f"nominal {nominal:g} N m", color="black", ls=":", lw=0.9)
+            axis.plot(time, values, label=f"{greek(name)} rms {motor['torque_rms_N_m']:.2f} N m", **looks[name])
+        everything = f"range of all {len(order)}"
+        axis.stairs(
+            high.max(axis=1), edges, baseline=low.min(axis=1), fill=True, color=FAINT, lw=0, zorder=1, label=everything
+        )
+        largest = max(motor["torque_max_N_m"] for motor in motors)
+        reach = largest
+        for value, text, look in ((stall, "stall", BOUND), (nominal, "nominal", LIMIT)):
+            if 0.0 < value <= NEAR * largest:
+                _both(axis, value, f"{text} {value:g} N m", **look)
+                reach = max(reach, value)
+            elif value:
+                far.append(f"{text} torque of the {_group(motors)} {value:g} N m")
         if friction:
-            label = f"friction {friction:g} N m"
-            axis.axhspan(-friction, friction, color=style.SKY, alpha=0.25, lw=0, zorder=0, label=label)
-        reach = _reach(stall, motors)
-        axis.set(xlim=(record.time[0], record.time[-1]), ylim=(-reach, reach), ylabel="torque [N m]")
+            _both(axis, friction, f"friction {friction:g} N m", color=style.SKY, lw=1.2)
+        axis.set(xlim=(record.time[0], record.time[-1]), ylim=(-1.1 * reach, 1.1 * reach), ylabel="torque [N m]")
         style.legend_beside(axis)
     axes[-1].set_xlabel("time [s]")
+    if len(starts) < len(record):
+        figure.note(f"Curves: mean over {(record.time[-1] - record.time[0]) / len(starts):.2g} s.")
+    if far:
+        figure.note(f"Beyond the axes: {', '.join(far)}.")
     if any(friction for _, _, friction in kinds):
         figure.note("Nominal: limit of the rms torque. Friction: what the gear carries without current.")
     _explain_excess(figure, kinds)
     return figure
+
+
+def _each(function: np.ufunc, values: Array, starts: NDArray[np.int64]) -> Array:
+    """Return a function of the values, (T, k), in each interval."""
+    return np.asarray(function.reduceat(values, starts, axis=0))
+
+
+def _group(motors: list[dict[str, Any]]) -> str:
+    """Return the common name of servos: "wheels" or "joints"."""
+    return "wheels" if motors[0]["joint"].startswith("wheel") else "joints"
 
 
 def _reach(stall: float, motors: list[dict[str, Any]]) -> float:
@@ -136,9 +172,9 @@ def servo_loads(record: Record) -> Figure:
         axis.plot(
             places, [motor["torque_max_N_m"] for motor in motors], "_", color="black", ms=6, label="largest torque"
         )
-        axis.axhline(stall, color=HEAD, ls="--", lw=0.9, label="stall torque")
+        axis.axhline(stall, label="stall torque", **BOUND)
         if nominal:
-            axis.axhline(nominal, color="black", ls=":", lw=1.0, label="nominal torque")
+            axis.axhline(nominal, label="nominal torque", **LIMIT)
         axis.set_xticks(places, [greek(motor["joint"]) for motor in motors], rotation=90)
         axis.set(xlim=(-0.7, len(motors) - 0.3), ylim=(0.0, _reach(stall, motors)), ylabel="torque [N m]")
         axis.grid(axis="x", visible=False)
@@ -167,6 +203,7 @@ def power(record: Record) -> Figure:
         axis.stairs(steps, record.time, color=colour, lw=1.0, baseline=None, label=label)
         axis.axhline(0.0, color=style.GREY, lw=0.6)
         axis.set_ylabel(f"{text}\npower [W]")
+        axis.locator_params(axis="y", nbins=4)
         style.legend_above(axis)
     axes[-1].set(xlabel="time [s]", xlim=(record.time[0], record.time[-1] or None))
     figure.align_ylabels(axes)
@@ -177,7 +214,7 @@ def wheels(record: Record) -> Figure:
     """Draw the load of each wheel pair, the times at which wheels on the ground carry nothing, and slip speeds."""
     figure = style.new_figure(6.2 + 0.6 * style.narrow(), style.title(record, "wheel loads and slip"))
     axes = figure.subplots(3, 1, sharex=True, height_ratios=[1.0, 0.9, 1.0])
-    time, pairs = record.time, pair_wheels(record)
+    time, pairs, starts = record.time, pair_wheels(record), interval_starts(len(record))
     grounded = record["grounded"] > 0
     slip = 1e3 * np.linalg.norm(record["contact_slip_velocity"], axis=2)
     loads = record["contact_normal_force"]
@@ -187,30 +224,37 @@ def wheels(record: Record) -> Figure:
         touching = loads[:, columns] > 0.0
         bare = grounded[:, k] & ~touching.all(axis=1)
         for where, colour, label in (
-            (grounded[:, k], GROUND, "on the ground"),
-            (bare, style.ORANGE, "a wheel lifts off"),
+            (grounded[:, k], FAINT, "on the ground"),
+            (bare, style.DEEP, "a wheel lifts off"),
         ):
             if where.any():
                 axes[1].fill_between(
                     time, k + 0.62, k + 1.38, where=where, step="post", color=colour, lw=0, label=label
                 )
         if pair in looks:
-            axes[0].plot(time, loads[:, columns].sum(axis=1), label=pair, **looks[pair])
+            mean = _each(np.add, loads[:, columns].sum(axis=1), starts) / np.diff(starts, append=len(time))
+            axes[0].plot(time[starts], mean, label=pair, **looks[pair])
             # Wheels in the air do not slip.
-            axes[2].plot(time, np.where(touching, slip[:, columns], 0.0).max(axis=1), **looks[pair])
+            fastest = _each(np.maximum, np.where(touching, slip[:, columns], 0.0).max(axis=1), starts)
+            axes[2].plot(time[starts], fastest, **looks[pair])
     axes[0].set_ylabel("load of the pair\n[N]")
-    axes[0].set_ylim(bottom=0.0)
+    above_edge(axes[0])
     axes[1].set(ylim=(len(pairs) + 0.5, 0.5), ylabel="wheel pair", yticks=range(1, len(pairs) + 1))
     axes[1].grid(visible=False)
     axes[2].set_ylabel("slip speed\n[mm/s]")
     style.at_least(axes[2], 1.0)
-    axes[2].set_ylim(bottom=0.0)
+    above_edge(axes[2])
     axes[2].set(xlabel="time [s]", xlim=(time[0], time[-1] or None))
     figure.align_ylabels(axes)
     style.legend_below(figure, axes[:2], 7)
     contacts = {contact["name"]: contact for contact in record.summary.get("contacts", ())}
     named = [contacts[record.labels["contact_normal_force"][k]] for columns in pairs.values() for k in columns]
     slipped = max((1e3 * contact["slip_distance_m"], contact["name"]) for contact in named)
+    if air := [pair.removeprefix("pair ") for pair in pairs if pair not in looks]:
+        figure.note(f"Pairs in the air during the whole run: {', '.join(air)}.")
+    if len(starts) < len(record):
+        length = (time[-1] - time[0]) / len(starts)
+        figure.note(f"Curves: mean load and largest slip speed in intervals of {length:.2g} s.")
     figure.note(f"Largest slip distance: {style.number(slipped[0], 3)} mm, {slipped[1]}.")
     return figure
 
@@ -224,10 +268,11 @@ def gripper(record: Record) -> Figure:
     axes = figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0]
     axes[0].plot(record.time, np.maximum(1e3 * record["grasp_distance"], LEAST), color=BODY, label="distance")
     style.log_axis(axes[0])
-    axes[0].set_ylabel("to the nearest\ngrasp frame [mm]")
+    axes[0].set_ylabel("distance to\nnearest grasp\nframe [mm]")
+    if 1e3 * record["grasp_distance"].min() < LEAST:
+        figure.note(f"Distances below {LEAST:g} mm are drawn as {LEAST:g} mm.")
     if grip is not None:
-        label = f"captures within {1e3 * grip.capture:g} mm"
-        axes[0].axhline(1e3 * grip.capture, color=HEAD, ls="--", lw=0.9, label=label)
+        axes[0].axhline(1e3 * grip.capture, label=f"captures within {1e3 * grip.capture:g} mm", **LIMIT)
     if forces is not None:
         bounds = (None, None) if grip is None else (grip.force, grip.torque)
         parts = (("force [N]", "N", bounds[0], ""), ("torque [N m]", "N m", bounds[1], "about "))
@@ -235,8 +280,10 @@ def gripper(record: Record) -> Figure:
             for (name, look), column in zip(curve_styles("xyz").items(), values.T, strict=True):
                 axis.plot(record.time, column, label=f"{about}{name}", **look)
             style.at_least(axis, 1e-3)
-            if bound is not None:
-                _both(axis, bound, f"bound {bound:g} {unit}", color=HEAD, ls="--", lw=0.9)
+            if bound is not None and bound <= NEAR * np.abs(values).max():
+                _both(axis, bound, f"bound {bound:g} {unit}", **BOUND)
+            elif bound is not None:
+                figure.note(f"Bound of the {label.partition(' [')[0]}, beyond the axis: {bound:g} {unit}.")
             axis.set_ylabel(label)
     _finish(axes, record)
     axes[-1].set_xlabel("time [s]")
@@ -283,16 +330,20 @@ def _moved(axis: Axes, record: Record, name: str, body: int) -> None:
     scale, unit = (180.0 / np.pi, "°") if turns else (1e3, "mm")
     own = record["q"][:, record.labels["q"].index(name)]
     last = f"{style.number(scale * own[-1], 3)}{'' if turns else ' '}{unit}"
-    axis.plot(record.time, scale * own, color="black", lw=1.2, label=f"{name}: {last}")
-    for start, end in _holds(record, name):
-        rows = slice(start, end)
-        drawn = (
-            ("w", "gripper", style.SKY, style.DASHES[1]),
-            ("w_target", "target of the gripper", HEAD, style.DASHES[2]),
-        )
-        for signal, label, colour, dashes in drawn:
-            along = own[start] + _followed(record, record[signal][rows], body)
-            axis.plot(record.time[rows], scale * along, color=colour, ls=dashes, lw=1.1, label=label)
+    # The lines become thinner, because they coincide unless the gripper slips.
+    axis.plot(record.time, scale * own, color="#BBBBBB", lw=4.0, label=f"{name}: {last}")
+    drawn: tuple[tuple[str, str, dict[str, Any]], ...] = (
+        ("w", "gripper", {"color": style.BLUE, "lw": 1.8}),
+        ("w_target", "target", {"color": "black", "lw": 0.8}),
+    )
+    for signal, label, look in drawn:
+        tracks = [
+            (a, b, scale * (own[a] + _followed(record, record[signal][a:b], body))) for a, b in _holds(record, name)
+        ]
+        off = max((np.abs(along - scale * own[a:b]).max() for a, b, along in tracks), default=0.0)
+        text = f"{label}, at most {style.number(off, 2)}{'' if turns else ' '}{unit} away"
+        for a, b, along in tracks:
+            axis.plot(record.time[a:b], along, label=text, **look)
     style.at_least(axis, 1.0)
     axis.set_ylabel(f"{'angle' if turns else 'displacement'} of {name} [{unit}]")
 
@@ -385,7 +436,7 @@ def _finish(axes: Array, record: Record) -> None:
             for time in times:
                 axis.axvline(time, color="#555555", ls=EVENTS[kind], lw=0.8, label=f"{style.UNLISTED}{kind}")
         if axis.get_legend_handles_labels()[1]:
-            style.legend_beside(axis)
+            style.legend_beside(axis, 3)
     # Add one legend below all panels.
     named = {
         h.get_label(): h

@@ -25,7 +25,7 @@ from dynsim.snake.lifting import snake_geometry
 from dynsim.snake.published import used_limit
 
 BODY, HEAD, GROUND, LIFT, TARGET, SUPPORT = "#444444", style.PULLING, style.BLUE, "#FFFFFF", style.GREEN, style.SKY
-OBJECT = "#E9CFA6"
+OBJECT, EDGE = "#E9CFA6", "#00283F"
 SYMBOLS = {"alpha": "α", "beta": "β", "gamma": "γ"}
 COORDINATE_NAMES = {
     "x": "$x$",
@@ -35,17 +35,28 @@ COORDINATE_NAMES = {
     "beta": r"pitch $\beta$",
     "gamma": r"yaw $\gamma$",
 }
+COST = "cost of\nredundancy"
 # Maximum number of modes whose numbers fit above the bars of a chart.
 NUMBERED = 30
 # Number of intervals into which a run is divided. If it has more modes than this, fractions and ranges for each
 # interval are drawn instead of each mode.
 INTERVALS = 160
+# Looks of limits (dotted) and of stall torques and bounds (long dashes); no curve is thin and black.
+LIMIT: dict[str, Any] = {"color": style.BLACK, "ls": (0, (1, 2)), "lw": 0.8}
+BOUND: dict[str, Any] = {"color": style.BLACK, "ls": (0, (8, 4)), "lw": 0.6}
+# Coordinates of the controlled point that vary by less than this have no panel [mm, °].
+STILL = (2.0, 0.2)
+DEGREES = 180.0 / np.pi
 # Colours of fractions of time from 0 to 1.
 SHARES = LinearSegmentedColormap.from_list("shares", [LIFT, GROUND])
 # Minimum height of a top view relative to its width, because a straight robot appears as a thin line.
 MIN_HEIGHT = 0.3
 # Font size of tick labels of postures [point]; least width of their panels, greatest and smallest height [inch].
 SMALL, CELL, TALLEST, LOWEST = 6.5, 1.6, 4.6, 0.35
+# Seen from above, the path of a point is drawn and explained if its extent is greater than this [m].
+LONG = 0.05
+# Height of a page that a figure fills before its legend has more than one row [inch].
+PAGE = 8.2
 # If a point of the body rises or sinks by more than this, there is a side view [m].
 RISES = 0.01
 # Errors below this are rounding errors [mm or °]; ratio of errors above which their axis is logarithmic.
@@ -69,7 +80,7 @@ class View:
         self.row, self.time, self.mode = row, float(record.time[row]), int(record["mode"][row])
         self.points: Array = record["posture"][row]
         self.surfaces = scene.surfaces
-        self.path: Array = record["w"][:, :2]
+        self.path: Array = record["w"][: row + 1, :2]
         self.centre: Array = record["centre_of_mass"][row]
         self.grounded = record["grounded"][row].astype(bool)
         self.radius = snake_geometry(record).wheel_radius
@@ -108,7 +119,7 @@ class View:
         for down, pair in zip(self.grounded, self.wheels, strict=True):
             # In side view, a lifted pair is drawn slightly above the ground; the model has no height for it ([T] II.A).
             raised = np.array([0.0, 0.0 if above or down else 0.35 * self.radius])
-            look: dict[str, Any] = {"facecolor": GROUND if down else LIFT, "edgecolor": GROUND, "lw": 0.7}
+            look: dict[str, Any] = {"facecolor": GROUND if down else LIFT, "edgecolor": EDGE, "lw": 0.6}
             wheels = (self.project(corners, above) + raised for corners in pair)
             add_outlines(axes, wheels, zorder=4 if above else 2, **look)
 
@@ -116,7 +127,7 @@ class View:
         """Draw the body and the controlled point."""
         flat = self.project(self.points, above)
         axes.plot(*flat.T, "-", color=colour, lw=1.8, zorder=3, solid_capstyle="round")
-        axes.plot(*flat[0], "o", color=head, ms=4, zorder=5)
+        axes.plot(*flat[0], "o", color=head, ms=2.8, zorder=5)
 
 
 Box = tuple[float, float, float, float]
@@ -127,7 +138,7 @@ def _top_box(clouds: list[Array]) -> Box:
 
 
 def _side_box(clouds: list[Array]) -> Box:
-    x0, x1, low, high = limits(clouds, 0.04)
+    x0, x1, low, high = limits(clouds, 0.06)
     return x0, x1, min(low, -0.02), high
 
 
@@ -162,8 +173,10 @@ def _grid(
     )
     heights = [max(cell * (box[3] - box[2]) / (box[1] - box[0]), LOWEST) for row in rows for box in row]
     ticks = len(heights) if len(heights) > len(rows) else 1
-    texts = ticks * style.letters(18.0) + len(rows) * style.letters(6.0 + 10.0 * lines)
-    figure = style.new_figure(sum(heights) + texts / 72.0 + 0.8, title)
+    texts = ticks * style.letters(18.0 if ticks == 1 else 27.0) + len(rows) * style.letters(6.0 + 10.0 * lines)
+    height = sum(heights) + texts / 72.0 + 0.8
+    # Panels of a figure that would be higher than a page are a little smaller.
+    figure = style.new_figure(max(min(height, PAGE), 0.85 * height), title)
     axes = figure.subplots(len(heights), columns, squeeze=False, height_ratios=heights)
     for panel in axes.ravel():
         panel.set_aspect("equal", adjustable="box")
@@ -180,7 +193,7 @@ def _frame(axes: NDArray[Any], boxes: Sequence[Box], used: int, column: int, las
     for panel, (x0, x1, y0, y1), (across, up) in zip(panels, boxes, names, strict=False):
         panel.set(xlim=(x0, x1), ylim=(y0, y1))
         panel.tick_params(labelleft=column == 0, labelbottom=last or len(panels) > 1)
-        panel.set_xlabel(across if last else "", fontsize=style.letters(7.5))
+        panel.set_xlabel(across if last or len(panels) > 1 else "", fontsize=style.letters(7.5))
         panel.set_ylabel(up if column == 0 else "", fontsize=style.letters(7.5))
     for empty in axes[:, used:].ravel() if column == used - 1 else ():
         empty.set_visible(False)
@@ -211,6 +224,8 @@ def posture_grid(
         for sides in [((_top_box, True), (_side_box, False))[: 1 + side]]
     }
     columns = min(_columns(len(line)) for line in lines.values())
+    if (columns, max(map(len, lines.values()))) == (2, 3):
+        columns = 1  # two columns would leave a cell empty
     rows = [(label, line[k : k + columns]) for label, line in lines.items() for k in range(0, len(line), columns)]
     cell = (style.width() - 0.7) / columns
     size = style.letters(7.0)
@@ -227,7 +242,8 @@ def posture_grid(
                 view.draw(panel, above=above)
             first = column == 0 and label.strip() and view is lines[label][0][0]
             panels[0].set_title((f"{label}\n" if first else "") + texts[id(view)], fontsize=size)
-    _explain(figure, pooled, {"path of the point": Line2D([], [], color=HEAD, lw=1.0)})
+    paths = [view.path for view in pooled]
+    _explain(figure, pooled, {"path of the point": Line2D([], [], color=HEAD, lw=1.0)} if _seen(paths) else {})
     return figure
 
 
@@ -245,8 +261,7 @@ def overlaid(title: str, runs: Mapping[str, tuple[Record, Sequence[View]]]) -> F
     side = max(float(np.ptp(heights, axis=0).max()) for heights in high) > RISES
     tops, sides = [], []
     for record, line in runs.values():
-        paths = [record["w"][:, :2], record["base_pose"][:, :2]]
-        tops.append(limits([*(view.extent(above=True) for view in line), *paths], 0.06))
+        tops.append(limits([*(view.extent(above=True) for view in line), record["w"][:, :2]], 0.06))
         sides.append(_side_box([view.extent(above=False) for view in line]))
     x0, x1, y0, y1 = np.array(tops).T
     side = side or bool(np.max(y1 - y0) < MIN_HEIGHT * np.max(x1 - x0))
@@ -276,18 +291,21 @@ def overlaid(title: str, runs: Mapping[str, tuple[Record, Sequence[View]]]) -> F
             line[-1].draw(panel, above=above)
         if uneven[k]:
             panels[0].tick_params(labelleft=True)
-        panels[0].plot(*record["base_pose"][:, :2].T, color=GROUND, lw=0.8, zorder=2)
-        panels[0].plot(*record["w"][:, :2].T, color=HEAD, lw=1.0, zorder=5.5)
-        panels[0].plot(*record["w_target"][:, :2].T, "--", color=TARGET, lw=1.0, zorder=5.6)
+        if _seen([record["w"][:, :2]]):
+            panels[0].plot(*record["w"][:, :2].T, color=HEAD, lw=1.0, zorder=5.5)
+            panels[0].plot(*record["w_target"][:, :2].T, "--", color=TARGET, lw=1.0, zorder=5.6)
         panels[0].set_title(label, fontsize=size)
-    more: dict[str, Any] = {
-        "earlier posture": Line2D([], [], color="0.65", lw=1.8),
-        "path of the point": Line2D([], [], color=HEAD, lw=1.0),
-        "target of the point": Line2D([], [], color=TARGET, ls="--", lw=1.0),
-        "path of pair 1": Line2D([], [], color=GROUND, lw=0.8),
-    }
+    more: dict[str, Any] = {"earlier posture": Line2D([], [], color="0.65", lw=1.8)}
+    if _seen([record["w"][:, :2] for record, _ in runs.values()]):
+        more["path of the point"] = Line2D([], [], color=HEAD, lw=1.0)
+        more["target of the point"] = Line2D([], [], color=TARGET, ls="--", lw=1.0)
     _explain(figure, views, more)
     return figure
+
+
+def _seen(paths: Sequence[Array]) -> bool:
+    """Return whether the longest path is longer than the mark of the controlled point."""
+    return max(float(np.ptp(path, axis=0).max()) for path in paths) > LONG
 
 
 def overlay_margins(
@@ -298,17 +316,22 @@ def overlay_margins(
         axes[0].plot(record.time, record["cost"], label=label, **looks[label])
         axes[1].plot(record.time, used_limit(record), **looks[label])
         axes[2].plot(record.time, 1e3 * record["support_margin"], **looks[label])
+    margin_axes(axes)
+
+
+def margin_axes(axes: Sequence[Axes]) -> None:
+    """Label panels of cost, yaw angle and support margin, and draw their limits."""
     texts = ("largest yaw angle\n/ its limit", "support margin\n[mm]")
-    for axis, limit, name, text in zip(axes[1:], (1.0, 0.0), ("limit", "tips"), texts, strict=True):
+    for axis, limit, name, text in zip(axes[1:], (1.0, 0.0), ("limit", "tips below zero"), texts, strict=True):
         limit_line(axis, limit, name)
         axis.set_ylabel(text)
-    axes[0].set_ylabel("cost V")
-    axes[0].set_ylim(bottom=0)
+    axes[0].set_ylabel(COST)
+    above_edge(axes[0])
 
 
 def limit_line(axis: Axes, value: float, text: str = "") -> None:
-    """Draw a limit as a dash-dotted line, with its name, if any, above the right end."""
-    axis.axhline(value, color=HEAD, ls="-.", lw=0.8)
+    """Draw a limit as a dotted line, with its name, if any, above the right end."""
+    axis.axhline(value, **LIMIT)
     if not text:
         return
     low, high = axis.get_ylim()
@@ -320,7 +343,6 @@ def limit_line(axis: Axes, value: float, text: str = "") -> None:
         xytext=(-2, 1.5),
         textcoords="offset points",
         ha="right",
-        color=HEAD,
         fontsize=style.letters(7.0),
     )
 
@@ -367,6 +389,8 @@ def mode_chart(axis: Axes, record: Record, title: str = "mode") -> None:
     axis.set_xlim(time[0], time[-1])
     axis.set_ylim(pairs + 0.6, -0.2 if numbered else 0.4)
     axis.set_yticks(range(1, pairs + 1))
+    if numbered:
+        axis.set_yticks([0.2, *range(1, pairs + 1)], ["mode", *map(str, range(1, pairs + 1))])
     axis.set_ylabel("wheel pair")
     # The title mentions mode numbers only if they are drawn.
     title = f"{title}, and the " if numbered else title.removesuffix("mode")
@@ -413,11 +437,12 @@ def _shares(axis: Axes, record: Record, holds: NDArray[Any], places: NDArray[np.
         axis.pcolormesh(edges, bar, share[None], cmap=SHARES, vmin=0.0, vmax=1.0)
 
 
-def error_axis(axis: Axes, *errors: NDArray[np.float64]) -> None:
-    """Set the limits of an axis of errors [mm or °], logarithmic if the errors differ by more than ``SPREAD``.
+def error_axis(axis: Axes, name: str, unit: str, *errors: NDArray[np.float64]) -> None:
+    """Label and limit an axis of errors [mm or °], logarithmic if the errors differ by more than ``SPREAD``.
 
-    Rounding errors, and a peak or an exact sample at the start, do not extend the axis.
+    Rounding errors, and a peak or an exact sample at the start, do not extend the axis; a note names its lower end.
     """
+    axis.set_ylabel(f"{name}\n[{unit}]")
     values = np.concatenate(errors)
     high = max(float(values.max(initial=0.0)), ROUNDING)
     seen = values[values > ROUNDING]
@@ -429,6 +454,32 @@ def error_axis(axis: Axes, *errors: NDArray[np.float64]) -> None:
     style.log_axis(axis)
     locator: Any = axis.yaxis.get_major_locator()
     locator.set_params(numticks=6)  # otherwise low panels have labels at two decades only
+    figure: Any = axis.figure
+    if any((error[1:] < 0.7 * low).any() for error in errors):
+        hidden = sum(bool((error < 0.7 * low).all()) for error in errors)
+        runs = f" ({hidden} of {len(errors)} variants)" if hidden else ""
+        end = f"{style.number(0.7 * low, 2)} {unit}".replace(" °", "°")
+        figure.note(f"{name.capitalize()}s below {end} are not shown{runs}.")
+
+
+def above_edge(axis: Axes) -> None:
+    """Start the axis of a positive quantity slightly below zero, so that its frame does not cover curves at zero."""
+    axis.set_ylim(bottom=-0.03 * axis.get_ylim()[1])
+
+
+def moving(records: Sequence[Record]) -> tuple[list[int], str]:
+    """Return the coordinates of the controlled point that vary in any run, and a note on the others."""
+    shown, still = [], []
+    for i, name in enumerate(records[0].labels["w"]):
+        scale, unit = (1e3, " mm") if i < 3 else (DEGREES, "°")
+        both = [scale * record[signal][:, i] for record in records for signal in ("w", "w_target")]
+        if max(np.ptp(values) for values in both) > STILL[i // 3]:
+            shown.append(i)
+            continue
+        off = max(np.abs(w - target).max() for w, target in zip(both[::2], both[1::2], strict=True))
+        still.append(f"{SYMBOLS.get(name, name)} ({style.number(round(off, 2), 2)}{unit})")
+    note = f"Constant and not drawn, with the largest distance from the target: {', '.join(still)}."
+    return shown, note if still else ""
 
 
 def moments(record: Record, count: int) -> NDArray[np.int64]:
@@ -468,11 +519,11 @@ def _explain(figure: style.Drawing, views: Sequence[View], more: Mapping[str, An
     """Add a legend of the views below a figure."""
     entries: dict[str, Any] = {
         "body": Line2D([], [], color=BODY, lw=1.8),
-        "wheel on ground": Patch(facecolor=GROUND, edgecolor=GROUND),
-        "wheel lifted": Patch(facecolor=LIFT, edgecolor=GROUND),
+        "wheel on ground": Patch(facecolor=GROUND, edgecolor=EDGE),
+        "wheel lifted": Patch(facecolor=LIFT, edgecolor=EDGE),
         "support polygon": Patch(facecolor=SUPPORT, alpha=0.25),
         "centre of mass": Line2D([], [], color="black", marker="x", ls="", ms=4),
-        "controlled point": Line2D([], [], color=HEAD, marker="o", ls="", ms=4),
+        "controlled point": Line2D([], [], color=HEAD, marker="o", ls="", ms=2.8),
         **more,
     }
     if any(len(view.surfaces) > 1 for view in views):

@@ -628,39 +628,6 @@ def families(names: Sequence[str]) -> dict[str, tuple[str, str]]:
     return {name: (stem, name[len(stem) + 1 :]) for name, stem in stems.items()}
 
 
-def family_styles(names: Sequence[str]) -> tuple[dict[str, dict[str, Any]], dict[str, Line2D]]:
-    """Return the look of each variant, and the lines of their legend by label.
-
-    If there are more variants than colours, related variants share a colour and differ in their line style, see
-    :func:`families`. Stems select the colour, unless there are more endings than stems. The legend then explains
-    colours and line styles separately.
-    """
-    colours, parts = _colours(), families(names)
-    stems, endings = (list(dict.fromkeys(part)) for part in zip(*parts.values(), strict=True))
-    if len(names) <= len(colours) or len(names) in (len(stems), len(endings)):
-        looks = variant_styles(names)
-        return looks, {name: Line2D([], [], **look) for name, look in looks.items()}
-    coloured, dashed = (stems, endings) if len(stems) >= len(endings) else (endings, stems)
-    looks = {}
-    for name, (stem, ending) in parts.items():
-        colour, dash = (stem, ending) if coloured is stems else (ending, stem)
-        # If the colours do not suffice, they are used again with other line styles.
-        turn, k = divmod(coloured.index(colour), len(colours))
-        line_style = DASHES[(dashed.index(dash) + turn * len(dashed)) % len(DASHES)]
-        looks[name] = {"color": colours[k], "linestyle": line_style, "linewidth": 1.2}
-    if len(coloured) > len(colours):
-        return looks, {name: Line2D([], [], **look) for name, look in looks.items()}
-    texts = ("{}", "…_{}") if coloured is stems else ("…_{}", "{}_…")
-    entries: dict[str, Line2D] = {}
-    for k, part in enumerate(coloured):
-        entries[texts[0].format(part) if part else ALONE] = Line2D([], [], color=colours[k])
-    for k, part in enumerate(dashed):
-        entries[texts[1].format(part) if part else ALONE] = Line2D(
-            [], [], color=BLACK, linestyle=DASHES[k % len(DASHES)]
-        )
-    return looks, entries
-
-
 def number(value: float, digits: int = 4, scale: float = 0.0) -> str:
     """Format a number with a true minus sign, as on the axes; as 0 if it is a rounding error of the ``scale``."""
     return f"{0.0 if abs(value) < NOTHING * scale else value:.{digits}g}".replace("-", "−")

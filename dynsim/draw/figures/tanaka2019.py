@@ -16,13 +16,17 @@ from matplotlib.figure import Figure
 from dynsim.draw.figures import style
 from dynsim.draw.figures.snake_view import (
     COORDINATE_NAMES,
+    COST,
     GROUND,
     HEAD,
+    LIMIT,
     SYMBOLS,
     View,
+    above_edge,
     curve_styles,
     greek,
     mode_chart,
+    moving,
     overlay_margins,
     pair_loads,
     posture_grid,
@@ -99,18 +103,19 @@ def _deviations(records: Mapping[str, Record], sources: Mapping[str, str]) -> Fi
     """Draw the deviations of six displacements, with the endings of the names of variants by their source."""
     moved = [name for name in TABLE_III if name in records]
     places, published = np.arange(len(moved)), [TABLE_III[name] for name in moved]
-    figure = style.new_figure(7.0, "displacement of the head minus its target, [T] Table III")
+    figure = style.new_figure(7.0, "displacement of the head minus its target, Table III of Tanaka et al. 2019")
     axes = figure.subplots(6, 1, sharex=True)
     for i, axis in enumerate(axes):
         off = [1e3 * (p.mean[i] - p.target[i]) for p in published]
         spread = [2e3 * p.deviation[i] for p in published]
-        look: dict[str, Any] = {"width": 0.7, "color": VARIANT_COLOURS[2], "alpha": 0.5, "capsize": 2}
-        axis.bar(places, off, yerr=spread, label="measured in [T], mean ± 2 SD", **look)
-        for shift, (source, ending) in zip((-0.2, 0.0, 0.2), sources.items(), strict=False):
+        axis.bar(places, off, width=0.8, color=VARIANT_COLOURS[2], alpha=0.5, label="measured: mean")
+        look: dict[str, Any] = {"ls": "", "color": VARIANT_COLOURS[6], "lw": 1.2, "capsize": 2.5}
+        axis.errorbar(places - 0.28, off, yerr=spread, label="measured: ± 2 SD", **look)
+        for shift, (source, ending) in zip((-0.08, 0.12, 0.3), sources.items(), strict=False):
             text, mark = MARKS[source]
             there = [k for k, name in enumerate(moved) if name + ending in records]
             ours = [1e3 * (displacement(records[moved[k] + ending])[i] - published[k].target[i]) for k in there]
-            axis.plot(places[there] + shift * (len(sources) > 1), ours, ls="", ms=4, label=text, **mark)
+            axis.plot(places[there] + shift, ours, ls="", ms=4, label=text, **mark)
         axis.axhline(0.0, color="black", lw=0.6)
         axis.margins(y=0.08)
         axis.set_ylabel(f"{_name(i)} [{'mm' if i < 3 else 'mrad'}]")
@@ -119,7 +124,7 @@ def _deviations(records: Mapping[str, Record], sources: Mapping[str, str]) -> Fi
     axes[-1].set_xlabel("coordinate that was moved")
     figure.align_ylabels(axes)
     style.legend_below(figure, [axes[0]], 2)
-    note = "Displacement: mean over the last second minus mean over the first second ([T] V.A)"
+    note = "Displacement: mean over the last second minus mean over the first second (Tanaka et al. 2019, V.A)"
     later = ", in which a head whose pose is fed back still rises from its sag." if len(sources) > 1 else "."
     figure.note(note + later)
     return figure
@@ -131,28 +136,31 @@ def _name(i: int) -> str:
 
 def sag_and_feedback(records: Mapping[str, Record]) -> Figure:
     """Draw Figs 7(a) and 7(b) of [T]: the head while β changes, with feedforward and with a measured head pose."""
-    figure = style.new_figure(7.6, "head while its pitch β changes, as in Fig 7 of [T]")
-    axes = figure.subplots(6, 2, sharex=True, sharey="row")
     shown = {"beta": "(a) feedforward", "beta_measured": "(b) head pose fed back"}
+    drawn, note = moving([records[name] for name in shown])
+    figure = style.new_figure(
+        1.2 * len(drawn) + 1.0, "head while its pitch β changes, as in Fig 7 of Tanaka et al. 2019"
+    )
+    axes = figure.subplots(len(drawn), 2, sharex=True, sharey="row", squeeze=False)
     for column, (name, title) in zip(axes.T, shown.items(), strict=True):
         record = records[name]
-        for i, axis in enumerate(column):
-            axis.plot(record.time, record["w"][:, i], color=GROUND, label="simulated")
-            axis.plot(record.time, record["w_target"][:, i], "--", color=HEAD, lw=1.0, label="target")
-            style.at_least(axis, 0.02)
+        for i, axis in zip(drawn, column, strict=True):
+            axis.plot(record.time, 1e3 * record["w"][:, i], color=GROUND, label="simulated")
+            axis.plot(record.time, 1e3 * record["w_target"][:, i], "--", color=HEAD, lw=1.0, label="target")
         column[0].set_title(title, fontsize=style.letters(8.0))
         column[-1].set_xlabel("time [s]")
-    for i, axis in enumerate(axes[:, 0]):
-        axis.set_ylabel(f"{_name(i)} [{'m' if i < 3 else 'rad'}]")
+    for i, axis in zip(drawn, axes[:, 0], strict=True):
+        axis.set_ylabel(f"{_name(i)} [{'mm' if i < 3 else 'mrad'}]")
     figure.align_ylabels(axes[:, 0])
     style.legend_below(figure, [axes[0, 0]], 2)
+    figure.note(*filter(None, [note]))
     return figure
 
 
 def wheel_loads(records: Mapping[str, Record]) -> Figure:
     """Draw the loads of the wheel pairs over time, for every manoeuvre with feedforward."""
     moved = [name for name in TABLE_III if name in records]
-    columns = 1 if style.narrow() else 2
+    columns = 2
     rows = -(-len(moved) // columns)
     loads = {name: pair_loads(records[name]) for name in moved}
     looks = curve_styles([pair for pair in loads[moved[0]] if any(load[pair].any() for load in loads.values())])
@@ -163,7 +171,7 @@ def wheel_loads(records: Mapping[str, Record]) -> Figure:
         for pair, look in looks.items():
             axis.plot(record.time, loads[name][pair], label=pair, **look)
         axis.set_title(f"moving {SYMBOLS.get(name, name)}", fontsize=style.letters(8.0))
-        axis.set_ylim(bottom=0.0)
+    above_edge(axes[0, 0])
     for axis in axes.ravel()[len(moved) :]:
         axis.set_visible(False)
     for axis in axes[:, 0]:
@@ -183,7 +191,9 @@ def motion(records: Mapping[str, Record]) -> Figure:
         views = [_view_at(record, t) for t in (0.0, 2.0, 7.0, 12.0, 17.0, np.inf)]
         area = record["support_area"]
         lines[label] = [(v, f"{v.time:.0f} s, mode {v.mode}, {area[v.row]:.3f} m²") for v in views]
-    return posture_grid("costs of eq 19 and eq 20, as in Figs 8 and 16 of [T], with the area of support", lines)
+    return posture_grid(
+        "costs of eq 19 and eq 20, as in Figs 8 and 16 of Tanaka et al. 2019, with the area of support", lines
+    )
 
 
 def _view_at(record: Record, time: float) -> View:
@@ -193,7 +203,9 @@ def _view_at(record: Record, time: float) -> View:
 def head_and_cost(record: Record) -> Figure:
     """Draw Fig 9 of [T]: head pose, mode and V over time, and the error stated in the text of [T]."""
     columns = 1 if style.narrow() else 2
-    figure = style.new_figure(9.2 / columns + 2.4, style.title(record, "head, mode and cost, as in Fig 9 of [T]"))
+    figure = style.new_figure(
+        9.2 / columns + 2.4, style.title(record, "head, mode and cost, as in Fig 9 of Tanaka et al. 2019")
+    )
     axes = figure.subplots(8 // columns, columns, sharex=True, squeeze=False)
     *poses, mode, cost = [*axes[:3].T.ravel(), *axes[3]] if columns == 2 else axes.ravel()
     time = record.time
@@ -202,7 +214,11 @@ def head_and_cost(record: Record) -> Figure:
         target = scale * record["w_target"][:, i]
         axis.plot(time, scale * record["w"][:, i], color=GROUND, label="simulated")
         axis.plot(time, target, "--", color=HEAD, lw=1.0, label="target")
-        low, high, label = target - scale * error, target + scale * error, "errors in [T]: about 30 mm, 0.1 rad"
+        low, high, label = (
+            target - scale * error,
+            target + scale * error,
+            "errors in Tanaka et al. 2019: about 30 mm, 0.1 rad",
+        )
         axis.fill_between(time, low, high, color=VARIANT_COLOURS[4], alpha=0.25, lw=0, label=label)
         style.at_least(axis, 4 * scale * error)
         axis.set_ylabel(f"{_name(i)} [{unit}]")
@@ -211,10 +227,10 @@ def head_and_cost(record: Record) -> Figure:
         text = f"below {least:.2g}" if off < least else f"{off:.2g}"
         axis.set_title(f"largest error {text} {unit}", fontsize=style.letters(7.0))
     mode.step(time, record["mode"], where="post", color=GROUND)
-    mode.set(ylabel="mode σ", ylim=(0.5, record["mode"].max() + 0.5))
+    mode.set(ylabel="mode", ylim=(0.5, record["mode"].max() + 0.5))
     mode.set_yticks(np.unique(record["mode"]))
     cost.plot(time, record["cost"], color=GROUND)
-    cost.set_ylabel("cost V")
+    cost.set_ylabel(COST)
     cost.set_ylim(bottom=0.0)
     for axis in axes[-1]:
         axis.set_xlabel("time [s]")
@@ -229,14 +245,16 @@ def joint_angles(record: Record) -> Figure:
     names, count = record.labels["phi"], phi.shape[1]
     columns = 2 if style.narrow() else 3
     lines = -(-count // columns)
-    figure = style.new_figure(1.4 * lines + 0.9, style.title(record, "joint angles, as in Fig 10 of [T]"))
+    figure = style.new_figure(
+        1.4 * lines + 0.9, style.title(record, "joint angles, as in Fig 10 of Tanaka et al. 2019")
+    )
     axes = figure.subplots(lines, columns, sharex=True)
     for axis in axes.ravel()[count:]:
         axis.set_visible(False)
     for j, axis in enumerate(axes.ravel()[:count]):
         axis.plot(record.time, phi[:, j], color=GROUND, label="simulated")
         for bound in (geometry.lower[j], geometry.upper[j]):
-            axis.axhline(bound, color="black", ls="-.", lw=0.8, label="joint limit")
+            axis.axhline(bound, label="joint limit", **LIMIT)
         out, label = record["at_limit"][:, j] > 0, "excluded from allocation at its limit"
         axis.plot(record.time[out], phi[out, j], ".", color=HEAD, ms=3, label=label)
         if "phi_command" in record:
@@ -255,7 +273,7 @@ def policies(records: Mapping[str, Record]) -> Figure:
     axes = figure.subplots(6, 1, sharex=True, height_ratios=[1, 1, 1, 1.2, 1, 1])
     for axis, name in zip(axes, POLICIES, strict=False):
         mode_chart(axis, records[name], f"{name}: mode")
-    shown = {f"{name}, V at the end {records[name]['cost'][-1]:.2f}": records[name] for name in POLICIES}
+    shown = {f"{name}, cost at the end {records[name]['cost'][-1]:.2f}": records[name] for name in POLICIES}
     overlay_margins(axes[3:], shown, style.variant_styles(list(shown)))
     axes[5].set_xlabel("time [s]")
     figure.align_ylabels(axes)
@@ -282,7 +300,7 @@ def door(record: Record) -> Figure:
             view = View(record, max(view.row - 1, 0))  # the sample before the change that ends the stop
         opened = opening(record)[view.row]
         titled.append((view, f"({'abcdefghijklmnop'[k]}) {caption}\n{view.time:.1f} s, {opened:.1f}°"))
-    title = style.title(record, "the door and its angle, as in Fig 14 of [T]")
+    title = style.title(record, "the door and its angle, as in Fig 14 of Tanaka et al. 2019")
     return posture_grid(title, {"": titled})
 
 
@@ -292,5 +310,5 @@ def picking_up(record: Record) -> Figure:
     height = record["w"][closed, 2]
     lifted = closed[np.argmax(height > height.max() - 1e-4)]  # the first time; later ones differ only by rounding
     shown = ((closed[0] // 2, "1: reaching"), (closed[0], "2: grasping"), (lifted, "3: after picking up"))
-    line = [(View(record, int(row)), f"{caption}, t = {record.time[row]:.1f} s") for row, caption in shown]
-    return posture_grid(style.title(record, "picking up, as in Fig 13 of [T]"), {"": line}, side=True)
+    line = [(View(record, int(row)), f"{caption}, {record.time[row]:.1f} s") for row, caption in shown]
+    return posture_grid(style.title(record, "picking up, as in Fig 13 of Tanaka et al. 2019"), {"": line}, side=True)
