@@ -90,7 +90,7 @@ SizeOption = Annotated[
     str | None, option("WxH", "Width, or width and height, of the figures: 3.4, 3.4x2.4 [inch] or 86mm.")
 ]
 FontOption = Annotated[
-    str | None, option("FONT", "Size of the letters [point], a font family, or both, e.g. 8 or 'serif 8'.")
+    str | None, option("FONT", "Size of the labels [point], a font family, or both, e.g. 8 or 'serif 8'.")
 ]
 StyleOption = Annotated[
     str | None, option("SHEETS", "Matplotlib style sheets of the figures: files or names, comma-separated.")
@@ -104,7 +104,9 @@ PanelsOption = Annotated[
     ),
 ]
 NoTitleOption = Annotated[bool, typer.Option("--no-title", help="Omit the titles of the figures.")]
-NoCaptionOption = Annotated[bool, typer.Option("--no-caption", help="Omit the notes below the axes of the figures.")]
+NoCaptionOption = Annotated[
+    bool, typer.Option("--no-caption", help="Omit the notes below the axes; captions.txt has them.")
+]
 FormatOption = Annotated[FigureFormat, typer.Option("--format", help="File format of the figures.")]
 
 

@@ -56,7 +56,7 @@ from dynsim.cli.output import (
     print_warning,
     print_written,
     progress,
-    show_compilation,
+    status,
 )
 from dynsim.cli.plan import EXAMPLE as PLAN_EXAMPLE
 from dynsim.cli.plan import plan
@@ -236,7 +236,6 @@ def check(
     a start posture.
     """
     from dynsim.engine import check as check_scenario
-    from dynsim.engine.compilation import watched
     from dynsim.scenario import load_scenario, variant_names
 
     failed = False
@@ -247,7 +246,7 @@ def check(
             variants: Sequence[str | None] = variant_names(name) or [None]
             for variant in variants:
                 task = f"checking {escaped(name)} {escaped(variant or '')}"
-                with console.status(task) as status, watched(partial(show_compilation, status, task)):
+                with status(task):
                     loaded = load_scenario(name, variant, parsed_overrides(overrides))
                     loadable.append(loaded)
                     # Stored early, so that the start is printed even if a later check fails.

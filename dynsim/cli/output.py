@@ -13,7 +13,6 @@ from dynsim.system.terminal import Terminal, escaped, escaped_problem
 
 if TYPE_CHECKING:
     from rich.progress import Progress, ProgressColumn, TaskID
-    from rich.status import Status
 
     from dynsim.engine.compilation import Compilation
     from dynsim.scenario import Scenario
@@ -74,9 +73,16 @@ def _bars(*columns: str | ProgressColumn, quiet: bool, kept: bool = True) -> Pro
     )
 
 
-def show_compilation(status: Status, task: str, now: Compilation | None) -> None:
-    """Show in the status line which kernels are being compiled."""
-    status.update(task if now is None else f"{task}: {escaped(now.text)}, {now.elapsed:.0f} s")
+@contextmanager
+def status(task: str) -> Iterator[None]:
+    """Show a status line for the block, and print the first compilation of kernels."""
+    with console.status(task) as line:
+
+        def compiling(now: Compilation | None) -> None:
+            line.update(task if now is None else f"{task}: compiling, {now.elapsed:.0f} s")
+
+        with _compilation_shown(False, compiling):
+            yield
 
 
 @contextmanager

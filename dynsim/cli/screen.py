@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cache
+from textwrap import wrap
 from typing import Any
 
 from rich import box
@@ -55,6 +56,13 @@ def new_table(title: object, **options: Any) -> Table:
     return Table(title=escaped_line(title), title_justify="left", **{"box": box.SIMPLE_HEAD, **options})
 
 
+def _wide(heading: str, least: int, high: int) -> int:
+    """Return the width with which a heading has at most ``high`` lines, at least ``least``."""
+    text = Text.from_markup(heading).plain
+    widths = range(least, len(text))
+    return next((w for w in widths if len(wrap(text, w, break_on_hyphens=False)) <= high), max(least, len(text)))
+
+
 def listing(console: Console, title: object, columns: Sequence[tuple[str, Sequence[str]]], height: int) -> Table:
     """Return a table of the first columns that fit into the width of the screen, and the first rows that fit.
 
@@ -71,19 +79,23 @@ def listing(console: Console, title: object, columns: Sequence[tuple[str, Sequen
     """
     count = len(columns[0][1])
     table = new_table(title)
-    shown: list[Sequence[str]] = []
+    shown: list[tuple[str, Sequence[str], int]] = []
     left = size(console)[0] - EDGES + PADDING
     for k, (heading, cells) in enumerate(columns):
         names = [f"… and {count} more"] if k == 0 else []
         width = max(map(cell_width, [*names, *cells, *heading.split()]))
         if k == 0 or width + PADDING <= left:
             left -= width + PADDING
-            shown.append(cells)
-            table.add_column(heading, justify="right" if k else "left", width=width)
+            shown.append((heading, cells, width))
+    # Headings have as few lines as the width allows.
+    most = max(cell_width(heading) for heading, _, _ in shown)
+    high = next(n for n in range(1, most + 1) if sum(_wide(h, w, n) - w for h, _, w in shown) <= left or n == most)
+    for k, (heading, _, width) in enumerate(shown):
+        table.add_column(heading, justify="right" if k else "left", width=_wide(heading, width, high))
     room = height - lines(console, [table])
     fitting = count if count <= room else max(room - 1, 1)
     for k in range(fitting):
-        table.add_row(*(cells[k] for cells in shown))
+        table.add_row(*(cells[k] for _, cells, _ in shown))
     if fitting < count:
         table.add_row(f"… and {count - fitting} more")
     return table

@@ -714,8 +714,14 @@ RUN_FILES = ("record.h5", "summary.json", "scenario.yaml")
 # Files that are made from records and can be regenerated.
 FIGURE_FORMATS = ("png", "pdf", "svg")
 VIEW = "view.html"
-FIGURES = (*(f"figures/*.{kind}" for kind in FIGURE_FORMATS), "figures/animation.gif", VIEW)
-COMPARISON_FILES = ("comparison.json", "comparison.csv", *(f"compare_*.{kind}" for kind in FIGURE_FORMATS), VIEW)
+FIGURES = (*(f"figures/*.{kind}" for kind in FIGURE_FORMATS), "figures/animation.gif", "figures/captions.txt", VIEW)
+COMPARISON_FILES = (
+    "comparison.json",
+    "comparison.csv",
+    "captions.txt",
+    *(f"compare_*.{kind}" for kind in FIGURE_FORMATS),
+    VIEW,
+)
 
 
 def save_run(record: Record, folder: Path) -> None:

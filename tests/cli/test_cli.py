@@ -237,12 +237,12 @@ def test_figures_in_another_format_replace_those_of_the_run_before(tmp_path: Pat
     assert dynsim(*arguments, folder=tmp_path).returncode == 0
     figures = tmp_path / "out" / "figures"
     names = {"hand_path", "energy_ledger", "posture"}
-    assert {path.name for path in figures.iterdir()} == {f"{name}.png" for name in names}
+    assert {path.name for path in figures.iterdir()} == {"captions.txt", *(f"{name}.png" for name in names)}
     assert dynsim(*arguments, "--format", "svg", folder=tmp_path).returncode == 0
-    assert {path.name for path in figures.iterdir()} == {f"{name}.svg" for name in names}
+    assert {path.name for path in figures.iterdir()} == {"captions.txt", *(f"{name}.svg" for name in names)}
     result = dynsim("plot", "out/record.h5", "--format", "pdf", "--out", "pdf", folder=tmp_path)
     assert result.returncode == 0, result.stderr
-    assert {path.name for path in (tmp_path / "pdf").iterdir()} == {f"{name}.pdf" for name in names}
+    assert {path.name for path in (tmp_path / "pdf").iterdir()} == {"captions.txt", *(f"{name}.pdf" for name in names)}
     assert dynsim("plot", "out/record.h5", "--format", "gif", folder=tmp_path).returncode == 2
 
 

@@ -49,7 +49,7 @@ def test_a_plan_leaves_its_files_and_a_scenario_that_runs(small: Path, tmp_path:
     record = load_scenario(out / "plan.yaml").duration_s
     assert record == 10.0
     names = {path.name for path in (out / "figures").iterdir()}
-    assert names == {"plan_posture.png", "plan_heat.png", "plan_single_braces.png"}
+    assert names == {"plan_posture.png", "plan_heat.png", "plan_single_braces.png", "captions.txt"}
     assert (out / "view.html").stat().st_size > 1000
     assert (out / "plan_table.csv").read_text(encoding="utf-8").startswith("count,braces,heat_W")
 

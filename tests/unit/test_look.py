@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -10,12 +11,13 @@ import matplotlib
 import pytest
 from cycler import cycler
 from matplotlib.legend import Legend
+from PIL import Image
 from support.layout import layout_faults
 from support.messages import lines_with, raises
 
 import dynsim
 from dynsim.cli import main
-from dynsim.draw.figures import style
+from dynsim.draw.figures import draw, style
 from dynsim.draw.figures.look import Look
 from dynsim.draw.figures.style import POINTS, WIDTH, Drawing
 from dynsim.errors import RecordError
@@ -142,8 +144,27 @@ def test_caption_names_subject_run_and_axes(record: Record) -> None:
     assert drawn(record).caption.splitlines()[0] == (
         "Tracking error (elbow comparison / two_elbows): hand − target [mm], distance from target [mm] over time [s]."
     )
-    path = drawn(record, "hand_path", title=False).caption
+    path = drawn(record, "hand_path", title=False).caption.splitlines()[0]
     assert path == "Hand path (elbow comparison / two_elbows): y [m], z [m] over x [m]; z [m] over y [m]."
+
+
+def test_caption_describes_lines_and_logarithmic_axes(record: Record) -> None:
+    caption = drawn({"one": record, "two": record}, "compare_tracking_error").caption
+    assert re.search(r"one: [^;]* \(blue, solid\); two: [^;]* \(green, dashed\)", caption)
+    figure = drawn(record)
+    assert "Logarithmic axes" not in figure.caption
+    for axes in figure.axes[2:]:
+        axes.set_yscale("log")
+    assert "Logarithmic axes: distance from target." in figure.caption
+
+
+def test_style_sheet_sets_the_resolution_of_files(record: Record, tmp_path: Path) -> None:
+    sheet = tmp_path / "fine.mplstyle"
+    sheet.write_text("savefig.dpi: 300\n")
+    (fine,) = draw(record, tmp_path / "fine", look=Look.of(3.4, style=sheet, panels="distance"))
+    (usual,) = draw(record, tmp_path / "usual", look=Look.of(3.4, panels="distance"))
+    with Image.open(fine) as large, Image.open(usual) as small:
+        assert (large.width, small.width) == (1020, 578)
 
 
 @pytest.mark.parametrize(

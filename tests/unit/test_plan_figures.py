@@ -44,7 +44,7 @@ def names_of(axes: Axes) -> list[str]:
 @pytest.mark.parametrize(("aside", "views"), [(0.0, 1), (0.3, 2)])
 def test_an_arm_that_leaves_its_plane_is_drawn_from_above_too(aside: float, views: int) -> None:
     figure = figure_of(picture(aside))
-    assert [axes.get_ylabel() for axes in figure.axes] == ["height [m]", "left [m]"][:views]
+    assert [axes.get_ylabel() for axes in figure.axes] == ["height [m]", "to the left [m]"][:views]
     for axes in figure.axes:
         assert [text.get_text() for text in axes.texts if text.get_text()] == ["1"]
     assert "elbow on floor: 4.0 N" in names_of(figure.axes[0])

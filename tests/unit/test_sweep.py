@@ -498,7 +498,9 @@ ROWS: list[dict[str, Any]] = [
 )
 def test_figures_by_what_was_varied(tmp_path: Path, grid: list[str], sampled: list[str], files: set[str]):
     drawn = pictures.draw(pictures.Sweep("test", ROWS, grid, sampled), tmp_path)
-    assert {path.stem for path in drawn} == {path.stem for path in tmp_path.iterdir()} == files
+    assert {path.stem for path in drawn} == {path.stem for path in tmp_path.glob("*.png")} == files
+    captions = (tmp_path / "captions.txt").read_text("utf-8").split("\n\n")
+    assert {caption.partition("\n")[0] for caption in captions} == files
 
 
 @pytest.mark.parametrize(
@@ -603,15 +605,25 @@ def test_runs_at_the_same_place_do_not_hide_each_other():
     assert all(len(dots.get_facecolors()) for dots in best)
 
 
-def test_variants_differ_in_their_markers_and_the_best_runs_have_their_numbers():
+def test_variants_differ_in_their_markers_and_the_best_runs_are_described():
     rows = [row | {"run": k} for k, row in enumerate(ROWS)]
     figure = pictures.pareto(pictures.Sweep("test", rows, ["a", "b"], ["mass"]))
     assert figure is not None
     axes = figure.axes[0]
     first, second = (dots.get_paths()[0].vertices for dots in axes.collections[::2])
     assert first.shape != second.shape
-    # The lightest of the first place, of either variant, is the least in both.
-    assert [text.get_text() for text in axes.texts] == ["0"]
+    # The lightest of the first place, of either variant, is the least in both; it needs no number.
+    assert not axes.texts
+    run = rows[0]
+    assert mentions(
+        figure.caption, f"Best run ({run['variant']}, a\u00a0=\u00a0{run['a']:g}, b\u00a0=\u00a0{run['b']})"
+    )
+    # A run with less energy and a larger error is on the front as well.
+    other = rows[-1] | {"electrical_energy_J": 0.5 * run["electrical_energy_J"], "run": 99}
+    figure = pictures.pareto(pictures.Sweep("test", [*rows, other], ["a", "b"], ["mass"]))
+    assert figure is not None
+    assert {text.get_text() for text in figure.axes[0].texts} == {"0", "99"}
+    assert mentions(figure.caption, f"99: {other['variant']}, a\u00a0=\u00a0{other['a']:g}")
 
 
 @pytest.mark.parametrize(("status", "text"), [("ok", "number does not exist"), ("failed", "no run succeeded")])
@@ -685,11 +697,35 @@ def test_markers_of_lines_are_not_cut_by_the_frame():
         assert not any(line.get_clip_on() for line in axes.lines)
 
 
-def test_axis_of_lines_has_all_values_even_if_runs_failed():
-    rows = [*ROWS, {"variant": "one", "a": 5.0, "b": "x", "mass": 1.0, "status": "failed"}]
-    figure = pictures.lines(pictures.Sweep("test", rows, ["a"], ["mass"]))
+def test_lines_mark_failures_on_the_axis_and_omit_values_without_success():
+    at = float(ROWS[0]["a"])
+    rows = [row for row in ROWS if row["variant"] != "one" or row["a"] != at]
+    rows += [{"variant": "one", "a": value, "b": "x", "mass": 1.0, "status": "failed"} for value in (at, 5.0)]
+    rows.append({"variant": "two", "a": 5.0, "b": "x", "mass": 1.0, "status": "failed"})
+    figure = pictures.lines(pictures.Sweep("test", rows, ["a"], []))
     assert figure is not None
-    assert all(axes.get_xlim()[1] > 5.0 for axes in figure.axes)
+    for axes in figure.axes:
+        (crosses,) = (line for line in axes.lines if line.get_marker() == "x")
+        assert list(crosses.get_xdata()) == [at]
+        assert axes.get_xlim()[1] < 5.0
+    assert mentions(figure.caption, f"No run succeeded: one at {at:g}, 5; two at 5.")
+
+
+def test_words_are_rows_of_the_lines():
+    figure = pictures.lines(pictures.Sweep("test", ROWS, ["b"], []))
+    assert figure is not None
+    labels = [[label.get_text() for label in axes.get_yticklabels()] for axes in figure.axes]
+    assert labels[0] == [f"b {word}" for word in dict.fromkeys(row["b"] for row in ROWS)]
+    means = {line.get_label(): line.get_xdata() for line in figure.axes[0].lines}
+    first = [row["electrical_energy_J"] for row in ROWS if row["variant"] == "one" and row["b"] == ROWS[0]["b"]]
+    assert means["one"][0] == pytest.approx(np.mean(first))
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"), [("3.632e-11", "3.632 × 10⁻¹¹"), ("1.2e+12", "1.2 × 10¹²"), ("-0.5", "−0.5")]
+)
+def test_exponents_are_powers_of_ten(text: str, shown: str):
+    assert pictures._powers(text) == shown
 
 
 def test_colour_bars_stand_below_their_column():

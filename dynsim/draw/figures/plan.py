@@ -149,7 +149,7 @@ def posture(picture: PlanPicture) -> Figure | None:
     figure = style.new_figure(height, f"{picture.title}: {subject}")
     views = figure.subplots(len(shapes), 1, squeeze=False, sharex=True, height_ratios=shapes)[:, 0]
     surfaces = (picture.ground, picture.tops)
-    for axes, row, name, solid in zip(views, (2, 1), ("height [m]", "left [m]"), surfaces, strict=False):
+    for axes, row, name, solid in zip(views, (2, 1), ("height [m]", "to the left [m]"), surfaces, strict=False):
         seen = [0, row]
         # A surface that is everywhere, such as a floor from above, is not drawn.
         if solid is not None and solid[2].min() < 0.0 < solid[2].max():

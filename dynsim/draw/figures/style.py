@@ -60,6 +60,13 @@ DEEP = "#882255"
 VARIANT_COLOURS = (BLUE, GREEN, ORANGE, PURPLE, SKY, BLACK, "#8C6D31")
 # Line styles of variants, in addition to colours, or of variants that share a colour.
 DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (5, 1, 1, 1)), (0, (1, 1)), (0, (8, 3)), (0, (3, 1, 1, 1, 1, 1)))
+# Names of colours, line styles and markers in captions.
+_COLOUR_NAMES = {
+    BLUE: "blue", ORANGE: "orange", GREEN: "green", PURPLE: "pink", SKY: "light blue", BLACK: "black",
+    "#8c6d31": "brown", GREY: "grey", PULLING: "red", DEEP: "dark red",
+}  # fmt: skip
+_DASH_NAMES = ("solid", "dashed", "dash-dotted", "dotted", "long dashes", "dash-dot-dotted")
+_MARKER_NAMES = {"o": "circle", "s": "square", "D": "diamond", "^": "triangle", "v": "triangle down", "x": "cross"}
 AXIS_COLOURS = {"x": BLUE, "y": GREEN, "z": ORANGE}
 
 # Width of a figure on a page [inch]; in a figure below NARROW, which fits a column of a paper, panels are below each
@@ -90,6 +97,8 @@ _UNLISTED = re.compile(rf"_(nolegend_|child\d+|container\d+)|{UNLISTED}.*")
 # Mean width of a letter as a multiple of its size, for the breaking of long lines.
 LETTER = 0.56
 DPI = 170
+# File with the captions of the figures in its folder.
+CAPTIONS = "captions.txt"
 _LOOK: Any = {
     "lines.linewidth": 1.2,
     "lines.solid_capstyle": "round",
@@ -312,7 +321,7 @@ class Drawing(Figure):
 
     @property
     def caption(self) -> str:
-        """Caption for a paper, one sentence per line: subject and axes of the figure, then the notes."""
+        """Caption for a paper, one sentence per line: subject and axes of the figure, its legend, then the notes."""
         scenario, colon, subject = self.subject.partition(": ")
         panels: dict[str, list[str]] = {}
         for axes in filter(Axes.get_visible, self.axes):
@@ -329,7 +338,24 @@ class Drawing(Figure):
         parts = [" over ".join(filter(None, [", ".join(up), across])) for across, up in panels.items()]
         subject = f"{subject} ({scenario})" if colon else self.subject
         sentence = ": ".join(filter(None, [subject, "; ".join(filter(None, parts))]))
-        return "\n".join(filter(None, [sentence and f"{sentence[0].upper()}{sentence[1:]}.", self.notes]))
+        entries = "; ".join(f"{_words(label)}{_described(handle)}" for label, handle in self.legend_entries())
+        log = [up for axes in self.axes if axes.get_yscale() == "log" and (up := _quantity(axes.get_ylabel()))]
+        log += [over for axes in self.axes if axes.get_xscale() == "log" and (over := _quantity(axes.get_xlabel()))]
+        parts = [
+            sentence and f"{sentence[0].upper()}{sentence[1:]}.",
+            entries and f"Lines and marks: {entries}.",
+            f"Logarithmic axes: {', '.join(dict.fromkeys(log))}." if log else "",
+            self.notes,
+        ]
+        return "\n".join(filter(None, parts))
+
+    def legend_entries(self) -> list[tuple[str, Any]]:
+        """Return label and handle of the entries of the legends of the figure and its axes, each label once."""
+        entries = dict(self._entries)
+        for legend in filter(None, (axes.get_legend() for axes in self.axes)):
+            texts = (" ".join(text.get_text().split()) for text in legend.get_texts())
+            entries |= dict(zip(texts, legend.legend_handles, strict=True))
+        return list(entries.items())
 
     def entitle(self, title: str) -> None:
         """Set the subject, and the title above the panels if the look has titles."""
@@ -377,9 +403,7 @@ class Drawing(Figure):
         before = {axes: _room(axes) for axes in kept}
         entries = dict(self._entries)
         if not any(axes.get_legend() for axes in kept):
-            for legend in filter(None, (axes.get_legend() for axes in self.axes)):
-                texts = (text.get_text().replace("\n", " ") for text in legend.get_texts())
-                entries |= dict(zip(texts, legend.legend_handles, strict=True))
+            entries = dict(self.legend_entries())
         if self._below is not None:
             self._below.remove()
         self.grow(legend_row() * (1 - self._rows))
@@ -476,6 +500,28 @@ def _words(label: str) -> str:
     return " ".join(label.split())
 
 
+def _quantity(label: str) -> str:
+    """Return a label of an axis in one line, without its unit."""
+    return _words(label).partition(" [")[0]
+
+
+def _described(handle: Any) -> str:
+    """Return colour and line style, or marker, of an entry of a legend, in brackets; "" if they have no names."""
+    handle = next(iter(getattr(handle, "patches", ())), handle)
+    if not isinstance(handle, Line2D | Patch):
+        return ""
+    colour = handle.get_color() if isinstance(handle, Line2D) else handle.get_facecolor()
+    words = [next((name for code, name in _COLOUR_NAMES.items() if to_hex(colour) == code.lower()), "")]
+    if isinstance(handle, Line2D) and handle.get_linestyle() == "None":
+        words.append(_MARKER_NAMES.get(str(handle.get_marker()), ""))
+    elif isinstance(handle, Line2D):
+        pattern = vars(handle)["_unscaled_dash_pattern"]
+        styles = {vars(Line2D([], [], linestyle=dash))["_unscaled_dash_pattern"]: k for k, dash in enumerate(DASHES)}
+        words.append(_DASH_NAMES[styles[pattern]] if pattern in styles else "dashed")
+    text = ", ".join(filter(None, words))
+    return f" ({text})" if text else ""
+
+
 def _lines(text: str) -> int:
     return text.count("\n") + 1 if text else 0
 
@@ -496,7 +542,8 @@ def new_figure(height: float, title: str, *, page: float = WIDTH) -> Drawing:
     wanted = _drawn.get() or Look()
     wide = width() if wanted.width is not None or _has_own_size() else page
     own = float(matplotlib.rcParams["figure.figsize"][1]) if _has_own_size() and wanted.width is None else 0.0
-    figure = Drawing(figsize=(wide, wanted.height or max(own, height)), layout="constrained")
+    dots: Any = matplotlib.rcParams["savefig.dpi"] if _changed(["savefig.dpi"]) else None
+    figure = Drawing(figsize=(wide, wanted.height or max(own, height)), layout="constrained", dpi=dots)
     figure.grows = wanted.height is None
     figure.needed = height
     FigureCanvasAgg(figure)
@@ -529,7 +576,8 @@ def save(figure: Figure, path: Path) -> Path:
         If the file cannot be written; an existing file is then unchanged.
     """
     literal(figure)
-    figure.set_dpi(DPI)
+    if not _changed(["savefig.dpi"]):
+        figure.set_dpi(DPI)
     kind = path.suffix.removeprefix(".")
     with _settings, replacing(path) as stream, matplotlib.rc_context({"svg.hashsalt": path.stem}):
         if kind == "png":
@@ -542,10 +590,17 @@ def save(figure: Figure, path: Path) -> Path:
 
 
 def save_all(makers: Mapping[str, Callable[[T], Figure | None]], of: T, folder: Path, kind: str) -> list[Path]:
-    """Draw and save every figure for which the record or records have data; return the files."""
+    """Draw and save every figure for which there are data, and write their captions; return the files of figures."""
     with look():
         drawn = ((name, figure) for name, make in makers.items() if (figure := make(of)) is not None)
-        return [save(figure, folder / f"{name}.{kind}") for name, figure in with_panels(drawn)]
+        files, captions = [], []
+        for name, figure in with_panels(drawn):
+            files.append(save(figure, folder / f"{name}.{kind}"))
+            captions.append(f"{name}\n{getattr(figure, 'caption', '')}\n")
+        if captions:
+            with replacing(folder / CAPTIONS) as stream:
+                stream.write("\n".join(captions).encode())
+        return files
 
 
 def wanted_panels() -> tuple[str, ...]:

@@ -45,10 +45,12 @@ _MARKERS, _NUMBERED, _DIGITS = "osD^vP*X", 12, 7.0
 _STEPS = (1, 2, 2.5, 5, 10)
 # Marks in the cells of a map that have no colour.
 _MISSING = {"x": "no run succeeded", "_": "number does not exist"}
+# Letters of exponents.
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 # Values farther beyond the middle 80 % than this multiple of their range are beyond the axis.
 _FAR = 30.0
-# Minimum number of rows and columns of a map with contours.
-_SMOOTH = 5
+# Height of a row of words [inch]; part of the axis below which intervals and bars are too short to be seen.
+_WORDS, _SHORT = 0.4, 0.02
 # Maximum number of rows of a map whose cells contain numbers, and minimum size of these numbers [point].
 _CELLS, _LEAST = 12, 5.0
 
@@ -142,17 +144,24 @@ def draw(sweep: Sweep, folder: Path, kind: str = "png", look: Look | None = None
 
 
 def lines(sweep: Sweep) -> Figure | None:
-    """Draw energy and error over the grid if it has a single key; return None if it has no or several keys."""
+    """Draw energy and error over the grid if it has a single key; return None if it has no or several keys.
+
+    Values that are words are rows. Crosses on the axis mark values at which a variant has no successful run.
+    """
     if len(sweep.grid) != 1:
         return None
     (key,) = sweep.grid
+    levels = _levels(sweep.rows, key)
+    if not _numeric(levels):
+        return _words(sweep, key, levels)
     styles, metrics, varied = sweep.looks, sweep.metrics, sweep.varied(key)
     figure = sweep.figure(_PANEL * len(metrics) + _ROOM, f"effect of the {varied.name}")
     panels = figure.subplots(len(metrics), 1, sharex=True, squeeze=False)[:, 0]
-    levels = _levels(sweep.rows, key)
-    numeric = _numeric(levels)
-    at = varied.scale * np.array(levels, dtype=float) if numeric else np.arange(float(len(levels)))
-    shaded = False
+    at = varied.scale * np.array(levels, dtype=float)
+    shaded, good = False, _succeeded(sweep, key, levels)
+    inside = at[np.any(list(good.values()), axis=0)]
+    if not len(inside):
+        return None
     for axes, (metric, drawn) in zip(panels, metrics.items(), strict=True):
         for k, variant in enumerate(sweep.variants):
             # Hollow markers of decreasing size show curves that coincide.
@@ -160,38 +169,83 @@ def lines(sweep: Sweep) -> Figure | None:
                 "color": styles[variant]["color"], "linewidth": 1.0, "marker": _MARKERS[k % len(_MARKERS)],
                 "markersize": 3.5 + 2.5 * 0.5**k, "markerfacecolor": "none", "clip_on": False,
             }  # fmt: skip
-            if not numeric:
-                # Nothing is between two words.
-                look["linestyle"] = "none"
             groups = [_values(_at(sweep.of(variant), {key: level}), metric) * drawn.scale for level in levels]
             means = np.array([group.mean() if len(group) else np.nan for group in groups])
             if np.isfinite(means).any():
                 axes.plot(at, means, label=variant or None, **look)
-            if numeric and any(len(group) > 1 for group in groups):
+            if any(len(group) > 1 for group in groups):
                 limits = np.array(
                     [np.quantile(group, [0.025, 0.975]) if len(group) else (np.nan,) * 2 for group in groups]
                 )
                 axes.fill_between(at, *limits.T, color=look["color"], alpha=0.15, linewidth=0)
                 shaded = True
         axes.set_ylabel(style.broken(drawn.label, _PANEL))
-        # Markers are not on the axes; words are in the middle of their columns.
-        axes.dataLim.update_from_data_x(at, ignore=False)  # runs at the ends may have failed
-        axes.margins(x=0.02 if numeric else 0.5 / len(levels))
+        axes.margins(x=0.02)
         _scale(axes, "y", drawn.scale * _values(sweep.rows, metric))
         _clip(figure, axes, drawn, drawn.scale * _values(sweep.rows, metric))
     figure.align_ylabels(panels)
+    bad = [value for value, *fine in zip(at, *good.values(), strict=True) if not all(fine) and value in inside]
+    for axes in panels if bad else ():
+        look = {"transform": axes.get_xaxis_transform(), "color": style.BLACK, "clip_on": False, "zorder": 5}
+        axes.plot(bad, np.zeros(len(bad)), "x", markersize=5.0, label="variants without a successful run", **look)
     panels[-1].set_xlabel(style.broken(_label(varied)))
-    if not numeric:
-        panels[-1].set_xticks(at, [style.broken(str(level), 0.8 * style.width() / len(levels)) for level in levels])
-    elif _is_geometric(at):
+    if _is_geometric(at):
         style.log_axis(panels[-1], "x")
     elif style.narrow():
         panels[-1].xaxis.set_major_locator(MaxNLocator(5, steps=_STEPS))
-    if len(sweep.variants) > 1:
+    if len(sweep.variants) > 1 or bad:
         style.legend_below(figure, list(panels), 4)
     if shaded:
         figure.note(f"Lines: means over {_listed(sweep, sweep.sampled)}; shaded: 95 % of the runs.")
+    _note_failures(figure, sweep, key, good)
     return figure
+
+
+def _words(sweep: Sweep, key: str, levels: Sequence[Any]) -> Figure:
+    """Draw energy and error at values that are words or truth values, which are the rows of the panels."""
+    metrics, name = sweep.metrics, sweep.varied(key).name
+    grid = _Grid([1] * len(metrics), _ACROSS)
+    height = (_WORDS * len(levels) + _ROOM) * grid.rows
+    figure = sweep.figure(height, f"effect of the {name}")
+    panels = [row[0] for row in grid.subplots(figure)]
+    for m, (axes, (metric, drawn)) in enumerate(zip(panels, metrics.items(), strict=True)):
+        for k, variant in enumerate(sweep.variants):
+            groups = [_values(_at(sweep.of(variant), {key: level}), metric) * drawn.scale for level in levels]
+            means = [group.mean() if len(group) else np.nan for group in groups]
+            look = {"color": sweep.looks[variant]["color"], "markersize": 3.5 + 2.5 * 0.5**k}
+            if np.isfinite(means).any():
+                axes.plot(
+                    means, range(len(levels)), _MARKERS[k % len(_MARKERS)],
+                    markerfacecolor="none", label=variant or None, **look,
+                )  # fmt: skip
+        axes.set(ylim=(len(levels) - 0.5, -0.5), xlabel=style.broken(drawn.label, 0.8 * grid.width))
+        axes.set_yticks(range(len(levels)), [f"{name.split()[-1]} {level}" for level in levels])
+        axes.tick_params(labelleft=m % grid.beside == 0)
+        axes.margins(x=0.05)
+        _scale(axes, "x", drawn.scale * _values(sweep.rows, metric))
+    if len(sweep.variants) > 1:
+        style.legend_below(figure, panels, 4)
+    _note_failures(figure, sweep, key, _succeeded(sweep, key, levels))
+    return figure
+
+
+def _succeeded(sweep: Sweep, key: str, levels: Sequence[Any]) -> dict[str, list[bool]]:
+    """Return for each variant at which values of a key not all runs failed."""
+    return {v: [not all(map(_failed, _at(sweep.of(v), {key: level}))) for level in levels] for v in sweep.variants}
+
+
+def _note_failures(figure: style.Drawing, sweep: Sweep, key: str, good: Mapping[str, Sequence[bool]]) -> None:
+    """Note at which values of a key no run of a variant succeeded; variants with equal values share a sentence."""
+    groups: dict[str, list[str]] = {}
+    levels = _levels(sweep.rows, key)
+    for variant, fine in good.items():
+        bad = [level for level, well in zip(levels, fine, strict=True) if not well]
+        values = ", ".join(sweep.value(key, level).partition(" = ")[2] for level in bad)
+        if bad:
+            groups.setdefault(values if len(bad) <= _FEW else f"{len(bad)} of {len(levels)} values", []).append(variant)
+    parts = [f"{', '.join(filter(None, variants))} at {values}".strip() for values, variants in groups.items()]
+    if parts:
+        figure.note(f"No run succeeded: {'; '.join(parts)}.")
 
 
 def heat_map(sweep: Sweep) -> Figure | None:
@@ -199,10 +253,10 @@ def heat_map(sweep: Sweep) -> Figure | None:
     if len(sweep.grid) < 2:
         return None
     x, y = sweep.grid[:2]
-    metrics = sweep.metrics
+    metrics, able = sweep.metrics, [v for v in sweep.variants if not all(map(_failed, sweep.of(v)))]
     # A variant without a contact, for example, lacks the force of this contact.
     variants = {
-        metric: [v for v in sweep.variants if any(_failed(r) or r.get(metric) is not None for r in sweep.of(v))][:_MAPS]
+        metric: [v for v in sweep.variants if any(row.get(metric) is not None for row in sweep.of(v))][:_MAPS]
         for metric in metrics
     }
     xs, ys = _levels(sweep.rows, x), _levels(sweep.rows, y)
@@ -211,7 +265,6 @@ def heat_map(sweep: Sweep) -> Figure | None:
     height = panel * grid.rows + _ROOM + _COLOURS * len(grid.bands)
     figure = sweep.figure(height, f"effect of the {sweep.varied(x).name} and the {sweep.varied(y).name}")
     panels = grid.subplots(figure)
-    contours = False
     for m, (row, (metric, drawn)) in enumerate(zip(panels, metrics.items(), strict=True)):
         tables = np.full((len(variants[metric]), len(ys), len(xs)), np.nan)
         failed = np.zeros(tables.shape, dtype=bool)
@@ -256,19 +309,13 @@ def heat_map(sweep: Sweep) -> Figure | None:
             style.log_axis(bar.ax, "x")
             if high > 200.0 * low or ticks < 4:
                 subs = (1.0,) if high > 200.0 * low else (1.0, 3.0)
-                bar.ax.xaxis.set_major_locator(LogLocator(subs=subs, numticks=max(ticks, 4)))
-        if not written and min(tables.shape[1:]) >= _SMOOTH and high > low:
-            levels = [tick for tick in bar.ax.get_xticks() if low < tick < high]
-            for axes, table in zip(row, tables, strict=False):
-                axes.contour(table, levels=levels, colors="white", linewidths=0.7)
-            contours = True
-        missing = [v for v in sweep.variants if v not in variants[metric]]
-        if lacking := [v for v in missing if all(row.get(metric) is None for row in sweep.of(v))]:
+                bar.ax.xaxis.set_major_locator(LogLocator(subs=subs, numticks=max(ticks, 3)))
+        if lacking := [v for v in able if all(row.get(metric) is None for row in sweep.of(v))]:
             figure.note(f"{drawn.name}: does not exist for {', '.join(lacking)}.")
-    if len(sweep.variants) > _MAPS:
-        figure.note(f"Maps of the first {_MAPS} of {len(sweep.variants)} variants.")
-    if contours:
-        figure.note("White lines: contours at the ticks of the colour bar.")
+    if failing := [v for v in sweep.variants if v not in able]:
+        figure.note(f"{', '.join(failing)}: no run succeeded.")
+    if len(able) > _MAPS:
+        figure.note(f"Maps of the first {_MAPS} of {len(able)} variants.")
     style.legend_below(figure, [axes for row in panels for axes in row], 2)
     if others := [*sweep.grid[2:], *sweep.sampled]:
         figure.note(f"Mean over {_listed(sweep, others)}.")
@@ -399,18 +446,25 @@ def pareto(sweep: Sweep) -> Figure | None:
     firsts = [(points == at).all(axis=1).argmax() for at in front]
     few = len(rows) < len(sweep.rows) - sum(map(_failed, sweep.rows))
     text = f"{len(rows)} runs{' have both numbers' if few else ''}."
-    if numbered := len(front) <= _NUMBERED and all("run" in row for row in rows):
-        _number_runs(figure, axes, front, [str(rows[k]["run"]) for k in firsts])
+    about = [_described(sweep, rows[k]) for k in firsts]
     if alone:
-        run = rows[firsts[0]]
-        values = [sweep.value(key, run[key]).replace(" = ", "\u00a0=\u00a0") for key in sweep.grid]
-        about = [f"number {run['run']} in the table" if numbered else "", str(run.get("variant", "")), *values]
-        text += f" Best run ({', '.join(filter(None, about))}): least energy and least error."
+        text += f" Best run{f' ({about[0]})' if about[0] else ''}: least energy and least error."
     else:
         text += " Pareto front: no run is better in both."
-        text += " Numbers: runs as in the table, the first of equal runs." if numbered else ""
+        if len(front) <= _NUMBERED and all("run" in row for row in rows):
+            numbers = [str(rows[k]["run"]) for k in firsts]
+            _number_runs(figure, axes, front, numbers)
+            text += " Numbers: runs as in the table, the first of equal runs"
+            named = [f"{number}: {run}" for number, run in zip(numbers, about, strict=True) if run]
+            text += f" ({'; '.join(named)})." if named else "."
     figure.note(text)
     return figure
+
+
+def _described(sweep: Sweep, run: Mapping[str, Any]) -> str:
+    """Return the variant of a run and its values of the grid."""
+    values = [sweep.value(key, run[key]).replace(" = ", "\u00a0=\u00a0") for key in sweep.grid]
+    return ", ".join(filter(None, [str(run.get("variant", "")), *values]))
 
 
 def _number_runs(figure: Figure, axes: Axes, front: Array, texts: Sequence[str]) -> None:
@@ -469,35 +523,36 @@ def samples(sweep: Sweep) -> Figure | None:
     grid = _Grid([len(members)] * len(metrics), _ACROSS)
     figure = sweep.figure(
         (_LOW if grid.rows > 1 else _PANEL) * grid.rows + _ROOM,
-        f"distribution over {len(sweep.rows)} random runs",
+        "distribution of random runs",
     )
     for m, (row, (metric, drawn)) in enumerate(zip(grid.subplots(figure), metrics.items(), strict=True)):
         for k, (axes, (variant, point)) in enumerate(zip(row, members, strict=False)):
             values = _values(_at(sweep.of(variant), point), metric) * drawn.scale
             heads = [variant] * (len(variants) > 1) + [sweep.value(key, at) for key, at in point.items()]
             head = ", ".join(heads) if len(members) > 1 else ""
-            texts = _distribution(axes, values, sweep.looks[variant]["color"], grid.width)
+            texts = _distribution(axes, values, drawn.unit, sweep.looks[variant]["color"], grid.width)
             title = "\n".join(filter(None, [head, texts]))
             axes.set_title(style.broken(title, 0.85 * grid.width, style.letters(7.5)), fontsize=style.letters(7.5))
             if k >= len(members) - grid.columns:
                 axes.set_xlabel(style.broken(drawn.label, 0.8 * grid.width))
             if k % grid.columns == 0 and m % grid.beside == 0:
                 axes.set_ylabel("runs")
+    each = f", {len(sweep.rows) // (len(variants) * len(points))} in each panel" if len(members) > 1 else ""
     figure.note(
-        f"Random: {_listed(sweep, sweep.sampled)}. Line: mean; after ±: its {100 * LEVEL:g} % interval; dashed: limits "
-        f"of {100 * LEVEL:g} % of the runs."
+        f"{len(sweep.rows)} runs{each}. Random: {_listed(sweep, sweep.sampled)}. Line and first number: mean; after "
+        f"±: its {100 * LEVEL:g} % interval; dashed: limits of {100 * LEVEL:g} % of the runs."
     )
     if len(shown) < len(points):
         figure.note(f"{len(shown)} of {len(points)} grid points; statistics.json contains all.")
     return figure
 
 
-def _distribution(axes: Axes, values: Array, colour: str, across: float) -> str:
+def _distribution(axes: Axes, values: Array, unit: str, colour: str, across: float) -> str:
     """Draw the draws at one grid point as a histogram ``across`` wide [inch]; return mean and interval as text."""
     if len(values) < 2 or np.ptp(values) == 0.0:
         axes.set_axis_off()
         few = f"too few runs with numbers: {len(values)}"
-        return few if len(values) < 2 else f"{len(values)} runs, all {style.number(values[0])}"
+        return few if len(values) < 2 else f"{len(values)} runs, all {style.number(values[0])} {unit}".rstrip()
     # Bin width by the rule of Freedman and Diaconis, or of Sturges for few samples.
     bins = min(_BINS, len(np.histogram_bin_edges(values, "auto")) - 1)
     axes.hist(values, bins=bins, color=colour, alpha=0.7)
@@ -508,7 +563,8 @@ def _distribution(axes: Axes, values: Array, colour: str, across: float) -> str:
     for limit in (statistics.low, statistics.high):
         axes.axvline(limit, color=style.BLACK, linewidth=0.8, linestyle=(0, (4, 2)))
     axes.margins(x=0.03)
-    mean = f"mean {_with_interval(statistics.mean, statistics.mean_high - statistics.mean)},"
+    interval = _with_interval(statistics.mean, statistics.mean_high - statistics.mean)
+    mean = f"{interval}{f' {unit}' if unit else ''},"
     limits = f"{100 * LEVEL:g} % in {_rounded(statistics.low)} … {_rounded(statistics.high)}"
     return f"{mean}{' ' if across > _ACROSS + 0.5 else chr(10)}{limits}"
 
@@ -532,18 +588,27 @@ def tornado(sweep: Sweep) -> Figure | None:
     )
     panels = [row[0] for row in grid.subplots(figure)]
     explained: list[str] = []
+    visible = False
     for axes, (metric, fits) in zip(panels, effects.items(), strict=True):
         drawn = metrics[metric]
         largest = np.max([np.abs(fit.effect) for fit in fits.values()], axis=0)
         order = np.argsort(-largest, kind="stable")[:bars][::-1]
-        thick = 0.8 / len(variants)
+        thick, least = 0.8 / len(variants), _SHORT * drawn.scale * largest.max()
+        places = max(1 - math.floor(math.log10(least)), 0) if least > 0.0 else 0
         for k, variant in enumerate(variants):
             if variant not in fits:
                 continue
             effect, half = (drawn.scale * values[order] for values in (fits[variant].effect, fits[variant].half_width))
             at = np.arange(len(order)) + (0.5 * (len(variants) - 1) - k) * thick
             look = {"color": sweep.looks[variant]["color"], "error_kw": {"elinewidth": 0.8}}
-            axes.barh(at, effect, xerr=half, height=thick, label=variant or None, **look)
+            seen = np.where(half > least, half, 0.0)
+            visible |= bool(seen.any())
+            axes.barh(at, effect, xerr=seen if seen.any() else None, height=thick, label=variant or None, **look)
+            for height, value in zip(at, effect, strict=True):
+                if abs(value) < 2.0 * least:
+                    text = f"{round(value, places) + 0.0:.{places}f}".replace("-", "−")
+                    look = {"xytext": (3.0, 0.0), "textcoords": "offset points", "va": "center"}
+                    axes.annotate(text, (max(value, 0.0), height), fontsize=style.letters(6.0), **look)
         axes.set_yticks(range(len(order)), [labels[k] for k in order], fontsize=small)
         axes.axvline(0.0, color=style.BLACK, linewidth=0.6)
         axes.grid(visible=False, axis="y")
@@ -554,7 +619,9 @@ def tornado(sweep: Sweep) -> Figure | None:
         explained.append(f"{' … '.join(dict.fromkeys([shares[0], shares[-1]]))} % ({drawn.name})")
     if len(variants) > 1:
         style.legend_below(figure, panels, 4)
-    figure.note(f"Error bars: {100 * LEVEL:g} % intervals. ± values: one standard deviation.")
+    size = f"shorter than {100 * _SHORT:g} % of the largest change"
+    drawn_as = f"error bars, unless {size}" if visible else size
+    figure.note(f"{100 * LEVEL:g} % intervals: {drawn_as}. After ±: one standard deviation.")
     figure.note(f"Variance that linear fits explain: {', '.join(explained)}.")
     if bars < len(sweep.sampled):
         figure.note(f"The {bars} largest of {len(sweep.sampled)} effects; statistics.json contains all.")
@@ -589,7 +656,14 @@ def _failed(row: Mapping[str, Any]) -> bool:
 
 
 def _rounded(value: float) -> str:
-    return rounded(value, zeros="#").replace("-", "−") if np.isfinite(value) else ""
+    return _powers(rounded(value, zeros="#")) if np.isfinite(value) else ""
+
+
+def _powers(text: str) -> str:
+    """Return a number with true minus signs and a power of ten instead of an exponent, e.g. 3.6 × 10⁻¹¹."""
+    mantissa, exponent, power = text.partition("e")
+    raised = f" × 10{str(int(power)).translate(_RAISED)}" if exponent else ""
+    return f"{mantissa.replace('-', '−')}{raised}"
 
 
 def _label(quantity: Quantity) -> str:
