@@ -380,6 +380,9 @@ def _ratings(motor: Drive, torque: str) -> dict[str, float]:
         "nominal_current_A": motor.nominal_current,
         "peak_current_A": motor.greatest_current,
         torque: motor.nominal_torque,
+        torque.replace("nominal", "continuous"): min(
+            motor.nominal_torque, motor.joint_constant * motor.nominal_current
+        ),
     }
     if isinstance(motor, Servo):
         ratings |= {"stall_torque_N_m": motor.stall_torque, "gear_friction_N_m": motor.coulomb_friction}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import itertools
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -403,7 +404,7 @@ def test_labels_of_postures_lie_on_nothing() -> None:
 
 
 def test_energies_far_apart_are_dots_on_a_logarithmic_axis(braced: Record) -> None:
-    """Bars of 220 J and 13 200 J: one of them is no more than a line. A ratio of 28 is drawn on a linear axis."""
+    """Bars of 220 J and 13 200 J: one of them is no more than a line. A ratio of 18 is drawn on a linear axis."""
     more, most = copy.deepcopy(braced), copy.deepcopy(braced)
     more["energy_electrical"][:] *= 10.0
     most["energy_electrical"][:] *= 60.0
@@ -412,7 +413,7 @@ def test_energies_far_apart_are_dots_on_a_logarithmic_axis(braced: Record) -> No
     assert total.get_xscale() == "log"
     assert not total.patches
     assert [text.get_text().split()[1:] for text in total.texts] == [["(1/60)"], ["(1/6)"], []]
-    most["energy_electrical"][:] *= 28.0 / 60.0
+    most["energy_electrical"][:] *= 18.0 / 60.0
     figure = drawn(energy.energy_comparison({"a": braced, "b": most}))
     assert [axes.get_yscale() for axes in figure.axes] == ["linear"] * 3
     assert figure.axes[0].get_ylim()[0] == 0.0
@@ -499,65 +500,76 @@ def test_real_contact_figure_names_modes_and_marks_events(real: Record) -> None:
     kinds = {event.kind for event in real.events}
     assert {"lift_off", "landing"} <= kinds
     for kind in kinds:
-        assert f"{contacts.MARKS[kind][1]} (" in texts(figure)
-    # The panel of the whole run; that of the transient shows what is in it.
-    marks = [line for line in figure.axes[-1].get_lines() if line.get_label() == f"{style.UNLISTED}event"]
-    shown = sorted(float(t) for line in marks for t in line.get_xdata())
-    (start, whole), begun = figure.axes[-2:], figure.axes[-2].get_xlim()[1]
-    times = sorted(event.time for event in real.events if event.name == "elbow_7")
-    assert shown == [time for time in times if time > begun]
-    marks = [line for line in start.get_lines() if line.get_label() == f"{style.UNLISTED}event"]
-    assert sorted(float(t) for line in marks for t in line.get_xdata()) == [time for time in times if time <= begun]
+        assert mentions(figure.caption, f"{contacts.MARKS[kind][0]} (")
+    start, whole = figure.axes[-2:]
+    for axes in (start, whole):
+        assert_marked(axes, [event.time for event in real.events if event.name == "elbow_7"])
     # Nothing lies on the bands.
     assert not any(axes.child_axes for axes in figure.axes)
     assert whole.get_ylim()[1] < start.get_ylim()[1]
 
 
+def event_lines(axes: Axes) -> list[float]:
+    """Return the times of the lines that mark events."""
+    marks = [part for part in axes.collections if part.get_label() == f"{style.UNLISTED}event"]
+    return sorted(float(path.vertices[0, 0]) for part in marks for path in part.get_paths())
+
+
+def assert_marked(axes: Axes, times: Sequence[float]) -> None:
+    """Every event within the axes has a line, or one that is closer than a line of its own would be legible."""
+    low, high = axes.get_xlim()
+    shown, inside = event_lines(axes), [time for time in times if low <= time <= high]
+    assert set(shown) <= set(inside)
+    apart = contacts.APART * (high - low)
+    assert all(min(abs(time - line) for line in shown) < apart for time in inside)
+    assert (np.diff(shown) >= apart).all()
+
+
 def test_every_time_figure_marks_the_events_of_contacts(real: Record, braced: Record) -> None:
     for draw in (energy.error, energy.energy, energy.ledger, energy.motors):
         figure = drawn(draw(real))
+        landings = sum(event.kind == "landing" for event in real.events)
+        assert mentions(figure.caption, f"landing ({landings})")
         for axes in figure.axes:
-            if axes.get_title(loc="left").startswith("with "):
-                continue  # the small panel aside
-            marks = [line for line in axes.get_lines() if line.get_label() == f"{style.UNLISTED}event"]
-            low, high = axes.get_xlim()
-            assert sum(len(line.get_xdata()) for line in marks) == sum(low <= e.time <= high for e in real.events)
+            if not axes.get_title(loc="left").startswith("with "):  # the small panel aside
+                assert_marked(axes, [event.time for event in real.events])
         # Nothing happens to what is glued.
-        for axes in drawn(draw(braced)).axes:
-            assert f"{style.UNLISTED}event" not in [line.get_label() for line in axes.get_lines()]
+        assert not any(map(event_lines, drawn(draw(braced)).axes))
 
 
-def test_comparisons_mark_the_events_of_every_run_in_its_colour(real: Record, braced: Record) -> None:
-    other = copy.copy(real)
-    other.events = real.events[:1]
-    records = {"glued": braced, "real": real, "other": other}
-    colours = {name: look["color"] for name, look in style.variant_styles(list(records)).items()}
-    for draw, panels in ((energy.error_comparison, (0, 1)), (energy.energy_comparison, (0, 2))):
+def test_friction_of_joints_has_names_apart_from_contacts(real: Record) -> None:
+    both = copy.copy(real)
+    both.events = [Event(0.01, "slip_start", "joint_2"), Event(0.02, "slip_start", "elbow_7")]
+    caption = drawn(energy.energy(both)).caption
+    assert all(mentions(caption, f"{text} (1)") for text in contacts.MARKS["slip_start"])
+
+
+def test_comparisons_name_curves_that_coincide_and_mark_no_events(real: Record, braced: Record) -> None:
+    records = {"glued": braced, "real": real, "same": real}
+    draws = (energy.error_comparison, energy.energy_comparison, energy.path_comparison, contacts.forces_comparison)
+    for draw in draws:
         figure = drawn(draw(records))
-        for axes in (figure.axes[k] for k in panels):
-            marks = [line for line in axes.get_lines() if line.get_label() == f"{style.UNLISTED}event"]
-            shown = {name: [l for l in marks if l.get_color() == colour] for name, colour in colours.items()}
-            assert shown["glued"] == []
-            for name in ("real", "other"):
-                assert sum(len(line.get_xdata()) for line in shown[name]) == len(records[name].events)
-            # Rows that do not cover each other, over the panel: no curve lies there.
-            bottom = axes.get_window_extent().y1
-            rows = [{line.get_window_extent().y0 for line in shown[name]} for name in ("real", "other")]
-            assert all(len(row) == 1 for row in rows)
-            (first_mark,), (next_one,) = rows
-            assert bottom < next_one < first_mark
-        landings = sum(event.kind == "landing" for record in records.values() for event in record.events)
-        assert f"landing ({landings})" in texts(figure)
+        assert not any(map(event_lines, figure.axes))
+        assert mentions(figure.caption, "real and same")
+        assert not mentions(drawn(draw({"glued": braced, "moved": shifted(real)})).caption, "coincide")
+
+
+def shifted(record: Record) -> Record:
+    """Return a record whose energies, forces and hand are far from the original."""
+    moved = copy.deepcopy(record)
+    for name in ("energy_electrical", "work_mechanical", "contact_normal_force", "hand_position"):
+        moved[name][:] = 3.0 * moved[name] + 0.5
+    return moved
 
 
 @pytest.mark.parametrize("size", [7.2, 3.4])
-def test_legend_of_many_marks_overlaps_nothing(real: Record, size: float) -> None:
+def test_note_on_many_events_overlaps_nothing(real: Record, size: float) -> None:
     """All kinds of events, three digits each."""
     crowded = copy.copy(real)
     crowded.events = [Event(0.001 * k, kind, "elbow_7") for k in range(100) for kind in contacts.MARKS]
-    for name in ("compare_energy", "compare_contact_forces"):
-        figure = dynsim.figure({"one": crowded, "other": crowded}, name, size=size)
-        assert "landing (200)" in texts(figure)
+    for name in ("energy", "contact_forces"):
+        figure = dynsim.figure(crowded, name, size=size)
+        assert mentions(figure.caption, "landing (100)")
         assert layout_faults(figure) == []
 
 
@@ -567,19 +579,22 @@ def test_shares_near_none_and_all_are_told_from_them() -> None:
     assert texts == ["0.0 %", "0.03 %", "0.0002 %", "3.1 %", "50.0 %", "99.96 %", "99.9999 %", "100.0 %"]
 
 
-def test_many_events_are_marks_without_lines(pendulum: Record) -> None:
+def test_close_events_share_a_line(pendulum: Record) -> None:
     record = copy.copy(pendulum)
     record.events = []
-    for k in range(contacts.LINES + 1):
-        record.add_event(0.01 * k, "bounce", "tip")
+    for time in (0.0, 0.001, 0.5, 0.5 + 2.0 * contacts.APART, 0.501, 1.5):
+        record.add_event(time, "bounce", "tip")
     axes = style.new_figure(2.0, "").subplots()
     axes.set_xlim(0.0, 1.0)
     contacts.mark(axes, contacts.marked(record))
-    assert len(axes.get_lines()) == 1
+    assert event_lines(axes) == [0.0, 0.5, 0.5 + 2.0 * contacts.APART]
     assert contacts.marked(record, ["other"]) == []
-    contacts.mark(axes, contacts.marked(record)[:3])
-    assert len(axes.get_lines()) == 5
     assert axes.get_xlim() == (0.0, 1.0)
+
+
+def test_numbers_have_powers_of_ten() -> None:
+    assert style.number(4.41e-13, 2) == "4.4 × 10⁻¹³"
+    assert (style.number(-1e-6), style.number(12345678.0), style.number(0.25)) == ("−10⁻⁶", "1.235 × 10⁷", "0.25")
 
 
 def test_ledger_figure_has_the_losses_of_impacts(real: Record, braced: Record) -> None:
@@ -619,7 +634,7 @@ def test_drawn_energy_is_a_curve_where_it_differs_from_net(braced: Record, more:
     record.add("energy_electrical_drawn", more * braced["energy_electrical"], "J")
     top = drawn(energy.energy(record)).axes[0]
     assert len([line for line in top.get_lines() if not str(line.get_label()).startswith("_")]) == curves
-    assert "drawn" in texts(drawn(energy.energy(record)))
+    assert "taken from the supply" in texts(drawn(energy.energy(record)))
 
 
 def test_ten_motors_are_an_envelope_and_six(braced: Record) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -29,6 +29,7 @@ TRACTION_TOP, MARGIN_LOW = 2.5, -2.0
 # Tracking: minimum ranges of the axes, so that rounding errors are not magnified.
 MIN_RANGES = {"position [m]": 1e-3, "heading [°]": 0.1, "error [mm]": 5e-3, "heading error [°]": 5e-3}
 MILLI = 1e3
+EDGE = 0.01
 _MINIMUM = "Minimum of the tip margin: from {:g} s on."
 # Values over time, and how they are drawn.
 Curve = tuple[Array, dict[str, Any]]
@@ -54,19 +55,19 @@ def overturning(record: Record) -> Figure | None:
         _frame_margin(axes)
     for axes in rows[2]:
         _lines(axes, record, TRACTION, "max {}", np.nanmax)
-        style.shade(axes, record.time, bare, "#EFEFEF", "a wheel carries no load")
+        style.shade(axes, record.time, bare, "#EFEFEF", f"{style.UNLISTED}no load")
         axes.axhline(1.0, color=style.PULLING, linewidth=0.8, label="slips above 1")
         axes.set_ylim(0.0, min(max(axes.get_ylim()[1], 1.15), TRACTION_TOP))
     for panels, label in zip(rows, ("load [N]", "tip margin", "traction demand\n/ friction limit"), strict=True):
         for axes in panels:
-            _mark_tipping(axes, [record], [style.PULLING])
-        panels[0].set_ylabel(label)
+            _mark_tipping(axes, record, "tips over" if panels is rows[1] else None)
+        style.label_row(panels, label)
         style.legend_above(panels[-1], columns=4)
-    note = [_MINIMUM.format(record.settle_time)]
+    note = [_MINIMUM.format(record.settle_time) + " Other extremes: whole run."]
     if np.nanmax(traction, initial=0.0) > TRACTION_TOP:
-        note.append(f"Traction demand: cut off at {TRACTION_TOP:g}, which a wheel with almost no load exceeds.")
+        note.append(f"Traction demand: not drawn above {TRACTION_TOP:g}, which a wheel with almost no load exceeds.")
     if bare.any():
-        note.append(f"No traction demand if a wheel carries no load: {percent(float(bare.mean()))} of the samples.")
+        note.append(f"Grey, without demand: a wheel carries no load ({percent(float(bare.mean()))} of the samples).")
     figure.note(*note)
     contacts.mark_all(figure, rows, record)
     return figure
@@ -78,10 +79,8 @@ def margin_comparison(records: Mapping[str, Record]) -> Figure | None:
     if not shown:
         return None
     some = list(shown.values())
-    figure = style.new_figure(
-        3.4 + len(shown) * style.legend_row() / 72.0 + contacts.height_of_variants(shown),
-        style.comparison_title(some, "tip margin (1: safest, 0: tips over)"),
-    )
+    title = style.comparison_title(some, "tip margin (1: safest, 0: tips over)")
+    figure = style.new_figure(3.4 + len(shown) * style.legend_row() / 72.0, title)
     series = [(record.time, np.maximum(record[MARGIN], MARGIN_LOW)) for record in some]
     (panels,) = style.time_rows(figure, [series], max(record.settle_time for record in some))
     styles = style.variant_styles(list(records))
@@ -89,9 +88,8 @@ def margin_comparison(records: Mapping[str, Record]) -> Figure | None:
         for name, record in shown.items():
             style.line(axes, record.time, record[MARGIN], label=_margin_label(name, record), **styles[name])
         _frame_margin(axes)
-        _mark_tipping(axes, some, [styles[name]["color"] for name in shown])
-    panels[0].set_ylabel("tip margin")
-    contacts.mark_variants(figure, [panels], shown, styles)
+    style.label_row(panels, "tip margin")
+    style.note_coinciding(figure, [(panels[-1], dict(zip(shown, series, strict=True)))])
     style.legend_below(figure, panels[-1:], 1)
     figure.note(_MINIMUM.format(max(record.settle_time for record in some)))
     return figure
@@ -137,7 +135,7 @@ def tracking(record: Record) -> Figure | None:
             style.at_least(axes, 2.0 * MIN_RANGES[name])
             if "error" in name:
                 axes.axhline(0.0, color=style.GREY, linewidth=0.6)
-        panels[0].set_ylabel(name)
+        style.label_row(panels, name)
         style.legend_above(panels[-1], columns=4)
     contacts.mark_all(figure, rows, record)
     figure.align_ylabels([panels[0] for panels in rows])
@@ -211,17 +209,13 @@ def _frame_margin(axes: Axes) -> None:
     style.shade_below_zero(axes, "outside the support triangle")
 
 
-def _mark_tipping(axes: Axes, records: Sequence[Record], colours: Sequence[str]) -> None:
-    """Draw lines and triangles at the tipping times within the axes, because others would be drawn outside."""
+def _mark_tipping(axes: Axes, record: Record, label: str | None) -> None:
+    """Draw lines at the tipping times within the axes."""
     low, high = axes.get_xlim()
-    for record, colour in zip(records, colours, strict=True):
-        for time in tipping_times(record):
-            if not low <= time <= high:
-                continue
-            axes.axvline(time, color=colour, linestyle=(0, (4, 2)), linewidth=0.9)
-            # Draw the triangle above the axes, where it is visible even at their edge.
-            top = axes.get_xaxis_transform()
-            axes.plot(time, 1.0, "v", color=colour, markersize=4, transform=top, clip_on=False, zorder=5)
+    for time in (time for time in tipping_times(record) if low <= time <= high):
+        # On the edge of the axes, the line is not visible.
+        seen = label if low + EDGE * (high - low) < time else None
+        axes.axvline(time, color=style.PULLING, linestyle=(0, (4, 2)), linewidth=0.9, label=seen)
 
 
 def _rms(values: Array) -> float:
@@ -238,7 +232,7 @@ BELOW = 2.9
 # their size.
 TRIANGLES, APART = 6, 0.25
 ELBOW_COLOURS = (style.ORANGE, style.GREEN, "#8C6D31")
-ARM_ABOVE = "#A8A8A8"
+ARM_ABOVE = "#B8B8B8"
 TRIANGLE, INSIDE, OUTSIDE = style.SKY, style.PURPLE, style.PULLING
 
 
@@ -266,7 +260,12 @@ def top_view(record: Record) -> Figure | None:
     _draw_base_frame(own, body, rows)
     for axes in (world, own):
         axes.set_aspect("equal", adjustable="box", anchor="N")
-    style.legend_below(figure, [world, own], 4)
+    if stacked and not style.narrow():
+        own.set_anchor("NW")
+        entries = style.legend_entries([world, own])
+        own.legend(entries.values(), entries, loc="center left", bbox_to_anchor=(1.3, 0.5), ncols=2)
+    else:
+        style.legend_below(figure, [world, own], 4)
     figure.note("Circles: centre of pressure at the start (white) and at the end (black).")
     return figure
 
@@ -307,8 +306,8 @@ def _draw_world(axes: Axes, body: Skeleton, rows: Rows) -> None:
         add_outlines(axes, solids, edgecolor=ARM_COLOUR, lw=0.8, zorder=2, **look)
     arm = body.segments(last)[:, :, :2]
     for segment in arm:
-        axes.plot(*segment.T, color=ARM_ABOVE, lw=1.6, zorder=3)
-    axes.plot([], [], color=ARM_ABOVE, lw=1.6, label="arm at the end")
+        axes.plot(*segment.T, color=ARM_ABOVE, lw=4.0, zorder=3)
+    axes.plot([], [], color=ARM_ABOVE, lw=4.0, label="arm at the end")
     apart = APART * float(np.ptp(support_corners(body, first), axis=0).max())
     for row in _rows_along_path(record["base_pose"], rows, apart):
         axes.add_patch(Polygon(support_corners(body, row), facecolor="none", edgecolor=TRIANGLE, lw=0.7, zorder=4))
@@ -343,21 +342,22 @@ def _draw_base_frame(axes: Axes, body: Skeleton, rows: Rows) -> None:
     corners = _ahead_and_left(support_corners(body, int(rows[-1])) - pose[:2], pose[2])
     axes.add_patch(Polygon(corners, facecolor=TRIANGLE, alpha=0.2, lw=0, zorder=2))
     axes.add_patch(Polygon(corners, facecolor="none", edgecolor=TRIANGLE, lw=1.0, zorder=3))
-    middle = corners.mean(axis=0)
+    middle, outer = corners.mean(axis=0), np.concatenate([corners, *parts])
     for point, corner in zip(body.scene.supports, corners, strict=True):
         axes.plot(*corner, "o", color=ARM_COLOUR, markersize=3, zorder=6)
-        # Place the label towards the middle, where there is space.
-        away = 16.0 * (middle - corner) / np.linalg.norm(middle - corner)
+        # Place the label outside of the base, where there is space.
+        over = abs(corner[1] - middle[1]) > abs(corner[0] - middle[0])
+        side = np.sign(corner - middle)
+        edge = np.array([corner[0], side[1] * np.abs(outer[:, 1]).max()] if over else [outer[:, 0].max(), corner[1]])
+        look: dict[str, Any] = {"ha": "center", "va": "bottom" if side[1] > 0 else "top"}
+        look = look if over else {"ha": "left", "va": "center"}
         axes.annotate(
             point.name,
-            corner,
-            xytext=away,
+            tuple(edge),
+            xytext=3.0 * (side * [0, 1] if over else side * [1, 0]),
             textcoords="offset points",
             fontsize=style.letters(7.0),
-            ha="center",
-            va="center",
-            bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 0.5},
-            zorder=11,
+            **look,
         )
     path = pressure_in_base(record)
     _draw_pressure(axes, body, path)
@@ -368,7 +368,9 @@ def _draw_base_frame(axes: Axes, body: Skeleton, rows: Rows) -> None:
     known = path[np.isfinite(path).all(axis=1)]
     near = known[((known >= low - reach) & (known <= high + reach)).all(axis=1)]
     low, high = box_about([drawn, near], 0.06)
-    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+    # The names of the wheels need some space.
+    aside = 0.08 * (high[1] - low[1])
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1] - aside, high[1] + aside))
     lost = 1.0 - len(near) / max(len(path), 1)
     axes.set_title("in the base frame" + (f"; {100 * lost:.2g} % of the path is outside" if lost > 0.0 else ""))
     axes.set_xlabel("ahead [m]")

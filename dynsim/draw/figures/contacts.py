@@ -13,8 +13,6 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.transforms import ScaledTranslation
 
 from dynsim.draw.figures import style
 from dynsim.draw.figures.style import Array
@@ -22,23 +20,20 @@ from dynsim.record import Record
 from dynsim.record.content import Event
 from dynsim.record.measures import percent
 
-# Kinds of events that are marked: marker and meaning. Other kinds of events have separate figures.
+# Kinds of events that are marked, as events of contacts and of joints. Other kinds have separate figures.
 MARKS = {
-    "landing": ("v", "landing"),
-    "lift_off": ("^", "lift-off"),
-    "bounce": ("o", "bounce"),
-    "slip_start": (">", "slip starts"),
-    "slip_stop": ("s", "slip stops"),
-    "stop_hit": ("P", "joint stop hit"),
-    "stop_left": ("X", "joint stop left"),
-    "chatter": ("*", "chatter"),
+    "landing": ("landing",),
+    "lift_off": ("lift-off",),
+    "bounce": ("bounce",),
+    "slip_start": ("contact slips", "joint leaves dry friction"),
+    "slip_stop": ("contact sticks", "dry friction stops joint"),
+    "stop_hit": ("joint stop hit",),
+    "stop_left": ("joint stop left",),
+    "chatter": ("chatter",),
 }
-COLOUR = "#555555"
-# Maximum number of events with vertical lines; more lines would hide the curves.
-LINES = 40
-# Distance of the marks from the upper edge, and between rows of marks; size of a mark [point].
-BELOW, MARK_ROW, MARK = 4.0, 6.0, 3.2
-SHARED = "Events that are closer than a mark is wide share the mark; the legend counts all."
+COLOUR = "#A6A6A6"
+# Events that are closer than this fraction of the axis share a line.
+APART = 0.01
 
 
 def marked(record: Record, names: Iterable[str] | None = None) -> list[Event]:
@@ -47,84 +42,34 @@ def marked(record: Record, names: Iterable[str] | None = None) -> list[Event]:
     return [event for event in record.events if event.kind in MARKS and (chosen is None or event.name in chosen)]
 
 
-def mark(axes: Axes, events: Sequence[Event], colour: str = COLOUR, *, row: int = 0, lines: bool = True) -> bool:
-    """Mark the events within the axes by a faint line and a marker in a row, counted down from the upper edge.
-
-    Rows with negative numbers are above the edge. Events of one kind that are closer than the width of a marker share
-    it.
-
-    Returns
-    -------
-    bool
-        Whether events share a marker.
-    """
+def mark(axes: Axes, events: Sequence[Event]) -> None:
+    """Draw a thin line behind the curves at the time of each event within the axes."""
     low, high = axes.get_xlim()
-    inside = [event for event in events if low <= event.time <= high]
-    down = ScaledTranslation(0.0, -(BELOW + MARK_ROW * row) / 72.0, axes.figure.dpi_scale_trans)
-    transform = axes.get_xaxis_transform() + down
-    look: dict[str, Any] = {"color": colour, "markersize": MARK, "markeredgewidth": 0.0, "zorder": 6, "clip_on": False}
-    apart = (high - low) * MARK / (72.0 * axes.get_position().width * style.width())
-    marks: list[tuple[str, float]] = []
-    for kind in MARKS:
-        last = -np.inf
-        for time in sorted(event.time for event in inside if event.kind == kind):
-            if time - last >= apart:
-                marks.append((kind, last := time))
-    for kind, (marker, _) in MARKS.items():
-        if times := [time for own, time in marks if own == kind]:
-            axes.plot(times, [1.0] * len(times), marker, transform=transform, label=f"{style.UNLISTED}event", **look)
-    if lines and len(marks) <= LINES:
-        for _, time in marks:
-            axes.axvline(time, color=colour, linewidth=0.5, alpha=0.35 if row >= 0 else 0.2, zorder=0.5)
-    axes.set_xlim(low, high)
-    return len(marks) < len(inside)
+    times: list[float] = []
+    for time in sorted(event.time for event in events if low <= event.time <= high):
+        if not times or time - times[-1] >= APART * (high - low):
+            times.append(time)
+    look: dict[str, Any] = {"colors": COLOUR, "linewidth": 0.6, "zorder": 0.5, "label": f"{style.UNLISTED}event"}
+    if times:
+        axes.vlines(times, 0.0, 1.0, transform=axes.get_xaxis_transform(), **look)
+        axes.set_xlim(low, high)
 
 
 def mark_all(figure: style.Drawing, rows: Sequence[Sequence[Axes]], record: Record) -> None:
-    """Mark all events of a run in every panel, with a legend below the figure."""
+    """Mark all events of a run in every panel, with a note."""
     events = marked(record)
-    shared = [mark(axes, events) for panels in rows for axes in panels]
-    explain(figure, events, any(shared))
+    for axes in (axes for panels in rows for axes in panels):
+        mark(axes, events)
+    explain(figure, events, record)
 
 
-def height_of_variants(records: Mapping[str, Record]) -> float:
-    """Return the height above a panel that :func:`mark_variants` needs [inch]."""
-    return MARK_ROW * sum(bool(marked(record)) for record in records.values()) / 72.0
-
-
-def mark_variants(
-    figure: style.Drawing,
-    rows: Sequence[Sequence[Axes]],
-    records: Mapping[str, Record],
-    styles: Mapping[str, Mapping[str, Any]],
-) -> None:
-    """Mark the events of several runs above every panel, one row per run in the order and colours of the legend.
-
-    Inside the panel the marks would cover the curves of other variants.
-    """
-    having = {name: events for name, record in records.items() if (events := marked(record))}
-    everything = [event for events in having.values() for event in events]
-    shared = False
-    for panels in rows if everything else ():
-        for axes in panels:
-            for row, (name, events) in enumerate(having.items()):
-                shared |= mark(
-                    axes, events, styles[name]["color"], row=row - len(having), lines=len(everything) <= LINES
-                )
-            # A blank title reserves the space for the marks.
-            axes.set_title(" ", fontsize=1.0, y=1.0, pad=MARK_ROW * len(having))
-    explain(figure, everything, shared)
-
-
-def explain(figure: style.Drawing, events: Sequence[Event], shared: bool) -> None:
-    """Add the marks, with the number of events, to the legend below a figure; note if events share a mark."""
-    if shared:
-        figure.note(SHARED)
-    count = Counter(event.kind for event in events)
-    look: dict[str, Any] = {"color": COLOUR, "linestyle": "none", "markersize": 4.0, "markeredgewidth": 0.0}
-    kinds = {f"{text} ({count[kind]})": marker for kind, (marker, text) in MARKS.items() if count[kind]}
-    handles = {label: Line2D([], [], marker=marker, **look) for label, marker in kinds.items()}
-    figure.put_below(handles, 4, last=True)
+def explain(figure: style.Drawing, events: Sequence[Event], record: Record) -> None:
+    """Add a note with the number of events of each kind."""
+    touching = set(contact_names([record]))
+    count = Counter(MARKS[event.kind][0 if event.name in touching else -1] for event in events)
+    if count:
+        kinds = (text for texts in MARKS.values() for text in dict.fromkeys(texts) if count[text])
+        figure.note(f"Vertical grey lines: {', '.join(f'{text} ({count[text]})' for text in kinds)}.")
 
 
 # Maximum number of rows on a page; height of a row [inch].
@@ -171,46 +116,39 @@ def _forces(records: Mapping[str, Record], title: str) -> Figure | None:
     figure = style.new_figure(1.0 + ROW * len(chosen) + more * style.legend_row() / 72.0, title + note)
     series = [[values for r in having[name].values() for values in _series(r, name)] for name in chosen]
     styles = style.variant_styles(list(records))
-    rows = style.time_rows(figure, series, max(run.settle_time for run in runs))
-    shared = False
+    rows = style.time_rows(figure, series, max(run.settle_time for run in runs), zero=alone)
     for name, panels in zip(chosen, rows, strict=True):
-        # Events of the transient panel would overlap each other in the panel of the whole run.
-        begun = panels[0].get_xlim()[1] if len(panels) > 1 else -np.inf
         for axes in panels:
-            for row, (variant, record) in enumerate(having[name].items()):
+            for variant, record in having[name].items():
                 force, colour = _force(record, name), str(styles[variant]["color"])
                 label = variant if many else labels[name, variant]
                 style.line(axes, record.time, force, label=label, **styles[variant])
                 for value in _extremes(record, name) if alone else ():
                     axes.axhline(value, color=colour, linestyle=(0, (5, 3)), linewidth=0.7)
-                changes = marked(record, [name])
-                changes = [event for event in changes if axes is panels[0] or event.time > begun]
-                shared |= mark(axes, changes, colour, row=row - len(having[name]) * many)
+                if alone:
+                    mark(axes, marked(record, [name]))
                 if alone and is_unilateral(record):
                     _draw_modes(axes, record, name)
-                elif alone:
-                    fill: dict[str, Any] = {"color": style.PULLING, "alpha": 0.3, "linewidth": 0, "interpolate": True}
-                    axes.fill_between(
-                        record.time, force, 0.0, where=force < 0.0, label=f"{style.UNLISTED}pulling", **fill
-                    )
                 if alone and len(panels) > 1 and axes is panels[0]:
                     _draw_samples(axes, record, name, colour)
             if not all(map(is_unilateral, having[name].values())):
                 style.shade_below_zero(axes, "surface pulls")
-        panels[0].set_ylabel(f"{name}\nnormal force [N]")
+        style.label_row(panels, f"{name}\nnormal force [N]")
         if not many:
             style.legend_above(panels[-1], columns=2)
-        elif any(marked(run, [name]) for run in having[name].values()):
-            panels[-1].set_title(" ", fontsize=1.0, y=1.0, pad=MARK_ROW * len(having[name]))
     _note_sampling(figure, rows, runs)
     if not many:
-        also = ", also as dashed lines" if alone else ""
-        figure.note(f"Legend: share of the run; range of the force over all integration steps{also}.")
+        also = ", also as dashed lines within the axes" if alone else ""
+        figure.note(f"Legend: share of the run; range over all integration steps, with peaks between samples{also}.")
     if many:
         style.legend_below(figure, [panels[-1] for panels in rows], 5)
     bands = {str(bar.get_label())[1:]: bar for panels in rows for bar in panels[-1].collections}
     figure.put_below({text: bands[text] for text in BANDS if text in bands}, 4)
-    explain(figure, [event for record in runs for event in marked(record, chosen)], shared)
+    if not alone:
+        curves = [{v: (r.time, _force(r, name)) for v, r in having[name].items()} for name in chosen]
+        style.note_coinciding(figure, [(panels[-1], row) for panels, row in zip(rows, curves, strict=True)])
+    else:
+        explain(figure, marked(runs[0], chosen), runs[0])
     return figure
 
 

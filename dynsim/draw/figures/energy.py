@@ -26,16 +26,16 @@ TERMS = {
     "loss_stop": ("joint-stop impacts", "#F0E442"),
     "loss_damper": ("dampers", "#44AA99"),
     "energy_elastic": ("Δ elastic energy", "#AA4499"),
-    "loss_scheme": ("time stepping", "#999933"),
+    "loss_scheme": ("numerical error of the time steps", "#999933"),
     "energy_kinetic": ("Δ kinetic energy", "#009E73"),
     "energy_potential": ("Δ potential energy", "#CC79A7"),
     "energy_magnetic": ("Δ magnetic energy", "#7F7F7F"),
 }
 # Largest ratios of the variants' final energies, and of their distances from the target, for which an axis is linear.
-LOG_ENERGY, LOG_DISTANCE = 50.0, 8.0
+LOG_ENERGY, LOG_DISTANCE = 20.0, 8.0
 # Fraction of the energy turnover above which one term hides the others, which then get a separate panel.
 DOMINANT = 0.8
-# Net and drawn energy are shown as one curve if they differ by no more than this fraction of the maximum.
+# Net energy and energy from the supply are one curve if they differ by no more than this fraction of the maximum.
 DIFFER = 0.01
 # A residual below this fraction of its limit is only printed, not drawn.
 SMALL_RESIDUAL = 0.1
@@ -54,10 +54,10 @@ def energy(record: Record) -> Figure | None:
     top, bottom = figure.subplots(2, 1, sharex=True)
     net, drawn = record["energy_electrical"], record["energy_electrical_drawn"]
     apart = bool(np.abs(drawn - net).max() > DIFFER * np.abs(drawn).max())
-    label = f"net: {_joules(net)}" + ("" if apart else f" (drawn, without recovery: {_joules(drawn)})")
+    label = f"net: {_joules(net)}" + ("" if apart else f"; taken from the supply: {_joules(drawn)}")
     style.line(top, record.time, net, label=label, color=style.BLUE, lw=1.8)
     if apart:
-        label = f"drawn, without recovery: {_joules(drawn)}"
+        label = f"taken from the supply, without recovery: {_joules(drawn)}"
         style.line(top, record.time, drawn, label=label, color=style.ORANGE, linestyle=(0, (4, 3)))
     if net.min() >= 0.0:
         top.set_ylim(bottom=0.0)
@@ -78,10 +78,9 @@ def energy_comparison(records: Mapping[str, Record]) -> Figure | None:
     shown = {name: record for name, record in records.items() if has_motors(record)}
     if not shown:
         return None
-    height = 4.6 + 2.0 * contacts.height_of_variants(shown)
     title = style.comparison_title(list(shown.values()), "electrical energy and mechanical work")
     below = 0.8 + 0.2 * len(shown)
-    figure = style.new_figure(height + below * style.narrow(), title)
+    figure = style.new_figure(4.6 + below * style.narrow(), title)
     # In a narrow figure, the totals are below the curves.
     if style.narrow():
         grid = figure.add_gridspec(3, 1, height_ratios=[2.0, 2.0, below])
@@ -109,9 +108,11 @@ def energy_comparison(records: Mapping[str, Record]) -> Figure | None:
     work.axhline(0.0, color=style.GREY, linewidth=0.6)
     work.set_ylabel("mechanical\nwork [J]")
     work.set_xlabel("time [s]")
-    contacts.mark_variants(figure, [(over_time,), (work,)], shown, styles)
     _totals(total, list(shown), finals, [str(styles[name]["color"]) for name in shown], logarithmic)
     style.legend_below(figure, [over_time], 5)
+    signals = ((over_time, "energy_electrical"), (work, "work_mechanical"))
+    curves = [(axes, {name: (r.time, r[signal]) for name, r in shown.items()}) for axes, signal in signals]
+    style.note_coinciding(figure, curves)
     if logarithmic:
         figure.note("Fractions: relative to the largest energy.")
     return figure
@@ -139,29 +140,33 @@ def ledger(record: Record) -> Figure | None:
     widths, heights = [3.2, 1.0][:columns], [2.4, *[1.6] * below, *[1.0] * near]
     grid = figure.add_gridspec(rows, columns, width_ratios=widths, height_ratios=heights)
     whole = figure.add_subplot(grid[1 if below else 0, -1])
-    _stack(whole, record.time, terms, supplied, source)
+    largest = max(float(np.abs(values[-1])) for values in (*terms.values(), supplied))
+    _stack(whole, record.time, terms, largest)
+    _draw_supplied(whole, record.time, supplied, source, largest)
+    whole.set_ylabel("energy since start [J]")
     main = whole
     if dominant:
         whole.set_title("with Joule heat", loc="left")
         whole.set_xlabel("time [s]" if not below else "")
         main = figure.add_subplot(grid[0, 0], sharex=whole)
         others = {name: values for name, values in terms.items() if name != "heat_joule"}
-        _stack(main, record.time, others, supplied - terms["heat_joule"], source)
+        _stack(main, record.time, others, largest)
+        less = supplied - terms["heat_joule"]
+        _draw_supplied(main, record.time, less, f"{source} − Joule heat", largest, linestyle=style.DASHES[1])
         main.set_title("without Joule heat", loc="left")
-    main.set_ylabel("energy since start [J]")
+        main.set_ylabel("energy since start [J]")
     panels = [main, figure.add_subplot(grid[-1, 0], sharex=main)] if near else [main]
     if near:
         _residual(panels[1], record, turnover)
     if near or below:
         main.tick_params(labelbottom=False)
     if below:
-        whole.set_ylabel("energy since start [J]")
         whole.tick_params(labelbottom=not near)
     (panels[-1] if near or not below else whole).set_xlabel("time [s]")
     contacts.mark_all(figure, [(axes,) for axes in panels], record)
     if not near:
         figure.note(_residual_note(record, turnover))
-    style.legend_below(figure, [whole], 3)
+    style.legend_below(figure, [whole, main], 3)
     return figure
 
 
@@ -174,10 +179,9 @@ def _residual_note(record: Record, turnover: float) -> str:
     return f"Unexplained energy: at most {style.number(largest, 2)} J, {share} of the turnover (limit {limit})."
 
 
-def _stack(axes: Axes, time: Array, terms: Mapping[str, Array], supplied: Array, source: str) -> None:
+def _stack(axes: Axes, time: Array, terms: Mapping[str, Array], largest: float) -> None:
     """Stack positive terms upward and negative terms downward from zero; their sum is the supplied energy."""
     kept = np.unique(np.linspace(0, len(time) - 1, min(len(time), style.LINE_POINTS // 4)).astype(int))
-    largest = max(float(np.abs(values[-1])) for values in (*terms.values(), supplied))
     for clip in (np.maximum, np.minimum):
         base = np.zeros(len(kept))
         for name, values in terms.items():
@@ -191,8 +195,11 @@ def _stack(axes: Axes, time: Array, terms: Mapping[str, Array], supplied: Array,
                 time[kept], base, base + part, color=colour, linewidth=0.3, label=None if label in known else label
             )
             base = base + part
+
+
+def _draw_supplied(axes: Axes, time: Array, supplied: Array, source: str, largest: float, **look: Any) -> None:
     label = f"{source}: {_joules(supplied, largest)}" if np.any(supplied) else f"{source}: none"
-    axes.plot(time[kept], supplied[kept], color=style.BLACK, linewidth=1.1, label=label)
+    axes.plot(*style.sparse(np.stack([time, supplied], axis=1)).T, color=style.BLACK, lw=1.1, label=label, **look)
 
 
 def _residual(axes: Axes, record: Record, turnover: float) -> None:
@@ -200,7 +207,7 @@ def _residual(axes: Axes, record: Record, turnover: float) -> None:
     if np.any(size > 0.0):
         axes.set_yscale("log", nonpositive="mask")
         axes.yaxis.set_minor_locator(NullLocator())
-        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: style.number(value)))
     shown = np.where(size > 0.0, size, np.nan)
     if np.isfinite(shown).any():
         style.line(axes, record.time, np.where(np.isnan(shown), np.nanmin(shown), shown), color=style.BLACK, lw=0.9)
@@ -208,7 +215,7 @@ def _residual(axes: Axes, record: Record, turnover: float) -> None:
         limit = RESIDUAL_LIMIT * turnover
         axes.axhline(limit, color=style.PULLING, linestyle="--", linewidth=0.9)
         axes.annotate(
-            f"limit: {RESIDUAL_LIMIT:g} of the turnover",
+            f"limit: {style.number(RESIDUAL_LIMIT)} of the turnover",
             (0.99, limit),
             xycoords=("axes fraction", "data"),
             xytext=(0, -9),
@@ -261,6 +268,8 @@ TORQUES = {
 }
 # A limit above this multiple of the largest value is in the notes, because its line would compress the curves.
 FAR = 3.0
+# A bar that is shorter than this fraction of the axis has its value next to it.
+SHORT = 0.02
 LIMIT: dict[str, Any] = {"linestyle": "--", "linewidth": 0.9, "color": style.PULLING}
 RATING: dict[str, Any] = {"linestyle": (0, (1, 1.5)), "linewidth": 1.3, "color": style.BLACK}
 
@@ -269,7 +278,7 @@ def motors(record: Record) -> Figure | None:
     """Draw torques, currents and voltages of the motors, with limits and ratings; return None without currents."""
     if "current" not in record or record["current"].shape[1] == 0:
         return None
-    loads = {motor["joint"]: motor for motor in record.summary.get("motors", ())}
+    loads = {motor["joint"]: motor for motor in _loads(record)}
     volts = None if record.scene is None else record.scene.voltage_limit
     units = [unit for unit in TORQUES if any(f"{TORQUES[unit][0]}_rms_{unit}" in motor for motor in loads.values())]
     label = " or ".join(f"{TORQUES[unit][0]} [{TORQUES[unit][1]}]" for unit in units) or "torque [N m]"
@@ -281,7 +290,7 @@ def motors(record: Record) -> Figure | None:
     }
     signals = {name: signal for name, signal in signals.items() if name in record}
     columns = {name: [record.labels[name].index(joint) for joint in record.labels["current"]] for name in signals}
-    shown = _most_loaded(record)
+    shown = _most_loaded(record, [record[name][:, columns[name]] for name in signals])
     figure = style.new_figure(
         1.2 + 1.55 * len(signals), style.title(record, "torques, currents and voltages of the motors")
     )
@@ -293,18 +302,18 @@ def motors(record: Record) -> Figure | None:
             _draw(axes, record, name, columns[name], shown)
         limits = {looks[k]["color"]: entries.get(record.labels["current"][k], {}) for k in shown}
         draw_limits(figure, panels[-1], limits, keys, label)
-        panels[0].set_ylabel(label.replace(" or ", "\nor ") if " or " in label else label.replace(" [", "\n["))
+        style.label_row(panels, label.replace(" or ", "\nor ") if " or " in label else label.replace(" [", "\n["))
     style.legend_below(figure, [panels[-1] for panels in rows], 4)
     contacts.mark_all(figure, rows, record)
     if len(shown) < record["current"].shape[1]:
-        figure.note(f"Lines: the {len(shown)} motors with the largest rms current after the start.")
+        figure.note(f"Lines: {len(shown)} motors, those with the largest values and rms currents after the start.")
     return figure
 
 
 def torques(record: Record) -> Figure | None:
     """Draw the load of each motor next to its limit and rating as bars; return None without loads in the summary."""
     loads = {
-        unit: [motor for motor in record.summary.get("motors", ()) if f"{name}_rms_{unit}" in motor]
+        unit: [motor for motor in _loads(record) if f"{name}_rms_{unit}" in motor]
         for unit, (name, *_) in TORQUES.items()
     }
     loads = {unit: motors for unit, motors in loads.items() if motors}
@@ -326,10 +335,22 @@ def torques(record: Record) -> Figure | None:
                 limit_mark(axes, k, value, text, **look)
         axes.set_xlabel(f"{name} [{symbol}]")
         axes.set_xlim(0.0, 1.05 * axes.get_xlim()[1])
+        for k, value in enumerate(most):
+            if value < SHORT * axes.get_xlim()[1]:
+                look = {"textcoords": "offset points", "va": "center", "fontsize": style.letters(7.0)}
+                axes.annotate(style.number(value, 2), (value, k), xytext=(3, 0), **look)
     style.legend_below(figure, list(panels), 4)
     if not limits:
         figure.note("The scenario has neither torque limits nor torque ratings of motors.")
     return figure
+
+
+def _loads(record: Record) -> list[dict[str, Any]]:
+    """Return the loads of the motors; the rating of a torque also follows from that of the current."""
+    return [
+        motor | {key.replace("continuous", "nominal"): motor[key] for key in motor if key.startswith("continuous")}
+        for motor in record.summary.get("motors", ())
+    ]
 
 
 def bars(axes: Axes, names: Sequence[str], largest: Sequence[float], rms: Sequence[float]) -> None:
@@ -347,12 +368,17 @@ def limit_mark(axes: Axes, level: int, value: float, label: str, **look: Any) ->
     axes.plot([value, value], [level - 0.45, level + 0.45], label=label, **(look or LIMIT))
 
 
-def _most_loaded(record: Record) -> list[int]:
-    """Return the positions of the ``LARGEST`` motors with the largest rms currents after the start, in order."""
+def _most_loaded(record: Record, signals: Sequence[Array]) -> list[int]:
+    """Return the positions of ``LARGEST`` motors in order: with the largest values of signals, (T, k), and currents.
+
+    Values are those after the start; of the currents the rms counts.
+    """
     # Select the motors after the start, when all are active.
     settled = record.time >= record.settle_time
-    effort = np.sqrt((record["current"][settled if settled.any() else slice(None)] ** 2).mean(axis=0))
-    return sorted(np.argsort(-effort, kind="stable")[:LARGEST].tolist())
+    rows = settled if settled.any() else slice(None)
+    effort = np.sqrt((record["current"][rows] ** 2).mean(axis=0))
+    peaks = [int(np.nan_to_num(np.abs(values[rows])).max(axis=0).argmax()) for values in signals]
+    return sorted(list(dict.fromkeys([*peaks, *np.argsort(-effort, kind="stable").tolist()]))[:LARGEST])
 
 
 def _names(record: Record) -> Mapping[str, str]:
@@ -478,6 +504,7 @@ def _paths(records: Mapping[str, Record], title: str) -> Figure | None:
         style.legend_below(figure, panels[:1], 4)
     if note:
         figure.note(note)
+    style.note_coinciding(figure, [(panels[0], {name: (r.time, r["hand_position"]) for name, r in shown.items()})])
     return figure
 
 
@@ -498,8 +525,8 @@ def error(record: Record) -> Figure | None:
     for axes in rows[1]:
         style.line(axes, record.time, norm, label=_error_label("distance", record), color=style.BLACK)
         axes.set_ylim(bottom=0.0)
-    rows[0][0].set_ylabel(f"hand − {target_name(record)}\n[mm]")
-    rows[1][0].set_ylabel(f"distance from\n{target_name(record)} [mm]")
+    style.label_row(rows[0], f"hand − {target_name(record)}\n[mm]")
+    style.label_row(rows[1], f"distance from\n{target_name(record)} [mm]")
     _mark_settle(figure, rows, [record])
     contacts.mark_all(figure, rows, record)
     style.legend_above(rows[0][-1], columns=4)
@@ -515,8 +542,7 @@ def error_comparison(records: Mapping[str, Record]) -> Figure | None:
     shown = {name: record for name, record in records.items() if hand_target(record) is not None}
     if not shown:
         return None
-    height = 4.4 + 2.0 * contacts.height_of_variants(shown)
-    figure = style.new_figure(height, style.comparison_title(list(shown.values()), "tracking error"))
+    figure = style.new_figure(4.4, style.comparison_title(list(shown.values()), "tracking error"))
     deviations = {name: MILLI * (record["hand_position"] - hand_target(record)) for name, record in shown.items()}
     norms = {name: np.linalg.norm(deviation, axis=1) for name, deviation in deviations.items()}
     styles = style.variant_styles(list(records))
@@ -529,15 +555,16 @@ def error_comparison(records: Mapping[str, Record]) -> Figure | None:
             style.line(distance, record.time, norms[name], label=_error_label(name, record), **styles[name])
             style.line(vertical, record.time, deviations[name][:, 2], **styles[name])
     _mark_settle(figure, rows, list(shown.values()))
-    _scale_distances(rows[0], [norms[name][record.time >= settle] for name, record in shown.items()])
-    rows[0][0].set_ylabel("distance from\ntarget [mm]")
-    rows[1][0].set_ylabel("vertical\nerror [mm]")
-    contacts.mark_variants(figure, rows, shown, styles)
+    _scale_distances(figure, rows[0], [norms[name][record.time >= settle] for name, record in shown.items()])
+    style.label_row(rows[0], "distance from\ntarget [mm]")
+    style.label_row(rows[1], "vertical\nerror [mm]")
+    curves = [dict(zip(shown, row, strict=True)) for row in series]
+    style.note_coinciding(figure, [(panels[-1], row) for panels, row in zip(rows, curves, strict=True)])
     style.legend_below(figure, [rows[0][-1], rows[1][-1]], 5)
     return figure
 
 
-def _scale_distances(panels: Sequence[Axes], settled: Sequence[Array]) -> None:
+def _scale_distances(figure: style.Drawing, panels: Sequence[Axes], settled: Sequence[Array]) -> None:
     """Set the axes of distances, (n,) [mm] per variant, so that the settled ones of all variants can be read."""
     typical = [float(np.median(values)) for values in settled if values.size]
     if not typical or not 0.0 < LOG_DISTANCE * min(typical) < max(typical):
@@ -545,10 +572,12 @@ def _scale_distances(panels: Sequence[Axes], settled: Sequence[Array]) -> None:
             axes.set_ylim(bottom=0.0)
         return
     low = min(float(np.percentile(values, 2.0)) for values in settled if values.size) / 1.3
+    # Distances near zero would extend the axis by many empty decades.
+    low = max(low, 1e-4 * max(typical))
+    figure.note(f"Distance: logarithmic, not drawn below {style.number(low, 2)} mm.")
     for axes in panels:
         axes.autoscale(axis="y")
-        # Distances near zero would extend the axis by many empty decades.
-        axes.set_ylim(max(low, 1e-4 * max(typical)), axes.get_ylim()[1])
+        axes.set_ylim(low, axes.get_ylim()[1])
         style.log_axis(axes)
     if len(panels) > 1:
         panels[-1].set_ylim(top=1.3 * max(float(values.max()) for values in settled if values.size))
@@ -643,11 +672,11 @@ def _error_label(name: str, record: Record) -> str:
 def _mark_settle(figure: style.Drawing, rows: Sequence[Sequence[Axes]], records: Sequence[Record]) -> None:
     """Draw a line at the settling time, from which the rms values in the legend count, or note the time."""
     settle, end = max(run.settle_time for run in records), max(float(run.time[-1]) for run in records)
-    text = f"rms from {settle:g} s on" if settle > 0.0 else "rms of the whole run"
+    text = f"rms distance from {settle:g} s on" if settle > 0.0 else "rms distance of the whole run"
     shown = False
     for axes in (axes for panels in rows for axes in panels):
         if max(0.0, records[0].time[0]) < settle < min(end, axes.get_xlim()[1]):
-            label = text if axes is rows[-1][-1] else None
+            label = f"numbers: {text}" if axes is rows[-1][-1] else None
             axes.axvline(settle, color=style.GREY, linestyle=":", linewidth=1.0, label=label)
             shown |= label is not None
     if not shown:

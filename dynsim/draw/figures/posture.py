@@ -44,6 +44,8 @@ FAINT = 3
 LABEL_SIZE, LABEL_HEIGHT = 7.0, 19.0
 # Maximum number of contacts of the robot with labels.
 LABELLED = 8
+# A target with an extent below this [point] is drawn as a cross.
+SHORT = 12.0
 # Size of the symbol of a mount, relative to the extent of the view.
 MOUNT = 0.02
 # Distance from the centre of a contact mark to its label [point].
@@ -88,8 +90,19 @@ class Skeleton:
         return [solid for body in sorted(drawn) for solid in corners_of(self.record, self.scene, body, row)]
 
     def bases(self) -> list[list[Array]]:
-        """Return the corners of the solids of a mobile base and objects for each posture."""
-        return [[corners for corners, _ in self.solids(k)] for k in self.rows_shown]
+        """Return the corners of the solids of a mobile base and objects for the first and the last posture."""
+        rows = self.rows_shown
+        return [[corners for corners, _ in self.solids(k)] for k in dict.fromkeys([*rows[:1], *rows[-1:]])]
+
+    def named_objects(self) -> list[tuple[str, Array]]:
+        """Return the name and the corners, (n, 3) [m], of each object at the end."""
+        names = {k: self.scene.bodies[k].name for k in self.objects if self.scene.bodies[k].shapes}
+        return [
+            (name, np.concatenate([corners for corners, _ in corners_of(self.record, self.scene, k, row)]))
+            for row in self.rows_shown[-1:]
+            for k, name in names.items()
+            if name in self.scene.objects
+        ]
 
     @cached_property
     def objects(self) -> tuple[int, ...]:
@@ -194,7 +207,7 @@ class SidePlane(Projection):
         """Label of the horizontal axis of the plane."""
         # Round first; adding 0 removes the sign of a negative zero.
         azimuth = round(float(np.degrees(np.arctan2(self.axes[0, 1], self.axes[0, 0])))) + 0
-        return f"distance from {self.where}, azimuth {style.number(azimuth)}° [m]"
+        return f"distance from {self.where} [m], azimuth {style.number(azimuth)}°"
 
 
 def side_plane(record: Record, drawn: Sequence[Array]) -> SidePlane:
@@ -361,7 +374,8 @@ def posture(record: Record) -> Figure | None:
         side.set_title(style.broken(note, across), color=style.PULLING)
     style.legend_below(figure, [side], 5)
     if before := ", ".join(style.number(float(record.time[row]), 2) for row in body.rows_shown[:-1]):
-        figure.note(f"Faint: at {before} s.")
+        solids = f" Dashed: base and objects at {style.number(float(record.time[body.rows_shown[0]]), 2)} s."
+        figure.note(f"Faint: at {before} s.{solids if any(body.bases()) else ''}")
     return figure
 
 
@@ -385,21 +399,30 @@ def posture_comparison(records: Mapping[str, Record]) -> Figure | None:
     framed, scale = _with_labels((low, high), list(shown.values()), plane, 72.0 * np.array([across, 3.2]))
     size = framed[1] - framed[0]
     each = float(np.clip(across * size[1] / size[0], 0.8, 3.2))
-    figure = style.new_figure(0.9 + (0.3 + each) * lines, style.comparison_title(some, "postures at the end"))
+    figure = style.new_figure(
+        0.9 + 0.85 * (len(shown) % columns > 0) + (0.3 + each) * lines,
+        style.comparison_title(some, "postures at the end"),
+    )
     grid = figure.subplots(lines, columns, sharex=True, sharey="row", squeeze=False)
     styles = style.variant_styles(list(records))
     for axes, (name, body) in zip(grid.ravel(), shown.items(), strict=False):
         _side_view(axes, body, plane, scale, colour=styles[name]["color"], path=style.GREY, named=False)
         _frame_side(axes, plane, framed, body.scene.surfaces)
         axes.set_title(name, color=styles[name]["color"], fontweight="bold")
-        axes.label_outer()
+        label = axes.get_xlabel()
+        axes.label_outer(remove_inner_ticks=False)
     for axes in grid.ravel()[len(shown) :]:
         axes.set_axis_off()
+    for k, axes in enumerate(grid.ravel()[: len(shown)]):
+        if k + columns >= len(shown):
+            axes.tick_params(labelbottom=True)
+            axes.set_xlabel(label)
     # The axis labels of narrow panels would overlap, so only one panel has a label.
     for axes in grid[:, [k for k in range(columns) if columns > 2 and k != columns // 2]].ravel():
         axes.set_xlabel("")
     style.legend_below(figure, list(grid.ravel()), 5)
-    figure.note("Faint: earlier postures.")
+    dashed = any(any(body.bases()) for body in shown.values())
+    figure.note("Faint: earlier postures." + " Dashed: base and objects at the start." * dashed)
     return figure
 
 
@@ -462,10 +485,14 @@ def _side_view(
     for centre, radius in body.pads(body.rows_shown[-1]) if drawn else []:
         look = {"facecolor": PAD_COLOUR, "edgecolor": colour, "lw": 0.8, "zorder": 2.8, "label": "contact sphere"}
         axes.add_patch(Circle(tuple(plane.project(centre)), radius, **look))
-    for k, base in enumerate(body.bases()):
-        last = k == len(drawn) - 1
-        look = {"facecolor": BASE_COLOUR if last else "none", "alpha": 1.0 if last else 0.22}
-        add_outlines(axes, map(plane.project, base), edgecolor=colour, lw=0.8, zorder=2.5, **look)
+    for base in (bases := body.bases()):
+        last = base is bases[-1]
+        look = {"facecolor": BASE_COLOUR, "zorder": 2.5} if last else {"facecolor": "none", "linestyle": (0, (3, 2))}
+        add_outlines(axes, map(plane.project, base), edgecolor=colour if last else style.GREY, lw=0.8, **look)
+    for name, corners in body.named_objects() if named else []:
+        low, high = (getattr(plane.project(corners), side)(axis=0) for side in ("min", "max"))
+        look = {"xytext": (0, 1.5), "textcoords": "offset points", "fontsize": style.letters(LABEL_SIZE)}
+        axes.annotate(name, (0.5 * float(low[0] + high[0]), float(high[1])), ha="center", va="bottom", **look)
     for k, segments in enumerate(drawn):
         last = k == len(drawn) - 1
         flat = plane.project(segments)
@@ -483,7 +510,10 @@ def _side_view(
             axes.plot(*flat[:-1, 1].T, "o", color="white", markeredgecolor=colour, markersize=4, zorder=4)
     if (wanted := hand_target(record)) is not None:
         target = edge_on(plane.project(wanted))
-        axes.plot(*target.T, color=style.BLACK, linestyle=(0, (3, 2)), lw=0.9, zorder=5, label=target_name(record))
+        # A short target is a cross, because its dashes could not be recognised.
+        short = scale * float(np.ptp(target, axis=0).max()) < SHORT
+        look = {"marker": "x", "markersize": 7, "linestyle": "none"} if short else {"linestyle": (0, (3, 2)), "lw": 0.9}
+        axes.plot(*target[: 1 if short else None].T, color=style.BLACK, zorder=5, label=target_name(record), **look)
     axes.plot(*plane.project(style.sparse(record["hand_position"])).T, color=path, lw=1.0, zorder=4, label="hand path")
     for _, _, position, force in body.contacts():
         axes.plot(*plane.project(position), zorder=6, linestyle="none", **_contact_mark(force))

@@ -57,7 +57,7 @@ GREY = "#7F7F7F"
 NOTE = "#555555"
 # Colour of parts of links that are below a surface because they have no contact point.
 DEEP = "#882255"
-VARIANT_COLOURS = (BLUE, GREEN, ORANGE, PURPLE, SKY, BLACK, "#8C6D31")
+VARIANT_COLOURS = (BLUE, GREEN, ORANGE, PURPLE, SKY, BLACK, "#8C6D31", "#9E9AC8")
 # Line styles of variants, in addition to colours, or of variants that share a colour.
 DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (5, 1, 1, 1)), (0, (1, 1)), (0, (8, 3)), (0, (3, 1, 1, 1, 1, 1)))
 # Names of colours, line styles and markers in captions.
@@ -88,7 +88,9 @@ _COORDINATE = re.compile(r"(height |roll |pitch |yaw )?\$(x|y|z|\\alpha|\\beta|\
 # Space between the edge of a figure, and its title and notes [inch].
 EDGE = 0.07
 # Spaces before units, before brackets, and in ranges, at which a line is not broken.
-_UNIT = re.compile(r"(?<=\d) (?=(?:[mk]?[smgNWJAV]|mm|N m|kg|rad|Hz|°|%)(?!\w)|…)|(?<=…) | (?=\[)|(?<=N) (?=m\b)")
+_UNIT = re.compile(
+    r"(?<=\d) (?=(?:[mk]?[smgNWJAV]|mm|N m|kg|rad|Hz|°|%)(?!\w)|[…×])|(?<=[…×]) | (?=\[)|(?<=N) (?=m\b)|(?<=azimuth) "
+)
 _GREEK = {"alpha": "α", "beta": "β", "gamma": "γ"}
 # Labels of artists that are in no legend begin with this.
 UNLISTED = "_unlisted "
@@ -122,8 +124,13 @@ _LOOK: Any = {
 LINE_POINTS = 4000
 # A transient panel shows TRANSIENT_ROOM times the transient, unless this exceeds TRANSIENT_MAX_SHARE of the run.
 TRANSIENT_ROOM, TRANSIENT_MAX_SHARE = 1.2, 0.8
+# Curves whose range is below this fraction of their largest value are drawn with zero.
+FLAT = 0.1
+# Curves coincide if they differ by less than this fraction of their axis in this share of the samples.
+NEAR, MOSTLY = 0.01, 0.9
 # Values below this fraction of the scale of a quantity are rounding errors.
 NOTHING = 1e-9
+SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 # Height of a legend row as a multiple of the size of its letters.
 LEGEND_ROW = 1.67
 
@@ -684,8 +691,12 @@ def families(names: Sequence[str]) -> dict[str, tuple[str, str]]:
 
 
 def number(value: float, digits: int = 4, scale: float = 0.0) -> str:
-    """Format a number with a true minus sign, as on the axes; as 0 if it is a rounding error of the ``scale``."""
-    return f"{0.0 if abs(value) < NOTHING * scale else value:.{digits}g}".replace("-", "−")
+    """Format a number with a true minus sign and powers of ten; as 0 if it is a rounding error of the ``scale``."""
+    mantissa, _, power = f"{0.0 if abs(value) < NOTHING * scale else value:.{digits}g}".replace("-", "−").partition("e")
+    if not power:
+        return mantissa
+    exponent = f"10{str(int(power.replace('−', '-'))).translate(SUPERSCRIPTS)}"
+    return {"1": exponent, "−1": f"−{exponent}"}.get(mantissa, f"{mantissa} × {exponent}")
 
 
 def log_axis(axes: Axes, which: str = "y") -> None:
@@ -697,6 +708,45 @@ def log_axis(axes: Axes, which: str = "y") -> None:
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if near else (1.0,)))
     axis.set_major_formatter(FuncFormatter(lambda value, _: number(value, 6)))
     axis.set_minor_formatter(NullFormatter())
+
+
+def label_row(panels: Sequence[Axes], label: str) -> None:
+    """Label the vertical axis of a row of panels; panels with another scale have a separate label."""
+    for axes in panels:
+        if axes is panels[0] or axes.get_ylim() != panels[0].get_ylim():
+            axes.set_ylabel(label)
+
+
+def note_coinciding(figure: Drawing, rows: Sequence[tuple[Axes, Mapping[str, Series]]]) -> None:
+    """Add a note on the variants whose curves, in each of the axes, cannot be distinguished."""
+    groups: dict[str, list[str]] = {}
+    for axes, curves in rows:
+        others = list(curves)
+        while others:
+            first, *others = others
+            same = [name for name in others if _coincide(axes, curves[first], curves[name])]
+            others = [name for name in others if name not in same]
+            if same:
+                text = f"{', '.join([first, *same[:-1]])} and {same[-1]}"
+                groups.setdefault(text, []).append(_words(axes.get_ylabel()).partition(" [")[0])
+    texts = [text + f" ({', '.join(where)})" * (len(where) < len(rows)) for text, where in groups.items()]
+    if texts:
+        figure.note(f"Curves that coincide: {'; '.join(texts)}.")
+
+
+def _coincide(axes: Axes, first: Series, second: Series) -> bool:
+    """Return whether two curves over time, (T,) or (T, k), differ by less than a line is wide."""
+    (time, values), (times, others) = first, second
+    if abs(time[-1] - times[-1]) > NEAR * time[-1]:
+        return False
+    low, high = axes.get_ylim()
+    columns = values.reshape(len(time), -1), others.reshape(len(times), -1)
+    resampled = np.stack([np.interp(time, times, column) for column in columns[1].T], axis=1)
+    both = [columns[0], resampled]
+    if axes.get_yscale() == "log":
+        both, low, high = [np.log(np.maximum(part, low)) for part in both], math.log(low), math.log(high)
+    near = (np.abs(both[0] - both[1]) < NEAR * (high - low)).all(axis=1)
+    return bool(near.mean() > MOSTLY)
 
 
 def at_least(axes: Axes, span: float) -> None:
@@ -800,7 +850,7 @@ def line(axes: Axes, time: Array, values: Array, **options: Any) -> None:
 
 
 def time_rows(
-    figure: Drawing, rows: Sequence[Sequence[Series]], settle: float, *, compress: bool = False
+    figure: Drawing, rows: Sequence[Sequence[Series]], settle: float, *, compress: bool = False, zero: bool = True
 ) -> list[tuple[Axes, ...]]:
     """Create axes for quantities over time, one row each, with a column for the initial transient if needed.
 
@@ -818,6 +868,8 @@ def time_rows(
         Time from which on the values count as settled [s].
     compress : bool, optional
         Use a logarithmic scale beyond the settled range in the transient panel.
+    zero : bool, optional
+        Include zero in the settled range.
 
     Returns
     -------
@@ -826,7 +878,9 @@ def time_rows(
     """
     end = max(time[-1] for row in rows for time, _ in row)
     longest = TRANSIENT_MAX_SHARE * end / TRANSIENT_ROOM
-    transients = [t if t is not None and t.end < longest else None for t in (_transient(row, settle) for row in rows)]
+    transients = [
+        t if t is not None and t.end < longest else None for t in (_transient(row, settle, zero) for row in rows)
+    ]
     window = max((transient.end for transient in transients if transient is not None), default=0.0)
     split = window > 0.0 and not narrow()
     grid = figure.subplots(
@@ -861,14 +915,16 @@ class Transient:
     largest: float
 
 
-def _transient(row: Sequence[Series], settle: float) -> Transient | None:
+def _transient(row: Sequence[Series], settle: float, zero: bool) -> Transient | None:
     """Return the transient of a row, or None if the axis of the row need not be limited."""
     settled = np.concatenate([values[time >= settle].ravel() for time, values in row])
     everything = np.concatenate([values.ravel() for _, values in row])
     settled, everything = settled[np.isfinite(settled)], everything[np.isfinite(everything)]
     if settled.size < 2:
         return None
-    low, high = min(float(settled.min()), 0.0), max(float(settled.max()), 0.0)
+    low, high = float(settled.min()), float(settled.max())
+    if zero or high - low < FLAT * max(-low, high):
+        low, high = min(low, 0.0), max(high, 0.0)
     span = high - low
     if span <= 0.0 or np.ptp(np.append(everything, [low, high])) < 1.5 * span:
         return None
