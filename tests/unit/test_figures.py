@@ -100,7 +100,7 @@ def drawn(figure: Figure | None) -> Figure:
 def assert_pngs(paths: list[Path], folder: Path, names: set[str]) -> None:
     assert {path.stem for path in paths} == names
     # Nothing is left under a temporary name.
-    assert sorted(folder.iterdir()) == sorted(paths)
+    assert sorted(folder.glob("*.png")) == sorted(paths)
     for path in paths:
         data = path.read_bytes()
         assert data.startswith(PNG)

@@ -102,7 +102,7 @@ def test_plot_draws_only_the_figures_with_the_panels(
     monkeypatch.setattr(sys, "argv", ["dynsim", "plot", *files, "--out", str(out), "--panels", "work,vertical"])
     with pytest.raises(SystemExit, match="0"):
         main()
-    assert sorted(path.name for path in out.iterdir()) == ["compare_energy.png", "compare_tracking_error.png"]
+    assert sorted(path.name for path in out.glob("*.png")) == ["compare_energy.png", "compare_tracking_error.png"]
     monkeypatch.setattr(sys, "argv", ["dynsim", "plot", files[0], "--out", str(tmp_path / "no"), "--panels", "bogus"])
     with pytest.raises(SystemExit) as ended:
         main()

@@ -332,7 +332,7 @@ def test_servos_beside_their_limits(simulated):
         ]
         largest = np.abs(record["torque"][:, columns]).max()
         assert len(stalled) == (stall <= snake_tasks.NEAR * largest)
-        assert bool(stalled) != mentions(figure.caption, f"{stall:g} N m")
+        assert bool(stalled) != mentions(figure.notes, f"{stall:g} N m")
         assert any(says(text.get_text(), "gear friction") for text in axis.get_legend().texts) == (friction > 0.0)
         assert axis.get_ylim()[1] >= (stall if stalled else largest)
     worst = record.summary["worst_joint"]
