@@ -159,7 +159,7 @@ def test_arm_of_a_mobile_base_is_on_top() -> None:
 
 
 def test_pedestal_does_not_count_as_an_arm_inside() -> None:
-    """An arm mounted in a box starts as it does without the part inside."""
+    """The part of an arm inside the box on which it is mounted is ignored."""
     pedestal = {"type": "box", "center_m": [0.4, 0.0, -0.05], "edges_m": [1.4, 0.4, 0.12]}
     assert dynsim.build_model(scenario(pedestal)).robot.initial == pytest.approx(
         dynsim.build_model(scenario({"type": "plane", "point_m": [0.0, 0.0, 0.01]})).robot.initial, abs=1e-9
