@@ -66,9 +66,9 @@ def call(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> None:
 
 
 def drawn(folder: Path) -> set[str]:
-    for path in folder.iterdir():
+    for path in folder.glob("*.png"):
         assert path.read_bytes().startswith(PNG)
-    return {path.stem for path in folder.iterdir()}
+    return {path.stem for path in folder.glob("*.png")}
 
 
 @pytest.mark.long
@@ -96,7 +96,7 @@ def test_a_measured_record_is_drawn_by_plot(tmp_path: Path, monkeypatch: pytest.
     call(monkeypatch, "plot", tmp_path / "out" / "measured.h5")
     assert drawn(tmp_path / "out" / "figures") == ARM_FIGURES
     call(monkeypatch, "plot", tmp_path / "out" / "measured.h5", "--format", "svg", "--out", tmp_path / "svg")
-    assert {path.name for path in (tmp_path / "svg").iterdir()} == {f"{name}.svg" for name in ARM_FIGURES}
+    assert {path.name for path in (tmp_path / "svg").glob("*.svg")} == {f"{name}.svg" for name in ARM_FIGURES}
 
 
 def test_measured_beside_simulated(scenic: Rig, tmp_path: Path) -> None:

@@ -666,7 +666,7 @@ def test_single_value_far_beyond_the_others_is_beyond_the_axis():
     assert figure is not None
     assert figure.axes[0].get_ylim()[0] > -10.0
     assert min(np.nanmin(line.get_ydata()) for line in figure.axes[0].lines) > -10.0
-    assert mentions(figure.caption, "1 of 24", "−1e+12")
+    assert mentions(figure.caption, "1 of 24", "−10¹²")
 
 
 def test_result_does_not_replace_a_varied_value_of_the_same_name():
