@@ -77,9 +77,9 @@ def hand_posture(
         position, J = model.point_position_and_jacobian(*robot.hand, q)
         errors, rows = [target - position], [J]
         if orientation is not None:
-            R, origin = model.body_pose(hand, q)
+            R = model.body_pose(hand, q)[0]
             errors.append(turn_error(R @ axes, orientation))
-            rows.append(_turning(model, hand, R, origin, q) * revolute)
+            rows.append(angular_jacobian(model, hand, R, q) * revolute)
         for contact in braces:
             touching, rate = model.point_position_and_jacobian(contact.body, contact.point, q)
             errors.append(np.array([contact.radius - contact.surface.gap(touching)]))
@@ -116,8 +116,8 @@ def _stepped(
     return np.clip(q + step, lower, upper)
 
 
-def _turning(model: Kinematics, body: int, R: Array, origin: Array, q: Array) -> Array:
-    """Return the angular velocity of a body per unit rate, (3, n), from the velocities of its points."""
+def angular_jacobian(model: Kinematics, body: str | int, R: Array, q: Array) -> Array:
+    """Return the angular velocity of a body with rotation R per unit rate, (3, n), from velocities of its points."""
     at_origin = model.point_position_and_jacobian(body, np.zeros(3), q)[1]
     jacobian = np.zeros((3, model.n))
     for k in range(3):

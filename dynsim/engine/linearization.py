@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dynsim.compile.hand_posture import angular_jacobian
 from dynsim.dynamics import state as kst
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.derivative import derivative
@@ -234,12 +235,8 @@ class _Frozen:
         armature = np.where(model.armature == ka.BRAKED, 1.0, model.armature)
         forces, torques = list[Array](), list[Array]()
         for body in model.robot.bodies:
-            rotation, _ = model.body_pose(body, q)
-            jacobian = model.point_jacobian(body, np.zeros(3), q)
-            forces.append(jacobian.T)
-            arms = [model.point_jacobian(body, rotation[k], q) - jacobian for k in range(3)]
-            # The three points at e_k move by ω × e_k, and ω = ½ Σ e_k × (ω × e_k).
-            torques.append(0.5 * np.sum([np.cross(np.eye(3)[k], arm.T) for k, arm in enumerate(arms)], axis=0))
+            forces.append(model.point_jacobian(body, np.zeros(3), q).T)
+            torques.append(angular_jacobian(model, body, model.body_pose(body, q)[0], q).T)
         return np.linalg.cholesky(model.mass_matrix(q) + np.diag(armature)), np.hstack(forces + torques)
 
     def inputs(self) -> dict[str, dict[str, Callable[[NDArray[Any], Array], Array]]]:

@@ -34,7 +34,7 @@ from dynsim.integrators.stepping import tables as kt
 from dynsim.library import families
 from dynsim.model.base_pose import base_pose
 from dynsim.model.description import Array, Contact, Link, Robot
-from dynsim.model.drives import Drive, Servo, TorqueSource
+from dynsim.model.drives import Drive, Servo, TorqueSource, continuous_torque
 from dynsim.model.mobile_base import SUPPORTS, MobileBase
 from dynsim.record import Event, Record
 from dynsim.record.measures import (
@@ -380,9 +380,7 @@ def _ratings(motor: Drive, torque: str) -> dict[str, float]:
         "nominal_current_A": motor.nominal_current,
         "peak_current_A": motor.greatest_current,
         torque: motor.nominal_torque,
-        torque.replace("nominal", "continuous"): min(
-            motor.nominal_torque, motor.joint_constant * motor.nominal_current
-        ),
+        torque.replace("nominal", "continuous"): continuous_torque(motor),
     }
     if isinstance(motor, Servo):
         ratings |= {"stall_torque_N_m": motor.stall_torque, "gear_friction_N_m": motor.coulomb_friction}

@@ -178,6 +178,13 @@ class TorqueSource:
 Drive = Motor | Servo | TorqueSource
 
 
+def continuous_torque(motor: Drive) -> float:
+    """Return the continuous torque or force at the joint [N m or N], limited by rating and nominal current."""
+    if isinstance(motor, TorqueSource):
+        return motor.nominal_torque
+    return min(motor.nominal_torque, motor.joint_constant * motor.nominal_current)
+
+
 # Keys common to all motors of a scenario, and keys of a geared brushed DC motor ([WM] eqs 16–25).
 
 

@@ -22,7 +22,7 @@ from dynsim.errors import DynsimError, ModelError, ScenarioError
 from dynsim.library import families
 from dynsim.model.base_pose import base_coordinates, base_pose
 from dynsim.model.description import Array, Contact, Link, Load, Robot
-from dynsim.model.drives import Servo, TorqueSource
+from dynsim.model.drives import Servo, TorqueSource, continuous_torque
 from dynsim.model.urdf.reader import rotation
 from dynsim.record import Record
 from dynsim.record.joint_motion import yaml_name
@@ -517,14 +517,13 @@ class ArmPosture(StartPosture):
     @cached_property
     def _ratings(self) -> dict[str, tuple[float, float]]:
         """Largest torque at rest and continuous rating of each motor [N m or N]; infinite if unknown."""
-        ratings = {}
-        for motor in self.robot.motors:
-            if isinstance(motor, TorqueSource):
-                ratings[motor.joint] = motor.torque_limit, motor.nominal_torque
-                continue
-            lasting = min(motor.nominal_torque, motor.joint_constant * motor.nominal_current)
-            ratings[motor.joint] = motor.stall_torque, lasting
-        return ratings
+        return {
+            motor.joint: (
+                motor.torque_limit if isinstance(motor, TorqueSource) else motor.stall_torque,
+                continuous_torque(motor),
+            )
+            for motor in self.robot.motors
+        }
 
     @cached_property
     def _uncoupled_model(self) -> Model:

@@ -315,7 +315,7 @@ def test_a_simulation_that_is_killed_ends_the_drive_by_the_policy(drives: Callab
 def test_servos_that_are_gone_end_the_simulation(drives: Callable[..., Drive]) -> None:
     drive = drives()
     client, time_s = drive.begin(), 0.0
-    while time_s < 0.3:  # of the simulation, which may be late on a busy machine
+    while time_s < 0.3:  # simulated time, which lags behind the clock on a busy machine
         client.wish({"y": 1.0})
         time_s = client.until("time")["time"]
     drive.process.kill()

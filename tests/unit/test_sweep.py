@@ -725,7 +725,7 @@ def test_words_are_rows_of_the_lines():
     ("text", "shown"), [("3.632e-11", "3.632 × 10⁻¹¹"), ("1.2e+12", "1.2 × 10¹²"), ("-0.5", "−0.5")]
 )
 def test_exponents_are_powers_of_ten(text: str, shown: str):
-    assert pictures._powers(text) == shown
+    assert style.with_powers(text) == shown
 
 
 def test_colour_bars_stand_below_their_column():

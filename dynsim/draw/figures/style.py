@@ -692,11 +692,15 @@ def families(names: Sequence[str]) -> dict[str, tuple[str, str]]:
 
 def number(value: float, digits: int = 4, scale: float = 0.0) -> str:
     """Format a number with a true minus sign and powers of ten; as 0 if it is a rounding error of the ``scale``."""
-    mantissa, _, power = f"{0.0 if abs(value) < NOTHING * scale else value:.{digits}g}".replace("-", "−").partition("e")
-    if not power:
-        return mantissa
-    exponent = f"10{str(int(power.replace('−', '-'))).translate(SUPERSCRIPTS)}"
-    return {"1": exponent, "−1": f"−{exponent}"}.get(mantissa, f"{mantissa} × {exponent}")
+    text = with_powers(f"{0.0 if abs(value) < NOTHING * scale else value:.{digits}g}")
+    return re.sub(r"^(−?)1 × ", r"\1", text)
+
+
+def with_powers(text: str) -> str:
+    """Return a formatted number with true minus signs and a power of ten instead of an exponent: 3.6 × 10⁻¹¹."""
+    mantissa, exponent, power = text.partition("e")
+    raised = f" × 10{str(int(power)).translate(SUPERSCRIPTS)}" if exponent else ""
+    return f"{mantissa.replace('-', '−')}{raised}"
 
 
 def log_axis(axes: Axes, which: str = "y") -> None:
@@ -728,7 +732,7 @@ def note_coinciding(figure: Drawing, rows: Sequence[tuple[Axes, Mapping[str, Ser
             others = [name for name in others if name not in same]
             if same:
                 text = f"{', '.join([first, *same[:-1]])} and {same[-1]}"
-                groups.setdefault(text, []).append(_words(axes.get_ylabel()).partition(" [")[0])
+                groups.setdefault(text, []).append(_quantity(axes.get_ylabel()))
     texts = [text + f" ({', '.join(where)})" * (len(where) < len(rows)) for text, where in groups.items()]
     if texts:
         figure.note(f"Curves that coincide: {'; '.join(texts)}.")

@@ -45,8 +45,6 @@ _MARKERS, _NUMBERED, _DIGITS = "osD^vP*X", 12, 7.0
 _STEPS = (1, 2, 2.5, 5, 10)
 # Marks in the cells of a map that have no colour.
 _MISSING = {"x": "no run succeeded", "_": "number does not exist"}
-# Letters of exponents.
-_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 # Values farther beyond the middle 80 % than this multiple of their range are beyond the axis.
 _FAR = 30.0
 # Height of a row of words [inch]; part of the axis below which intervals and bars are too short to be seen.
@@ -656,14 +654,7 @@ def _failed(row: Mapping[str, Any]) -> bool:
 
 
 def _rounded(value: float) -> str:
-    return _powers(rounded(value, zeros="#")) if np.isfinite(value) else ""
-
-
-def _powers(text: str) -> str:
-    """Return a number with true minus signs and a power of ten instead of an exponent, e.g. 3.6 × 10⁻¹¹."""
-    mantissa, exponent, power = text.partition("e")
-    raised = f" × 10{str(int(power)).translate(_RAISED)}" if exponent else ""
-    return f"{mantissa.replace('-', '−')}{raised}"
+    return style.with_powers(rounded(value, zeros="#")) if np.isfinite(value) else ""
 
 
 def _label(quantity: Quantity) -> str:
