@@ -10,7 +10,7 @@ from dynsim.compile.model import Model
 from dynsim.dynamics.contact import distance as kd
 from dynsim.errors import ModelError
 from dynsim.model.description import Contact, Robot
-from dynsim.model.surfaces import SIMPLE, Array, Box, Quadric, Surface, shape_arrays
+from dynsim.model.surfaces import SIMPLE, Array, Box, Capsule, Quadric, Surface, shape_arrays
 
 
 def compile_shapes(robot: Robot, contacts: Sequence[Contact]) -> kd.ShapeArrays | None:
@@ -26,7 +26,7 @@ def compile_shapes(robot: Robot, contacts: Sequence[Contact]) -> kd.ShapeArrays 
         along = np.zeros(3)
         if contact.tip is not None:
             along = robot.attached_axes(contact.body) @ (contact.tip - contact.point)
-        point = isinstance(contact.surface, Quadric) and contact.radius == 0.0 and contact.tip is None
+        point = contact.carrier is None and isinstance(contact.surface, Quadric) and contact.radius == 0.0 and contact.tip is None
         if not contact.radius >= 0.0:
             raise ModelError(f"contact {contact.name}: radius {contact.radius} m must be zero or positive")
         if not point and isinstance(contact.surface, Quadric) and contact.surface.drawn.kind not in SIMPLE:
@@ -50,6 +50,8 @@ def moves(contact: Contact) -> bool:
 
 def bends_outward(surface: Surface) -> bool:
     """Return whether the point of a straight axis nearest to a surface, on its free side, can be between the ends."""
+    if isinstance(surface, Capsule):
+        return True
     if isinstance(surface, Quadric):
         return surface.drawn.kind in ("sphere", "cylinder") and (surface.drawn.radius or 0.0) > 0.0
     return isinstance(surface, Box)
@@ -58,6 +60,9 @@ def bends_outward(surface: Surface) -> bool:
 def gap_at(model: Model, contact: Contact, q: Array) -> float:
     """Return the gap [m] of a contact at a configuration, (nq,); raises ModelError for an unknown body."""
     ends = [model.point_position(contact.body, end, q) for end in (contact.point, contact.tip) if end is not None]
+    if contact.carrier is not None:
+        R, p = model.body_pose(contact.carrier, q)
+        ends = [R.T @ (end - p) for end in ends]
     return contact_gap(contact, *ends)
 
 

@@ -415,7 +415,10 @@ def compile_contacts(robot: Robot, contacts: Sequence[Contact], floors: np.ndarr
         link[k, ka.LINK], link[k, ka.FRICTION_LAW] = body, _FRICTION[contact.pulling_friction]
         link[k, ka.LEFT_OUT] = contact.left_out
         point[k, ka.POINT : ka.POINT + 3] = on_body
-        if not isinstance(surface, Quadric):  # use any plane, because its rows are overwritten
+        link[k, ka.CARRIER] = -1
+        if contact.carrier is not None:
+            link[k, ka.CARRIER], _ = _attached(robot, contact.carrier, np.zeros(3), f"surface of contact {contact.name}")
+        if contact.carrier is not None or not isinstance(surface, Quadric):  # use any plane: its rows are overwritten
             point[k, ka.QUADRIC + 8] = 1.0
             continue
         curved = bool(surface.Q.any())

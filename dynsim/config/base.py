@@ -96,6 +96,14 @@ class BodyPoint(StrictConfig):
     point_m: Vector3 = default([0.0, 0.0, 0.0], "coordinates in the axes of the body or frame")
 
 
+class SurfaceConfig(StrictConfig):
+    """Surface that contact points can touch."""
+
+    on: str | None = default(
+        None, "body that carries the surface, which is then described in the axes of this body; default: the world"
+    )
+
+
 def error_at(key: str, message: str) -> PydanticCustomError:
     """Return an error about one dotted ``key``, to be raised by a validator that checks a whole mapping."""
     return PydanticCustomError("value_error", "{message}", {"message": message, "key": key})

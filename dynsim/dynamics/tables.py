@@ -93,7 +93,8 @@ LINK = 0
 FRICTION_LAW = 1
 CURVED = 2  # 0 for a plane: Q = 0, and then b is its unit normal
 LEFT_OUT = 3  # 1: no joint moves the point along the normal in any posture, so that it never has an active row
-CONTACT_LINK_SIZE = 4
+CARRIER = 4  # link on which the surface is fixed, or -1 for the world
+CONTACT_LINK_SIZE = 5
 # ContactArrays.point
 POINT = 0  # 3: in the body's frame [m]
 QUADRIC = 3  # 10: C(r) = r.Q r/2 + b.r + c: Q xx xy xz yy yz zz, b, c
@@ -157,7 +158,7 @@ GAP = 12  # signed distance from the surface [m]
 GAP_RATE = 13  # [m/s]
 NORMAL_FORCE = 14  # f_n [N], zero without rows
 FORCE_VECTOR = 15  # 3: normal and friction force in W [N]
-ANCHOR = 18  # 3: point at which a sticking point is held, in W [m]
+ANCHOR = 18  # 3: point at which a sticking point is held, in the frame of its surface [m]
 FIRST_TANGENT = 21  # 3: directions of a sticking point's tangential rows in W
 SECOND_TANGENT = 24  # 3
 CONTACT_STATE_SIZE = 27

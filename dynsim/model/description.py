@@ -332,6 +332,7 @@ class Contact:
     radius: float = 0.0
     tip: Array | None = None
     left_out: bool = False
+    carrier: str | None = None
 
     @property
     def friction_at_rest(self) -> float:

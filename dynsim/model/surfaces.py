@@ -151,6 +151,19 @@ class Box(_Shaped):
 
 
 @dataclass(frozen=True)
+class Capsule(_Shaped):
+    """A capsule from a start along an axis, (3,) each [m]; the free side is outside."""
+
+    start: Array
+    axis: Array
+    radius: float
+
+    def shifted(self, by: Array) -> Capsule:
+        """The same capsule elsewhere."""
+        return replace(self, start=self.start + by)
+
+
+@dataclass(frozen=True)
 class HeightField(_Shaped):
     """Surface z = h(x, y), a bicubic C² spline through heights on a grid; the free side is above.
 
@@ -223,6 +236,11 @@ def shape_arrays(entries: Sequence[tuple[Surface | None, float, Array, bool]]) -
             data[k, kd.AXES : kd.AXES + 9] = np.asarray(surface.axes).ravel()
             data[k, kd.SIZE : kd.SIZE + 3] = 0.5 * np.asarray(surface.edges) - surface.edge_radius
             data[k, kd.EDGE] = surface.edge_radius
+        elif isinstance(surface, Capsule):
+            kind[k, kd.SURFACE] = kd.CAPSULE
+            data[k, kd.POSITION : kd.POSITION + 3] = surface.start
+            data[k, kd.AXES : kd.AXES + 3] = surface.axis
+            data[k, kd.SIZE] = surface.radius
         elif isinstance(surface, HeightField):
             kind[k, kd.SURFACE] = kd.HEIGHT_FIELD
             if id(surface) not in starts:

@@ -378,7 +378,12 @@ def contacts(scenario: Scenario, described: Robot | None = None) -> list[Contact
     options = scenario.config.contacts
     known = surfaces(scenario)
     described = robot(scenario) if described is None else described
-    result = [_foot(foot, known, options) for foot in described.feet]
+    carriers = {name: config.on for name, config in scenario.config.surfaces.items()}
+    result = [
+        replace(_foot(foot, known, options), carrier=carriers[foot.surface])
+        for foot in described.feet
+        if carriers.get(foot.surface) != foot.body
+    ]
     for name, point in options.points.items():
         if not point.enabled:
             continue
@@ -397,6 +402,7 @@ def contacts(scenario: Scenario, described: Robot | None = None) -> list[Contact
                 surface=known[point.surface],
                 surface_name=point.surface,
                 radius=point.radius_m,
+                carrier=carriers[point.surface],
                 **_law(options, point),
             )
         )

@@ -22,7 +22,7 @@ FIELD = 2  # height field: start of its coefficients in ShapeArrays.fields
 COUNT = 3  # 2: numbers of grid lines along x and y
 SHAPE_KIND_SIZE = 5
 # Kinds of surfaces; AS_POINT: the candidate is a point on the quadric of ContactArrays
-AS_POINT, PLANE, SPHERE, CYLINDER, BOX, HEIGHT_FIELD = 0, 1, 2, 3, 4, 5
+AS_POINT, PLANE, SPHERE, CYLINDER, BOX, HEIGHT_FIELD, CAPSULE = 0, 1, 2, 3, 4, 5, 6
 # ShapeArrays.data
 RADIUS = 0  # ρ [m]
 D = 1  # 3: axis from its start to its end, in the body's frame [m]
@@ -60,6 +60,8 @@ def distance(shapes: ShapeArrays, k, x, y, z):
         return nx * x + ny * y + nz * z, nx, ny, nz, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     if kind == BOX:
         return box_distance(shapes, k, x, y, z)
+    if kind == CAPSULE:
+        return capsule_distance(shapes, k, x, y, z)
     # For a sphere or cylinder, H = (1 − n nᵀ)/r, without the part along the axis of a cylinder.
     if kind == CYLINDER:
         along = nx * x + ny * y + nz * z
@@ -73,6 +75,61 @@ def distance(shapes: ShapeArrays, k, x, y, z):
     hxx, hxy, hxz = h * (1.0 - x * x - nx * nx), h * (-x * y - nx * ny), h * (-x * z - nx * nz)
     hyy, hyz, hzz = h * (1.0 - y * y - ny * ny), h * (-y * z - ny * nz), h * (1.0 - z * z - nz * nz)
     return sign * r - size, sign * x, sign * y, sign * z, hxx, hxy, hxz, hyy, hyz, hzz
+
+
+@internal_kernel
+def capsule_distance(shapes: ShapeArrays, k, x, y, z):
+    """As :func:`distance` for a capsule whose axis begins at the origin and is AXES."""
+    data = shapes.data
+    dx, dy, dz = data[k, AXES], data[k, AXES + 1], data[k, AXES + 2]
+    length = dx * dx + dy * dy + dz * dz
+    u = (x * dx + y * dy + z * dz) / length if length > 0.0 else 0.0
+    between = 1.0 if 0.0 < u < 1.0 else 0.0
+    u = min(max(u, 0.0), 1.0)
+    x, y, z = x - u * dx, y - u * dy, z - u * dz
+    r = math.sqrt(x * x + y * y + z * z)
+    h = 1.0 / max(r, 1e-300)
+    x, y, z = x * h, y * h, z * h
+    e = between / length if length > 0.0 else 0.0
+    return (
+        r - data[k, SIZE],
+        x,
+        y,
+        z,
+        h * (1.0 - x * x - e * dx * dx),
+        h * (-x * y - e * dx * dy),
+        h * (-x * z - e * dx * dz),
+        h * (1.0 - y * y - e * dy * dy),
+        h * (-y * z - e * dy * dz),
+        h * (1.0 - z * z - e * dz * dz),
+    )
+
+
+@internal_kernel
+def nearest_to_capsule(shapes: ShapeArrays, k, x, y, z, dx, dy, dz):
+    """:func:`nearest` of a capsule: of two segments; parallel ones in the middle of where they are side by side."""
+    data = shapes.data
+    ex, ey, ez = data[k, AXES], data[k, AXES + 1], data[k, AXES + 2]
+    rx, ry, rz = x - data[k, POSITION], y - data[k, POSITION + 1], z - data[k, POSITION + 2]
+    a, e = dx * dx + dy * dy + dz * dz, ex * ex + ey * ey + ez * ez
+    b, c, f = dx * ex + dy * ey + dz * ez, dx * rx + dy * ry + dz * rz, ex * rx + ey * ry + ez * rz
+    if e == 0.0:
+        return min(max(-c / a, 0.0), 1.0)
+    det = a * e - b * b
+    if det <= 1e-12 * a * e:
+        # Shares of the own axis at which the ends of the other are beside it.
+        one, two = -c / a, (b - c) / a
+        low, high = max(min(one, two), 0.0), min(max(one, two), 1.0)
+        if low <= high:
+            return 0.5 * (low + high)
+        return 0.0 if max(one, two) < 0.0 else 1.0
+    u = min(max((b * f - c * e) / det, 0.0), 1.0)
+    t = (b * u + f) / e
+    if t < 0.0:
+        return min(max(-c / a, 0.0), 1.0)
+    if t > 1.0:
+        return min(max((b - c) / a, 0.0), 1.0)
+    return u
 
 
 @internal_kernel
@@ -217,6 +274,8 @@ def nearest(shapes: ShapeArrays, k, x, y, z, dx, dy, dz):
     kind, data = shapes.kind[k, SURFACE], shapes.data
     if kind == BOX:
         return nearest_to_box(shapes, k, x, y, z, dx, dy, dz)
+    if kind == CAPSULE:
+        return nearest_to_capsule(shapes, k, x, y, z, dx, dy, dz)
     x, y, z = data[k, POSITION] - x, data[k, POSITION + 1] - y, data[k, POSITION + 2] - z
     length = dx * dx + dy * dy + dz * dz
     if kind == CYLINDER:

@@ -31,15 +31,18 @@ def moves_along_normal(model: ModelArrays, contacts: ContactArrays, ws: Workspac
     links, state = ws.links, ws.contacts
     at, last = vector(state, k, ka.POSITION), contacts.link[k, ka.LINK]
     row = wrench_at(at, vector(state, k, ka.NORMAL), ZERO_VECTOR)
-    square, i, least = dot_vector(at, at), last, abs(gap) / MAX_TRAVEL
-    while i >= 0:
+    square, least = dot_vector(at, at), abs(gap) / MAX_TRAVEL
+    i, j = last, contacts.link[k, ka.CARRIER]
+    while i != j:  # joints below both the body and the carrier of the surface move neither against the other
+        i, j = max(i, j), min(i, j)
         if abs(dot(six(links, i, ka.S), row)) > max(CLEARLY, least):
             return True
         p = vector(links, i, ka.P)
         square = max(square, dot_vector(p, p))
         i = model.tree[i, ka.PARENT]
-    i = last
-    while i >= 0:
+    i, j = last, contacts.link[k, ka.CARRIER]
+    while i != j:
+        i, j = max(i, j), min(i, j)
         S = six(links, i, ka.S)
         turn, shift = S[0] * S[0] + S[1] * S[1] + S[2] * S[2], S[3] * S[3] + S[4] * S[4] + S[5] * S[5]
         if abs(dot(S, row)) > max(IMMOBILE * (math.sqrt(turn * square) + math.sqrt(shift)), least):

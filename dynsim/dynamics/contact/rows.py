@@ -21,11 +21,14 @@ from dynsim.dynamics.tree.spatial import (
     along,
     cross,
     dot_vector,
+    minus_scaled,
     point_acceleration,
     point_velocity,
     put_six,
     put_vector,
     rotate,
+    rotate_back,
+    rotated_symmetric,
     rotation,
     six,
     times_inertia,
@@ -64,10 +67,11 @@ def set_modes(
     for k in range(contacts.link.shape[0]):
         i = contacts.link[k, ka.LINK]
         if modes[k] == ka.STICKING and active[k, ka.MODE] != ka.STICKING:
-            drop_anchor(ws, k)
+            drop_anchor(contacts, ws, k)
         active[k, ka.MODE], active[k, ka.FIRST_ROW] = modes[k], p
         if modes[k] == ka.SLIDING:
             new_row(ws, p, ka.SLIDING_ROW, k, i)
+            active[p, ka.BODY_B] = contacts.link[k, ka.CARRIER]
             active[p, ka.LAW] = contacts.link[k, ka.FRICTION_LAW]
             rows[p, ka.ROW_MU], rows[p, ka.ROW_FLOOR] = contacts.law[k, ka.MU], contacts.law[k, ka.FLOOR]
             p += 1
@@ -75,6 +79,7 @@ def set_modes(
             sticking += 1
             for _ in range(ka.MOST_ROWS):
                 new_row(ws, p, ka.STICKING_ROW, k, i)
+                active[p, ka.BODY_B] = contacts.link[k, ka.CARRIER]
                 p += 1
     if unilateral is not None:
         p = tie_rows(unilateral, ws, p)
@@ -145,11 +150,14 @@ def new_row(ws: Workspace, r, kind, owner, link):
 
 
 @internal_kernel
-def drop_anchor(ws: Workspace, k):
+def drop_anchor(contacts: ContactArrays, ws: Workspace, k):
     """Anchor candidate k at the projection of its present position onto the surface, and set two tangents there."""
-    state = ws.contacts
-    for s in range(3):
-        state[k, ka.ANCHOR + s] = state[k, ka.POSITION + s] - state[k, ka.GAP] * state[k, ka.NORMAL + s]
+    state, carrier = ws.contacts, contacts.link[k, ka.CARRIER]
+    anchor = along(vector(state, k, ka.POSITION), vector(state, k, ka.NORMAL), -state[k, ka.GAP])
+    if carrier >= 0:
+        at = vector(ws.links, carrier, ka.P)
+        anchor = rotate_back(rotation(ws.links, carrier, ka.R), along(anchor, at, -1.0))
+    put_vector(state, k, ka.ANCHOR, anchor)
     tangents(ws, k)
 
 
@@ -178,7 +186,7 @@ def point_row(rows, r, at, d):
 
 
 @noinline_kernel
-def sticking_rows(model: ModelArrays, ws: Workspace, k, i):
+def sticking_rows(model: ModelArrays, contacts: ContactArrays, ws: Workspace, k, i):
     """Write the tangential rows of sticking candidate k on link i; the first row is already written.
 
     The first row is the row of the surface, as for a sliding point, so that the gap remains the distance from the
@@ -192,7 +200,16 @@ def sticking_rows(model: ModelArrays, ws: Workspace, k, i):
     V = six(links, i, ka.V)
     v, a = point_velocity(V, at), point_acceleration(six(links, i, ka.A), V, at)
     a = a[0] + model.gravity[0], a[1] + model.gravity[1], a[2] + model.gravity[2]
-    offset = at[0] - state[k, ka.ANCHOR], at[1] - state[k, ka.ANCHOR + 1], at[2] - state[k, ka.ANCHOR + 2]
+    anchor, carrier = vector(state, k, ka.ANCHOR), contacts.link[k, ka.CARRIER]
+    if carrier >= 0:
+        # The same for the point of the carrier; ċ is the velocity of the body's own point.
+        V = six(links, carrier, ka.V)
+        b = point_acceleration(six(links, carrier, ka.A), V, at)
+        v = along(v, point_velocity(V, at), -1.0)
+        a = a[0] - b[0] - model.gravity[0], a[1] - b[1] - model.gravity[1], a[2] - b[2] - model.gravity[2]
+        a = along(a, cross((V[0], V[1], V[2]), v), -1.0)
+        anchor = transform(vector(links, carrier, ka.P), rotation(links, carrier, ka.R), anchor)
+    offset = along(at, anchor, -1.0)
     for m in range(ka.MOST_ROWS):
         r = first + m
         d = vector(state, k, ka.NORMAL if m == 0 else ka.FIRST_TANGENT if m == 1 else ka.SECOND_TANGENT)
@@ -354,7 +371,7 @@ def contact_rows(model: ModelArrays, contacts: ContactArrays, unilateral: Unilat
         return
     for k in range(contacts.link.shape[0]):
         if ws.active[k, ka.MODE] == ka.STICKING:
-            sticking_rows(model, ws, k, contacts.link[k, ka.LINK])
+            sticking_rows(model, contacts, ws, k, contacts.link[k, ka.LINK])
 
 
 @internal_kernel
@@ -498,16 +515,33 @@ def shaped_row(
     R = rotation(links, i, ka.R)
     s = transform(vector(links, i, ka.P), R, vector(point, k, ka.POINT))
     d = rotate(R, vector(data, k, kd.D))
+    carrier = contacts.link[k, ka.CARRIER]
+    # Point and axis in the frame of the surface.
+    x, e = s, d
+    if carrier >= 0:
+        turned = rotation(links, carrier, ka.R)
+        x = rotate_back(turned, along(s, vector(links, carrier, ka.P), -1.0))
+        e = rotate_back(turned, d)
     u = 0.0
     if shapes.kind[k, kd.MOVES] != 0:
-        u = nearest(shapes, k, s[0], s[1], s[2], d[0], d[1], d[2])
-        s = along(s, d, u)
-    far, nx, ny, nz, hxx, hxy, hxz, hyy, hyz, hzz = distance(shapes, k, s[0], s[1], s[2])
+        u = nearest(shapes, k, x[0], x[1], x[2], e[0], e[1], e[2])
+        s, x = along(s, d, u), along(x, e, u)
+    far, nx, ny, nz, hxx, hxy, hxz, hyy, hyz, hzz = distance(shapes, k, x[0], x[1], x[2])
     n, H = (nx, ny, nz), (hxx, hxy, hxz, hyy, hyz, hzz)
     # Velocity of the body's point at s, and its acceleration at vdot = 0 (A includes −g from the root).
     V = six(links, i, ka.V)
-    w, v, a = (V[0], V[1], V[2]), point_velocity(V, s), point_acceleration(six(links, i, ka.A), V, s)
+    a = point_acceleration(six(links, i, ka.A), V, s)
     a = a[0] + model.gravity[0], a[1] + model.gravity[1], a[2] + model.gravity[2]
+    if carrier >= 0:
+        # From here on, both are relative to the carrier and its point at s.
+        turned, other = rotation(links, carrier, ka.R), six(links, carrier, ka.V)
+        n, H = rotate(turned, n), rotated_symmetric(turned, H)
+        b = point_acceleration(six(links, carrier, ka.A), other, s)
+        V = minus_scaled(V, other, 1.0)
+        coriolis = cross((other[0], other[1], other[2]), point_velocity(V, s))
+        a = a[0] - b[0] - model.gravity[0], a[1] - b[1] - model.gravity[1], a[2] - b[2] - model.gravity[2]
+        a = along(a, coriolis, -2.0)
+    w, v = (V[0], V[1], V[2]), point_velocity(V, s)
     # H v, which becomes ṅ = H ṡ, and v, which becomes ṡ.
     n_rate, s_rate = times_inertia(H, v), v
     second = dot_vector(n, a) + dot_vector(v, n_rate)
@@ -531,11 +565,15 @@ def shaped_row(
     if rolls:
         # The candidate rolls away from its anchor; any two tangents at its present point span the same rows.
         tangents(ws, k)
-    sticking_rows(model, ws, k, i)
+    sticking_rows(model, contacts, ws, k, i)
     if rolls:
-        # v_c − ċ
+        # v_c − ċ, relative to the carrier
         left = along(along(v, s_rate, -1.0), n_rate, radius)
-        extra = cross(w, left)
+        own = six(links, i, ka.V)
+        extra = cross((own[0], own[1], own[2]), left)
+        if carrier >= 0:
+            other = six(links, carrier, ka.V)
+            extra = along(extra, cross((other[0], other[1], other[2]), along(left, v, -1.0)), -1.0)
         for r in range(m + 1, m + 3):
             rows[r, ka.TARGET] += dot_vector(vector(rows, r, ka.ROW + 3), extra)
             rows[r, ka.ROW_GAP] = 0.0

@@ -87,10 +87,10 @@ def row_system(model: ModelArrays, ws: Workspace):
     """
     tree, links, small, state = model.tree, ws.links, ws.small, ws.rows
     for k in range(ws.counts[ka.ROWS]):
+        if ws.active[k, ka.BODY_B] >= 0:
+            two_ended_row(model, ws, k)
+            continue
         if ws.active[k, ka.ROW_KIND] != ka.SLIDING_ROW:
-            if ws.active[k, ka.BODY_B] >= 0:
-                two_ended_row(model, ws, k)
-                continue
             if ws.active[k, ka.ROW_KIND] == ka.STICKING_ROW:
                 if k == ws.active[ws.active[k, ka.OWNER], ka.FIRST_ROW]:
                     sticking_columns(model, ws, k)

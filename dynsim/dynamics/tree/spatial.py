@@ -166,6 +166,14 @@ def compose(A, B):
 
 
 @internal_kernel
+def rotated_symmetric(R, I):
+    """Return R I Rᵀ for a symmetric matrix I (xx xy xz yy yz zz)."""
+    x, y, z = rotate(R, (I[0], I[1], I[2])), rotate(R, (I[1], I[3], I[4])), rotate(R, (I[2], I[4], I[5]))
+    a, b, c = rotate(R, (x[0], y[0], z[0])), rotate(R, (x[1], y[1], z[1])), rotate(R, (x[2], y[2], z[2]))
+    return a[0], a[1], a[2], b[1], b[2], c[2]
+
+
+@internal_kernel
 def turn(B, u, z, s, c):
     """Return B R(u, angle) by Rodrigues' formula, c B + s B [u]× + (1 − c) z uᵀ, with z = B u, sine s and cosine c."""
     d = 1.0 - c

@@ -341,17 +341,27 @@ def slips_along(contacts: ContactArrays, ws: Workspace, k):
 
 @internal_kernel
 def slip_rate(model: ModelArrays, contacts: ContactArrays, unilateral: UnilateralArrays, ws: Workspace, k):
-    """Return the acceleration along REFERENCE of the body point where candidate k touches [m/s²]."""
-    i, at = contacts.link[k, ka.LINK], vector(ws.contacts, k, ka.POSITION)
+    """Return the acceleration along REFERENCE of the body point where candidate k touches [m/s²].
+
+    It is relative to the point of the carrier of the surface.
+    """
+    a, carrier = acceleration_at(model, ws, contacts.link[k, ka.LINK], k), contacts.link[k, ka.CARRIER]
+    if carrier >= 0:
+        b = acceleration_at(model, ws, carrier, k)
+        a = a[0] - b[0], a[1] - b[1], a[2] - b[2]
+    return dot_vector(a, vector(unilateral.slide, k, ku.REFERENCE))
+
+
+@internal_kernel
+def acceleration_at(model: ModelArrays, ws: Workspace, i, k):
+    """Return the acceleration of the point of link i that is where candidate k touches [m/s²]."""
     # A is the acceleration at vdot = 0 and includes −g from the root.
     V, A, j = six(ws.links, i, ka.V), six(ws.links, i, ka.A), i
     while j >= 0:
         A = plus_scaled(A, six(ws.links, j, ka.S), ws.joints[j, ka.QDD])
         j = model.tree[j, ka.PARENT]
-    a, along = point_acceleration(A, V, at), 0.0
-    for s in range(3):
-        along += (a[s] + model.gravity[s]) * unilateral.slide[k, ku.REFERENCE + s]
-    return along
+    a = point_acceleration(A, V, vector(ws.contacts, k, ka.POSITION))
+    return a[0] + model.gravity[0], a[1] + model.gravity[1], a[2] + model.gravity[2]
 
 
 @internal_kernel

@@ -38,6 +38,7 @@ from dynsim.dynamics.tree.spatial import (
     cross,
     dot_vector,
     first_axis,
+    minus_scaled,
     point_velocity,
     put_rotation,
     put_six,
@@ -400,7 +401,7 @@ def restart_memory(system, s: SteppingArrays, ws: Workspace, y):
         note_place(system, state, k, last)
         last[kt.STORED] = spring_energy(system.contacts.law[k, ka.CONTACT_STIFFNESS], state[ka.GAP])
         at = vector(ws.contacts, k, ka.POSITION)
-        v = point_velocity(six(ws.links, system.contacts.link[k, ka.LINK], ka.V), at)
+        v = point_velocity(relative_velocity(system, ws, k), at)
         for m in range(3):
             d = ka.NORMAL if m == 0 else ka.FIRST_TANGENT if m == 1 else ka.SECOND_TANGENT
             last[kt.END_RATE + m] = dot_vector(v, vector(ws.contacts, k, d))
@@ -408,6 +409,13 @@ def restart_memory(system, s: SteppingArrays, ws: Workspace, y):
         if last[kt.END_RATE] >= -kt.BAD:
             slip = slip_of_rates(system.contacts.law, k, last[kt.END_RATE + 1], last[kt.END_RATE + 2])
             last[kt.LISTED], last[kt.CLOSED], last[kt.SLID] = 1.0, 1.0, 1.0 if slip > kt.BAD else 0.0
+
+
+@internal_kernel
+def relative_velocity(system, ws: Workspace, k):
+    """Return the spatial velocity of the body of candidate k relative to the carrier of its surface."""
+    V, carrier = six(ws.links, system.contacts.link[k, ka.LINK], ka.V), system.contacts.link[k, ka.CARRIER]
+    return minus_scaled(V, six(ws.links, carrier, ka.V), 1.0) if carrier >= 0 else V
 
 
 @internal_kernel
@@ -505,7 +513,11 @@ def is_same_contact(system, last, ws: Workspace, k, h):
     at = centre(shapes, state, k)
     square = (at[0] - last[kt.CENTRE]) ** 2 + (at[1] - last[kt.CENTRE + 1]) ** 2 + (at[2] - last[kt.CENTRE + 2]) ** 2
     v = point_velocity(six(ws.links, system.contacts.link[k, ka.LINK], ka.V), at)
-    return math.sqrt(square) <= SAME_PLACE * h * math.sqrt(dot_vector(v, v)) + SHORT_WAY
+    fastest, carrier = dot_vector(v, v), system.contacts.link[k, ka.CARRIER]
+    if carrier >= 0:
+        v = point_velocity(six(ws.links, carrier, ka.V), at)
+        fastest = max(fastest, dot_vector(v, v))
+    return math.sqrt(square) <= SAME_PLACE * h * math.sqrt(fastest) + SHORT_WAY
 
 
 @internal_kernel

@@ -234,8 +234,7 @@ def constraint_rates(model: ModelArrays, ws: Workspace, y, first, out):
         while a >= 0:
             total += y[first + a] * dot(row, six(ws.links, a, ka.S))
             a = model.tree[a, ka.PARENT]
-        if active[r, ka.ROW_KIND] == ka.BODY_ROW:
-            while b >= 0:
-                total -= y[first + b] * dot(row, six(ws.links, b, ka.S))
-                b = model.tree[b, ka.PARENT]
+        while b >= 0:
+            total -= y[first + b] * dot(row, six(ws.links, b, ka.S))
+            b = model.tree[b, ka.PARENT]
         out[r] = total

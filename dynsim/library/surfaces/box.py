@@ -8,12 +8,12 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from dynsim.compile.protocols import BuildContext
-from dynsim.config.base import Lengths, Positive, StrictConfig, Vector3, default, error_at
+from dynsim.config.base import Lengths, Positive, SurfaceConfig, Vector3, default, error_at
 from dynsim.model.surfaces import Box
 from dynsim.model.urdf.reader import rotation
 
 
-class Config(StrictConfig):
+class Config(SurfaceConfig):
     """Box centred at `center_m` and rotated by `rpy_deg`; the robot is outside."""
 
     type: Literal["box"]

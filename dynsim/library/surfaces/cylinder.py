@@ -8,11 +8,11 @@ import numpy as np
 from pydantic import Field
 
 from dynsim.compile.protocols import BuildContext
-from dynsim.config.base import Direction, Positive, StrictConfig, Vector3, default, unit_vector
+from dynsim.config.base import Direction, Positive, SurfaceConfig, Vector3, default, unit_vector
 from dynsim.model.description import Quadric
 
 
-class Config(StrictConfig):
+class Config(SurfaceConfig):
     """Cylinder about the line through `point_m` along `axis`; with `inside: true` the robot is in a pipe."""
 
     type: Literal["cylinder"]

@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field, PrivateAttr, model_validator
 
 from dynsim.compile.protocols import BuildContext
-from dynsim.config.base import Positive, StrictConfig, Vector3, default, error_at
+from dynsim.config.base import Positive, SurfaceConfig, Vector3, default, error_at
 from dynsim.errors import DynsimError
 from dynsim.model.surfaces import HeightField
 from dynsim.record.csv_rows import SIZE_LIMIT, read_grid
@@ -22,7 +22,7 @@ LEAST = 4
 LIMIT = 1e6
 
 
-class Config(StrictConfig):
+class Config(SurfaceConfig):
     """Heights [m] over a grid in the x–y plane, extrapolated linearly; the robot is above."""
 
     type: Literal["height_field"]

@@ -7,11 +7,11 @@ from typing import Literal
 import numpy as np
 
 from dynsim.compile.protocols import BuildContext
-from dynsim.config.base import Direction, StrictConfig, Vector3, default, unit_vector
+from dynsim.config.base import Direction, SurfaceConfig, Vector3, default, unit_vector
 from dynsim.model.description import Quadric
 
 
-class Config(StrictConfig):
+class Config(SurfaceConfig):
     """Plane through `point_m`; the robot is on the side of `normal`."""
 
     type: Literal["plane"]

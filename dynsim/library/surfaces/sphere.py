@@ -8,11 +8,11 @@ import numpy as np
 from pydantic import Field
 
 from dynsim.compile.protocols import BuildContext
-from dynsim.config.base import Positive, StrictConfig, Vector3, default
+from dynsim.config.base import Positive, SurfaceConfig, Vector3, default
 from dynsim.model.description import Quadric
 
 
-class Config(StrictConfig):
+class Config(SurfaceConfig):
     """Sphere about `center_m`; with `inside: true` the robot is in a bowl."""
 
     type: Literal["sphere"]
