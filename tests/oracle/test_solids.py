@@ -42,7 +42,7 @@ def peer(core: np.ndarray) -> tuple[coal.CollisionGeometry, float]:
     return coal.Box(*(2.0 * np.array(half))), radius
 
 
-@pytest.mark.parametrize(("first", "second"), itertools.product(KINDS, KINDS))
+@pytest.mark.parametrize(("first", "second"), list(itertools.product(KINDS, KINDS)))
 def test_distances_and_normals_are_those_of_coal(first: str, second: str) -> None:
     rng = np.random.default_rng([KINDS.index(first), KINDS.index(second)])
     a, b, at_a, at_b = cores(first, rng), cores(second, rng), poses(rng, 0.6), poses(rng, 0.3)
