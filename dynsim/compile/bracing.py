@@ -148,15 +148,19 @@ class BracePlanner:
         Kernel tables of the robot.
     links : (c,) sequence of int
         Index of the body of each brace.
+    carriers : (c,) sequence of int, optional
+        Index of the body that carries the surface of each brace, -1 for the world, the default.
     """
 
-    def __init__(self, robot: Robot, model: ka.ModelArrays, links: Sequence[int]) -> None:
+    def __init__(
+        self, robot: Robot, model: ka.ModelArrays, links: Sequence[int], carriers: Sequence[int] | None = None
+    ) -> None:
         if robot.couplings:
             raise ModelError("brace_statics: coupled joints are not supported, because they share a motor")
         self._model, self._ws = model, ka.workspace(len(robot.links), 0, 0)
         drives = {motor.joint: motor for motor in robot.motors}
         motors = np.array([_motor_row(drives.get(joint)) for joint in robot.joint_names])
-        self.arrays = kb.brace_arrays(integers(links), reals(motors))
+        self.arrays = kb.brace_arrays(integers(links), integers(carriers or [-1] * len(links)), reals(motors))
 
     def motion(self, points: Array, q: Array, v: Array) -> tuple[Array, Array]:
         """Return positions and velocities of points on the braces' bodies along a motion, both (T, c, 3).

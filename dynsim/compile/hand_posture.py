@@ -3,30 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
+from dynsim.compile.touching import Kinematics, touch
 from dynsim.errors import ModelError, UnreachableReference
-from dynsim.model.description import Array, Contact, Robot
+from dynsim.model.description import Array, Contact
 
 ITERATIONS = 200
 # Maximum change of a coordinate in one iteration [rad or m]; it prevents jumps to another solution branch.
 STEP_MAX = 0.3
 # Maximum damping, which applies far from the target; the damping vanishes near the target.
 DAMPING = 1e-2
-
-
-class Kinematics(Protocol):
-    """Methods of :class:`dynsim.Model` that are required to compute postures."""
-
-    robot: Robot
-    n: int
-    nq: int
-
-    def body_pose(self, body: str | int, q: ArrayLike) -> tuple[Array, Array]: ...
-    def point_position_and_jacobian(self, body: str | int, point: ArrayLike, q: ArrayLike) -> tuple[Array, Array]: ...
 
 
 def turn_error(R: Array, wanted: Array) -> Array:
@@ -81,16 +70,16 @@ def hand_posture(
             errors.append(turn_error(R @ axes, orientation))
             rows.append(angular_jacobian(model, hand, R, q) * revolute)
         for contact in braces:
-            touching, rate = model.point_position_and_jacobian(contact.body, contact.point, q)
-            errors.append(np.array([contact.radius - contact.surface.gap(touching)]))
-            rows.append((contact.surface.normal(touching) @ rate)[None])
+            at = touch(model, contact, q)
+            errors.append(np.array([-at.gap]))
+            rows.append((at.normal @ at.jacobian(model, q))[None])
         error, J = np.concatenate(errors), np.vstack(rows)
         size = float(np.abs(error).max())
         if size <= tolerance:
             return q
         q = _stepped(q, J, error * min(1.0, 0.3 / size), size, lower, upper, movable)
-    at = [robot.links[k].joint for k in range(model.n) if q[k] in (lower[k], upper[k])]
-    stuck = f"; at their limits: {', '.join(at)}" if at else ""
+    limited = [robot.links[k].joint for k in range(model.n) if q[k] in (lower[k], upper[k])]
+    stuck = f"; at their limits: {', '.join(limited)}" if limited else ""
     left = float(np.abs(error).max())
     raise UnreachableReference(
         f"no posture near the start satisfies all targets for hand and braces: residual {left:.3g} [m or rad]{stuck}; "

@@ -12,6 +12,7 @@ from collections.abc import Collection, Iterable, Sequence
 import numpy as np
 
 from dynsim.compile.model import Model
+from dynsim.compile.touching import Touch, touch
 from dynsim.config.problems import listed
 from dynsim.dynamics.contact.mobility import IMMOBILE
 from dynsim.dynamics.linear import RANK_TOLERANCE
@@ -73,13 +74,11 @@ def moves(
     With ``anywhere``, motion along the surface also counts. Joints in ``braked`` are ignored.
     """
     free = [i for i in range(model.n) if i not in braked]
-    points = [contact.point]
-    if contact.tip is not None:
-        points = [contact.point + share * (contact.tip - contact.point) for share in SHARES]
     for q in configurations:
-        for point in points:
-            position, jacobian = model.point_position_and_jacobian(contact.body, point, q)
-            rates = (jacobian if anywhere else contact.surface.normal(position) @ jacobian)[..., free]
+        for share in SHARES[: None if contact.tip is not None else 1]:
+            at = touch(model, contact, q, share)
+            jacobian = at.jacobian(model, q)
+            rates = (jacobian if anywhere else at.normal @ jacobian)[..., free]
             if np.abs(rates).max(initial=0.0) > SAME:
                 return True
     return False
@@ -106,15 +105,15 @@ def immobile(
     return still
 
 
-def immobile_at(model: Model, link: int, point: Array, normal: Array, q: Array) -> bool:
-    """Return whether the motion of a link's point along a normal is only a rounding error in a posture.
+def immobile_at(model: Model, at: Touch, q: Array) -> bool:
+    """Return whether the motion of a contact along its normal is only a rounding error in a posture.
 
     The limit is the same as in :func:`dynsim.dynamics.contact.mobility.moves_along_normal`.
     """
-    position, jacobian = model.point_position_and_jacobian(link, point, q)
-    places = np.vstack([model.joint_positions(q), position])
+    jacobian = at.jacobian(model, q)
+    places = np.vstack([model.joint_positions(q), at.position])
     scale = np.linalg.norm(places, axis=1).max() + np.linalg.norm(jacobian, axis=0)
-    return bool((np.abs(normal @ jacobian) <= IMMOBILE * scale).all())
+    return bool((np.abs(at.normal @ jacobian) <= IMMOBILE * scale).all())
 
 
 def mobility_floors(
@@ -132,8 +131,8 @@ def mobility_floors(
     for q in random_configurations(model.robot, braked, at)[:2]:
         inertia = np.diag(model.mass_matrix(q)) + model.armature
         for k, contact in enumerate(contacts):
-            position, jacobian = model.point_position_and_jacobian(contact.body, contact.point, q)
-            typical = float(((contact.surface.normal(position) @ jacobian) ** 2 / inertia).sum())
+            nearest = touch(model, contact, q, 0.0)
+            typical = float(((nearest.normal @ nearest.jacobian(model, q)) ** 2 / inertia).sum())
             floors[k] = max(floors[k], RANK_TOLERANCE * typical)
     return floors
 

@@ -10,8 +10,8 @@ import numpy as np
 from dynsim.compile.bracing import MIN_N, BracePlanner, brace_rows
 from dynsim.compile.mobility import immobile_at
 from dynsim.compile.model import Model
-from dynsim.compile.shapes import gap_at, share_of_axis
 from dynsim.compile.solids import axes_inside, passes_through, tangent_planes
+from dynsim.compile.touching import Touch, gap_at, touch
 from dynsim.dynamics.contact.braces import statics as kb
 from dynsim.errors import ModelError, first_few
 from dynsim.model.description import Array, Contact, Load, Robot
@@ -32,11 +32,11 @@ STEP_MAX = 0.3  # maximum step per iteration [rad or m]; prevents jumps to anoth
 
 
 def gaps_and_rates(model: Model, contacts: Sequence[Contact], q: Array) -> tuple[Array, Array]:
-    """Return the distances of points and spheres from surfaces, (c,) [m], and their derivatives, (c, n) [m/rad]."""
+    """Return the distances of contacts from surfaces, (c,) [m], and their derivatives, (c, n) [m/rad]."""
     gaps, rates = np.zeros(len(contacts)), np.zeros((len(contacts), model.n))
     for k, contact in enumerate(contacts):
-        position, jacobian = model.point_position_and_jacobian(contact.body, contact.point, q)
-        gaps[k], rates[k] = contact.surface.gap(position) - contact.radius, contact.surface.normal(position) @ jacobian
+        nearest = touch(model, contact, q)
+        gaps[k], rates[k] = nearest.gap, nearest.normal @ nearest.jacobian(model, q)
     return gaps, rates
 
 
@@ -199,8 +199,6 @@ def _furthest_beyond(robot: Robot, columns: Sequence[int], q: Array) -> tuple[in
 # Contacts with a gap below this [m] count as closed at the start.
 TOUCHING = 1e-6
 KEYS = ("initial", "equilibrium")
-# A contact, its link, the point on it [m], the normal in the world, and the gap [m].
-Touching = tuple[Contact, int, Array, Array, float]
 # Fraction of the static friction that an equilibrium uses at most, unless it needs the full friction.
 RESERVED = 0.9
 
@@ -283,75 +281,65 @@ def holding_torques(
             for follow_springs in ways
             for least in (MIN_N, 0.0)
         ]
-    pushes = [
-        _row(link, point, push, 0.0, 0.0, float(np.linalg.norm(push)))
-        for link, point, push in load_forces(model, q, loads)
-    ]
+    loaded = load_forces(model, q, loads)
+    pushes = [_row(point, push, 0.0, 0.0, float(np.linalg.norm(push))) for _, point, push in loaded]
     driven = replace(robot, motors=tuple(motor for motor in robot.motors if motor.joint in able))
     for share, least, follow_springs in attempts:
         rows = []
-        for contact, link, point, normal, _ in touching:
+        for at in touching:
             # The force of the spring is either prescribed or the target of a search.
-            spring = np.nan if springs is None else springs[contact.name]
+            spring = np.nan if springs is None else springs[at.contact.name]
             commanded = spring if follow_springs else np.nan
-            rows.append(_row(link, point, normal, share * contact.friction_at_rest, least, commanded))
+            rows.append(_row(at.point, at.normal, share * at.contact.friction_at_rest, least, commanded))
             if not (follow_springs or np.isnan(spring)):
-                rows[-1][1][[kb.NEAR, kb.COMPLIANCE]] = spring, 1.0 / contact.stiffness
+                rows[-1][[kb.NEAR, kb.COMPLIANCE]] = spring, 1.0 / at.contact.stiffness
             if not real:
-                rows.append(_row(link, point, -normal, 0.0, 0.0))
-        planner = BracePlanner(driven, model.arrays, [link for link, _ in (*rows, *pushes)])
-        tables = np.array([table for _, table in (*rows, *pushes)]).reshape(1, -1, kb.BRACE_SIZE)
+                rows.append(_row(at.point, -at.normal, 0.0, 0.0))
+        sides = 1 if real else 2
+        links = [at.link for at in touching for _ in range(sides)] + [link for link, *_ in loaded]
+        carriers = [at.carrier for at in touching for _ in range(sides)] + [-1] * len(loaded)
+        planner = BracePlanner(driven, model.arrays, links, carriers)
+        tables = np.array([*rows, *pushes]).reshape(1, -1, kb.BRACE_SIZE)
         still, arrays = np.zeros((1, model.n)), planner.arrays
         torques, normal_N, solved = planner.least_heat(q[None], still, still, tables)
         if solved == 1:
             pressed = normal_N[0, : len(rows)]
             normal = pressed if real else pressed[::2] - pressed[1::2]
-            names = [contact.name for contact, *_ in touching]
+            names = [at.contact.name for at in touching]
             forces = arrays.forces[: len(rows)] if real else arrays.forces[: len(rows)].reshape(-1, 2, 3).sum(axis=1)
-            places = [(link, point, force) for (_, link, point, *_), force in zip(touching, forces, strict=True)]
-            return Rest(torques[0], dict(zip(names, normal.tolist(), strict=True)), places, share == 1.0)
+            acting = [pair for at, force in zip(touching, forces, strict=True) for pair in _acting(model, q, at, force)]
+            return Rest(torques[0], dict(zip(names, normal.tolist(), strict=True)), acting, share == 1.0)
     raise ModelError(
-        _describe_weak_joints(model, arrays.motors, arrays.free, [contact[0].name for contact in touching]), keys=KEYS
+        _describe_weak_joints(model, arrays.motors, arrays.free, [at.contact.name for at in touching]), keys=KEYS
     )
 
 
 def touching_contacts(
     model: Model, contacts: Sequence[Contact], q: Array, real: bool, named: Container[str] | None = None
-) -> list[Touching]:
+) -> list[Touch]:
     """Return the contacts that touch and can carry load, or only the ``named`` contacts, whatever their gaps."""
-    touching = [(contact, *_touching_point(model, contact, q)) for contact in contacts]
+    nearest = [touch(model, contact, q) for contact in contacts if not contact.left_out]
     touching = [
-        entry
-        for entry in touching
-        if (abs(entry[-1]) <= TOUCHING or (real and entry[-1] < 0.0) if named is None else entry[0].name in named)
+        at
+        for at in nearest
+        if (abs(at.gap) <= TOUCHING or (real and at.gap < 0.0) if named is None else at.contact.name in named)
     ]
     # A point that no joint moves along its normal carries no force, see dynsim.integrators.contacts.impacts.
-    return [
-        entry for entry in touching if not (entry[0].left_out or immobile_at(model, entry[1], entry[2], entry[3], q))
-    ]
+    return [at for at in touching if not immobile_at(model, at, q)]
 
 
-def _touching_point(model: Model, contact: Contact, q: Array) -> tuple[int, Array, Array, float]:
-    """Return the link, the point of contact in its frame [m], the normal in the world and the gap [m]."""
-    robot = model.robot
-    position, point = model.point_position(contact.body, contact.point, q), contact.point
-    if contact.tip is not None:
-        end = model.point_position(contact.body, contact.tip, q)
-        share = share_of_axis(contact, position, end)
-        position, point = position + share * (end - position), point + share * (contact.tip - point)
-    normal = np.asarray(contact.surface.normal(position), dtype=np.float64)
-    gap = contact.surface.gap(position) - contact.radius
-    link, on_link = robot.attach(contact.body, point)
-    if contact.radius > 0.0:
-        on_link = on_link - contact.radius * (model.body_pose(link, q)[0].T @ normal)
-    return link, on_link, normal, float(gap)
+def _acting(model: Model, q: Array, at: Touch, force: Array) -> list[tuple[int, Array, Array]]:
+    """Return the forces of a contact on its link and on the link that carries the surface, as in :class:`Rest`."""
+    acting = [(at.link, at.point, force)]
+    if at.carrier >= 0:
+        R, p = model.body_pose(at.carrier, q)
+        acting.append((at.carrier, R.T @ (at.position - p), -force))
+    return acting
 
 
-def _row(
-    link: int, point: Array, normal: Array, friction: float, least: float, force: float = np.nan
-) -> tuple[int, Array]:
-    """Return a brace that does not slide, for the kernels: its link and its table row."""
-    return link, brace_rows(point, normal[None], np.array([friction]), least, force, np.zeros((1, 3)))[0]
+def _row(point: Array, normal: Array, friction: float, least: float, force: float = np.nan) -> Array:
+    """Return the table row of a brace that does not slide, for the kernels."""
+    return brace_rows(point, normal[None], np.array([friction]), least, force, np.zeros((1, 3)))[0]
 
 
 def load_torques(model: Model, q: Array, loads: Sequence[Load], time: float = 0.0) -> Array:

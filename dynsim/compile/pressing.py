@@ -23,8 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.compile.model import Model
-from dynsim.compile.posture import BEYOND, KEYS, Touching, holding_torques, touching_contacts
-from dynsim.compile.shapes import gap_at
+from dynsim.compile.posture import BEYOND, KEYS, holding_torques, touching_contacts
+from dynsim.compile.touching import Touch, gap_at
 from dynsim.dynamics.tree.joints import normalise, positions_along, rates_across
 from dynsim.errors import ModelError, first_few
 from dynsim.model.description import Array, Contact, Load
@@ -61,8 +61,8 @@ def pressed_in(
         If no torques hold the posture, or if no nearby posture is found in which the contacts carry their forces.
     """
     touching = touching_contacts(model, contacts, model.robot.initial, real)
-    names = [contact.name for contact, *_ in touching]
-    compliant = [contact.name for contact, *_ in touching if contact.stiffness > 0.0]
+    names = [at.contact.name for at in touching]
+    compliant = [at.contact.name for at in touching if at.contact.stiffness > 0.0]
     if not compliant:
         return model
 
@@ -136,8 +136,10 @@ def _search(
         q, size = _step(model, q, touching, forces) if touching else (q, 0.0)
         # A contact that carries load may open within a step. An unloaded contact carries load only if the posture
         # cannot be held otherwise.
-        meeting = [c.name for c, *_, gap in touching_contacts(model, contacts, q, real) if not c.stiffness or gap < 0.0]
-        carrying = [c.name for c, *_ in touching if not c.stiffness or forces[c.name] > NEARLY * c.stiffness]
+        near = touching_contacts(model, contacts, q, real)
+        meeting = [at.contact.name for at in near if not at.contact.stiffness or at.gap < 0.0]
+        closed = [at.contact for at in touching]
+        carrying = [c.name for c in closed if not c.stiffness or forces[c.name] > NEARLY * c.stiffness]
         for named in ([*carrying, *meeting], [*names, *meeting]):
             touching = touching_contacts(model, contacts, q, real, named)
             if (next_forces := holding(q, spring_forces(touching))) is not None:
@@ -147,7 +149,8 @@ def _search(
         forces = next_forces
         # If friction shares the load with normal forces, the split between them is only as accurate as the search.
         if size <= DONE or before <= size <= NEARLY:
-            lacking = [abs(forces[c.name] / c.stiffness + gap) for c, *_, gap in touching if c.stiffness > 0.0]
+            soft = [at for at in touching if at.contact.stiffness > 0.0]
+            lacking = [abs(forces[at.contact.name] / at.contact.stiffness + at.gap) for at in soft]
             # Rigid contacts or limits may prevent joints from pressing springs in further.
             if max(lacking, default=0.0) <= NEARLY:
                 return q, forces
@@ -157,26 +160,27 @@ def _search(
     return None
 
 
-def spring_forces(touching: Sequence[Touching]) -> dict[str, float]:
+def spring_forces(touching: Sequence[Touch]) -> dict[str, float]:
     """Return the normal force of each contact [N]: computed from the depth if it is compliant, NaN if it is rigid."""
     return {
-        contact.name: max(-contact.stiffness * gap, 0.0) if contact.stiffness > 0.0 else np.nan
-        for contact, *_, gap in touching
+        at.contact.name: max(-at.contact.stiffness * at.gap, 0.0) if at.contact.stiffness > 0.0 else np.nan
+        for at in touching
     }
 
 
-def _step(model: Model, q: Array, touching: Sequence[Touching], forces: Mapping[str, float]) -> tuple[Array, float]:
+def _step(model: Model, q: Array, touching: Sequence[Touch], forces: Mapping[str, float]) -> tuple[Array, float]:
     """Return the posture to which these forces press the contacts in, to first order, and the largest displacement.
 
     The step is damped until the gaps change approximately as the Jacobian predicts. A spring that can only be pressed
     in by a large rotation, for example at a wedged arm, is then pressed in less.
     """
-    rigid = np.array([contact.stiffness == 0.0 for contact, *_ in touching])
-    roots = np.sqrt([contact.stiffness for contact, *_ in touching])
-    rows = np.array([normal @ model.point_jacobian(link, point, q) for _, link, point, normal, _ in touching])
-    gaps = np.array([gap for *_, gap in touching])
+    closed = [at.contact for at in touching]
+    rigid = np.array([contact.stiffness == 0.0 for contact in closed])
+    roots = np.sqrt([contact.stiffness for contact in closed])
+    rows = np.array([at.normal @ at.jacobian(model, q) for at in touching])
+    gaps = np.array([at.gap for at in touching])
     wanted = -gaps - [
-        forces[contact.name] / contact.stiffness if contact.stiffness > 0.0 else 0.0 for contact, *_ in touching
+        forces[contact.name] / contact.stiffness if contact.stiffness > 0.0 else 0.0 for contact in closed
     ]
     for damping in DAMPINGS:
         step = _within_limits(model, q, rows, wanted, rigid, roots, damping)
@@ -184,7 +188,7 @@ def _step(model: Model, q: Array, touching: Sequence[Touching], forces: Mapping[
         positions_along(model.arrays, q, 0, step, change)
         after += change
         normalise(model.arrays, after, 0)
-        expected, changed = rows @ step, [gap_at(model, contact, after) for contact, *_ in touching] - gaps
+        expected, changed = rows @ step, [gap_at(model, contact, after) for contact in closed] - gaps
         if np.abs(changed - expected).max() <= AGREES * np.abs(expected).max() + NEARLY:
             break
     return after, float(np.abs(step).max())

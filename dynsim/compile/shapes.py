@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from dynsim.compile.model import Model
 from dynsim.dynamics.contact import distance as kd
 from dynsim.errors import ModelError
 from dynsim.model.description import Contact, Robot
@@ -26,7 +25,8 @@ def compile_shapes(robot: Robot, contacts: Sequence[Contact]) -> kd.ShapeArrays 
         along = np.zeros(3)
         if contact.tip is not None:
             along = robot.attached_axes(contact.body) @ (contact.tip - contact.point)
-        point = contact.carrier is None and isinstance(contact.surface, Quadric) and contact.radius == 0.0 and contact.tip is None
+        point = contact.radius == 0.0 and contact.tip is None and contact.carrier is None
+        point &= isinstance(contact.surface, Quadric)
         if not contact.radius >= 0.0:
             raise ModelError(f"contact {contact.name}: radius {contact.radius} m must be zero or positive")
         if not point and isinstance(contact.surface, Quadric) and contact.surface.drawn.kind not in SIMPLE:
@@ -55,24 +55,6 @@ def bends_outward(surface: Surface) -> bool:
     if isinstance(surface, Quadric):
         return surface.drawn.kind in ("sphere", "cylinder") and (surface.drawn.radius or 0.0) > 0.0
     return isinstance(surface, Box)
-
-
-def gap_at(model: Model, contact: Contact, q: Array) -> float:
-    """Return the gap [m] of a contact at a configuration, (nq,); raises ModelError for an unknown body."""
-    ends = [model.point_position(contact.body, end, q) for end in (contact.point, contact.tip) if end is not None]
-    if contact.carrier is not None:
-        R, p = model.body_pose(contact.carrier, q)
-        ends = [R.T @ (end - p) for end in ends]
-    return contact_gap(contact, *ends)
-
-
-def contact_gap(contact: Contact, start: Array, end: Array | None = None) -> float:
-    """Return the gap [m] of a contact with its point at ``start``, (3,), and the other end of its axis at ``end``."""
-    nearest = start if end is None else start + share_of_axis(contact, start, end) * (end - start)
-    try:
-        return contact.surface.gap(nearest) - contact.radius
-    except ModelError as error:
-        raise ModelError(f"contact {contact.name} {error}") from None
 
 
 def share_of_axis(contact: Contact, start: Array, end: Array) -> float:

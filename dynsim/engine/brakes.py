@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from dynsim.compile.mobility import immobile, mobility_floors
-from dynsim.compile.shapes import gap_at
+from dynsim.compile.touching import gap_at
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact.rows import row_errors, set_modes
 from dynsim.dynamics.derivative import derivative

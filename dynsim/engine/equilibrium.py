@@ -119,10 +119,10 @@ def balanced(
     planned = control.reference.voltage
     if not len(planned):
         touching = touching_contacts(model, contacts, robot.initial, real)
-        springs = spring_forces([entry for entry in touching if entry[0].stiffness == 0.0 or entry[-1] < 0.0])
+        springs = spring_forces([at for at in touching if at.contact.stiffness == 0.0 or at.gap < 0.0])
         balance = holding_torques(model, robot.initial, contacts, loads, _torque_joints(model, control), real, springs)
         torques, on_edge = balance.torques, balance.on_edge
-        forces = {contact.name: balance.normal_forces.get(contact.name, 0.0) for contact, *_ in touching}
+        forces = {at.contact.name: balance.normal_forces.get(at.contact.name, 0.0) for at in touching}
     else:
         # The plan determines the contact forces; it does not include loads, which the motors carry.
         torques, forces = load_torques(model, robot.initial, loads), {}
@@ -193,15 +193,13 @@ def _relied_on(
         if not isinstance(motor, TorqueSource):
             left[i] -= motor.joint_constant * u / motor.resistance
     touching = touching_contacts(model, contacts, robot.initial, real)
-    rows = np.array(
-        [normal @ model.point_jacobian(link, point, robot.initial) for _, link, point, normal, _ in touching]
-    )
+    rows = np.array([at.normal @ at.jacobian(model, robot.initial) for at in touching])
     if not len(rows):
         return []
     forces = np.linalg.lstsq(rows.T, left, rcond=None)[0]
     least = NO_FORCE * sum(link.inertia.mass for link in robot.links) * float(np.linalg.norm(robot.gravity))
-    named = zip(touching, forces, strict=True)
-    return [contact.name for (contact, *_), force in named if contact.stiffness > 0.0 and abs(force) > least]
+    named = zip((at.contact for at in touching), forces, strict=True)
+    return [contact.name for contact, force in named if contact.stiffness > 0.0 and abs(force) > least]
 
 
 def _torque_joints(model: Model, control: JointControl) -> list[str]:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.compile.model import Model
-from dynsim.compile.shapes import share_of_axis
+from dynsim.compile.touching import touch
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import delassus as kq
 from dynsim.dynamics.contact.rows import SIGNS_LIMIT
@@ -436,15 +436,9 @@ def free_rates(model: Model) -> Array:
 
 
 def contact_point(model: Model, contact: Contact, q: Array) -> tuple[Array, Array]:
-    """Return the surface normal, (3,), and the Jacobian of the point nearest to the surface, (3, n)."""
-    body, point = model.robot.attach(contact.body, contact.point)
-    if contact.tip is not None:
-        end = model.robot.attach(contact.body, contact.tip)[1]
-        start, other = (model.point_position(body, at, q) for at in (point, end))
-        point = point + share_of_axis(contact, start, other) * (end - point)
-    rotation, origin = model.body_pose(body, q)
-    normal = contact.surface.normal(origin + rotation @ point)
-    return normal, model.point_jacobian(body, point - contact.radius * (rotation.T @ normal), q)
+    """Return normal, (3,), and Jacobian of the velocity against the surface, (3, n), where a contact touches."""
+    at = touch(model, contact, q)
+    return at.normal, at.jacobian(model, q)
 
 
 def touching_rows(model: Model, contact: Contact, q: Array, sticks: bool) -> Array:

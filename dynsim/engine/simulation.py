@@ -25,9 +25,9 @@ from dynsim.compile.control import END_SLACK
 from dynsim.compile.model import Model
 from dynsim.compile.posture import holding_torques, load_forces, static_margin
 from dynsim.compile.references.teleop import VelocitySource
-from dynsim.compile.shapes import gap_at
 from dynsim.compile.tables import check_couplings, joint_stops
 from dynsim.compile.tie_rests import deflection, may_have_slid, rest_here, set_rests
+from dynsim.compile.touching import gap_at
 from dynsim.dynamics import state as kst
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dynsim.compile.model import Model
-from dynsim.compile.shapes import gap_at
+from dynsim.compile.touching import gap_at
 from dynsim.dynamics import tables as ka
 from dynsim.engine.force_indeterminacy import touching_rows
 from dynsim.engine.prepare import drive_slopes

@@ -342,7 +342,7 @@ class Contact:
     @property
     def geometry(self) -> tuple[str, str, Array, Surface, float, Array | None]:
         """Everything that determines the location of the contact and the surface that it can touch, without its law."""
-        return self.name, self.body, self.point, self.surface, self.radius, self.tip
+        return self.name, self.body, self.point, self.surface, self.radius, self.tip, self.carrier
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from dynsim.compile.mobility import immobile
 from dynsim.compile.model import Model
 from dynsim.compile.posture import on_surfaces
 from dynsim.compile.protocols import BuildContext
-from dynsim.compile.shapes import gap_at
+from dynsim.compile.touching import gap_at
 from dynsim.config.base import BodyPoint
 from dynsim.config.problems import dotted, errors_at, suggest
 from dynsim.errors import ModelError, ScenarioError, brief
@@ -378,7 +378,7 @@ def contacts(scenario: Scenario, described: Robot | None = None) -> list[Contact
     options = scenario.config.contacts
     known = surfaces(scenario)
     described = robot(scenario) if described is None else described
-    carriers = {name: config.on for name, config in scenario.config.surfaces.items()}
+    carriers = _carriers(scenario, described)
     result = [
         replace(_foot(foot, known, options), carrier=carriers[foot.surface])
         for foot in described.feet
@@ -418,6 +418,20 @@ def contacts(scenario: Scenario, described: Robot | None = None) -> list[Contact
         result += [replace(contact, **law) for contact in own]
     error = scenario.config.surface_error
     return result if error is None else [_scaled_friction(contact, error.friction_factor) for contact in result]
+
+
+def _carriers(scenario: Scenario, described: Robot) -> dict[str, str | None]:
+    """Return the body that carries each surface, None for the world; raises ModelError for an unknown body."""
+    bodies = described.bodies
+    for name, config in scenario.config.surfaces.items():
+        if config.on is not None and config.on not in bodies:
+            keys = ("surfaces", name, "on")
+            raise ModelError(
+                f"{dotted(keys)} = {config.on!r}: no such moving body{suggest(config.on, bodies)}; "
+                f"bodies: {', '.join(bodies)}",
+                keys=keys,
+            )
+    return {name: config.on for name, config in scenario.config.surfaces.items()}
 
 
 def _foot(foot: Foot, known: Mapping[str, Surface], options: Contacts) -> Contact:

@@ -15,7 +15,7 @@ from dynsim.compile.model import Model
 from dynsim.compile.posture import HAND, Rest, holding_torques, load_forces, load_torques, on_surfaces, static_margin
 from dynsim.compile.protocols import BuildContext
 from dynsim.compile.scene import drawn_surface, snake_scene
-from dynsim.compile.shapes import gap_at
+from dynsim.compile.touching import gap_at
 from dynsim.engine import check, named
 from dynsim.engine.recording import drawn_scene, pictured_parts, provenance
 from dynsim.errors import DynsimError, ModelError, ScenarioError

@@ -11,7 +11,8 @@ from scipy.optimize import minimize, minimize_scalar
 from support.random_robots import CompiledSystem, assemble, random_robot, random_rotation, random_unit
 
 from dynsim.compile.model import Model
-from dynsim.compile.shapes import compile_shapes, contact_gap, moves, touching_points
+from dynsim.compile.shapes import compile_shapes, moves, share_of_axis, touching_points
+from dynsim.compile.touching import gap_at
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact.rows import set_modes
 from dynsim.dynamics.state import OUT_FORCE
@@ -138,7 +139,7 @@ def test_gaps_are_distances_found_by_other_means(kind, shape):
         gap = b.ws.contacts[0, ka.GAP]
         # A simplex finds the distance to the square of its tolerance; so does a bracketed minimum (1e-8) but at a kink.
         assert gap == pytest.approx(brute_gap(contact, start, end), abs=2e-8 if shape == "capsule" else 1e-9)
-        assert contact_gap(contact, start, end) == pytest.approx(gap, abs=1e-12)
+        assert gap_at(model, contact, q) == pytest.approx(gap, abs=1e-12)
 
 
 @pytest.mark.parametrize(("kind", "shape"), CASES)
@@ -168,7 +169,8 @@ def test_capsules_over_edges_of_a_box():
         points = start + u[:, None] * (end - start)
         core = 0.5 * box.edges - box.edge_radius
         nearest = np.linalg.norm(points - np.clip(points, -core, core), axis=1).min() - box.edge_radius - 0.02
-        assert contact_gap(contact, start, end) == pytest.approx(
+        share = share_of_axis(contact, start, end)
+        assert box.gap(start + share * (end - start)) - contact.radius == pytest.approx(
             nearest, abs=2e-9 + 1e-4 * (end - start) @ (end - start) / 20
         )
 

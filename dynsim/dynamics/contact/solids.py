@@ -1,8 +1,8 @@
 """Contacts between two solids: spheres, capsules and rounded boxes, all as a box with half edges h and a radius r.
 
 h = 0 is a sphere, one nonzero half edge a capsule, three a box whose edges are rounded. The core |x_i| ≤ h_i is
-convex, and the distance of two solids is the distance of their cores minus both radii. It is attained at a corner of one
-core or between two edges. A pair has at most :data:`SLOTS` contacts: places that touch at the same time, such as
+convex, and the distance of two solids is the distance of their cores minus both radii. It is attained at a corner of
+one core or between two edges. A pair has at most :data:`SLOTS` contacts: places that touch at the same time, such as
 the corners of two faces. A slot keeps its place from step to step, because time stepping remembers impulses by slot.
 """
 
@@ -253,4 +253,5 @@ def pair_distances(poses_a, cores_a, poses_b, cores_b, slots, places, chosen, ga
         for j in range(SLOTS):
             if slots[j, GAP] < gaps[k]:
                 gaps[k] = slots[j, GAP]
-                normals[k, 0], normals[k, 1], normals[k, 2] = slots[j, NORMAL], slots[j, NORMAL + 1], slots[j, NORMAL + 2]
+                for i in range(3):
+                    normals[k, i] = slots[j, NORMAL + i]

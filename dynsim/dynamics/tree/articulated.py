@@ -90,11 +90,10 @@ def row_system(model: ModelArrays, ws: Workspace):
         if ws.active[k, ka.BODY_B] >= 0:
             two_ended_row(model, ws, k)
             continue
-        if ws.active[k, ka.ROW_KIND] != ka.SLIDING_ROW:
-            if ws.active[k, ka.ROW_KIND] == ka.STICKING_ROW:
-                if k == ws.active[ws.active[k, ka.OWNER], ka.FIRST_ROW]:
-                    sticking_columns(model, ws, k)
-                continue
+        if ws.active[k, ka.ROW_KIND] == ka.STICKING_ROW:
+            if k == ws.active[ws.active[k, ka.OWNER], ka.FIRST_ROW]:
+                sticking_columns(model, ws, k)
+            continue
         # Current values of the row and its force direction during the elimination.
         row, direction = six(state, k, ka.ROW), six(state, k, ka.DIRECTION)
         for m in range(k):

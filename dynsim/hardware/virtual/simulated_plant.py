@@ -322,7 +322,7 @@ def admissible_posture(scenario: Scenario, model: Model, posture: Array) -> Arra
     surfaces, is repeated until the gaps are rounding errors. Changes are logged. If a joint would have to change by
     more than START_CHANGE, the posture is returned unchanged, and the simulation rejects it with a message.
     """
-    from dynsim.compile.shapes import gap_at
+    from dynsim.compile.touching import gap_at
     from dynsim.scenario import build
 
     contacts = build.contacts(scenario, model.robot)

@@ -60,6 +60,7 @@ class BraceArrays(NamedTuple):
     """Braces, motors, results and workspace."""
 
     link: np.ndarray  # (c,) int
+    carrier: np.ndarray  # (c,) int: link that carries the surface, or -1 for the world
     table: np.ndarray  # (c, BRACE_SIZE) braces
     motors: np.ndarray  # (n, MOTOR_SIZE)
     first: np.ndarray  # (c + 1,) int: first unknown of each brace, and number of unknowns
@@ -72,15 +73,17 @@ class BraceArrays(NamedTuple):
     inside: np.ndarray  # (3 c,) scratch
     position: np.ndarray  # (3,) scratch
     jacobian: np.ndarray  # (3, n) scratch
+    other: np.ndarray  # (3, n) scratch
     program: ConeProgram
 
 
-def brace_arrays(link: np.ndarray, motors: np.ndarray) -> BraceArrays:
-    """Allocate :class:`BraceArrays` for braces on the links ``link``, (c,), and for the motors, (n, MOTOR_SIZE)."""
+def brace_arrays(link: np.ndarray, carrier: np.ndarray, motors: np.ndarray) -> BraceArrays:
+    """Allocate :class:`BraceArrays` for braces of links on carriers, (c,) each, and for the motors, (n, MOTOR_SIZE)."""
     c, n = len(link), len(motors)
     forces = ka.MOST_ROWS * c
     return BraceArrays(
         link=link,
+        carrier=carrier,
         table=reals(np.zeros((c, BRACE_SIZE))),
         motors=motors,
         first=integers(np.zeros(c + 1)),
@@ -93,6 +96,7 @@ def brace_arrays(link: np.ndarray, motors: np.ndarray) -> BraceArrays:
         inside=reals(np.zeros(forces)),
         position=reals(np.zeros(3)),
         jacobian=reals(np.zeros((3, n))),
+        other=reals(np.zeros((3, n))),
         program=cone_program(forces + 1, n, 2 * c + 2 * n + 1, 4 * c + 2 * n + 1),
     )
 
@@ -319,6 +323,11 @@ def brace_rows(model: ModelArrays, ws: Workspace, braces: BraceArrays):
     for k in range(braces.link.shape[0]):
         point_position(ws, braces.link[k], table[k], braces.position)
         point_jacobian(model, ws, braces.link[k], braces.position, jacobian)
+        if braces.carrier[k] >= 0:
+            point_jacobian(model, ws, braces.carrier[k], braces.position, braces.other)
+            for i in range(3):
+                for j in range(n):
+                    jacobian[i, j] -= braces.other[i, j]
         scale = max(scale, table[k, LEAST])
         commanded, mu, at = table[k, COMMANDED] == table[k, COMMANDED], table[k, FRICTION], first[k]
         directed = mu == 0.0 or table[k, SLIP] != 0.0 or table[k, SLIP + 1] != 0.0

@@ -1,0 +1,118 @@
+"""Points where contact candidates are nearest to their surfaces, of the world or of other bodies."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from dynsim.compile.shapes import share_of_axis
+from dynsim.errors import ModelError
+from dynsim.model.description import Array, Contact, Robot
+
+
+class Kinematics(Protocol):
+    """Methods of :class:`dynsim.Model` with which postures and contacts are computed."""
+
+    robot: Robot
+    n: int
+    nq: int
+
+    def body_index(self, body: str | int) -> int: ...
+    def body_pose(self, body: str | int, q: ArrayLike) -> tuple[Array, Array]: ...
+    def point_position(self, body: str | int, point: ArrayLike, q: ArrayLike) -> Array: ...
+    def point_jacobian(self, body: str | int, point: ArrayLike, q: ArrayLike) -> Array: ...
+    def point_position_and_jacobian(self, body: str | int, point: ArrayLike, q: ArrayLike) -> tuple[Array, Array]: ...
+
+
+@dataclass(frozen=True)
+class Touch:
+    """Place where a contact candidate is nearest to its surface.
+
+    Attributes
+    ----------
+    contact : Contact
+        Contact candidate.
+    link : int
+        Link of the candidate.
+    point : (3,) ndarray
+        Point of the candidate in the frame of its link [m].
+    position : (3,) ndarray
+        Its position in the world [m].
+    normal : (3,) ndarray
+        Normal of the surface in the world.
+    carrier : int
+        Link that carries the surface, or -1 for the world.
+    nearest : (3,) ndarray
+        Nearest point of the candidate's axis in the frame of the surface [m].
+    """
+
+    contact: Contact
+    link: int
+    point: Array
+    position: Array
+    normal: Array
+    carrier: int
+    nearest: Array
+
+    @property
+    def gap(self) -> float:
+        """Distance from the surface [m]."""
+        try:
+            return float(self.contact.surface.gap(self.nearest) - self.contact.radius)
+        except ModelError as error:
+            raise ModelError(f"contact {self.contact.name} {error}") from None
+
+    def jacobian(self, model: Kinematics, q: Array) -> Array:
+        """Return the Jacobian of the velocity against the surface, (3, n), at a configuration, (nq,)."""
+        own = model.point_jacobian(self.link, self.point, q)
+        if self.carrier < 0:
+            return own
+        R, p = model.body_pose(self.carrier, q)
+        return own - model.point_jacobian(self.carrier, R.T @ (self.position - p), q)
+
+
+def touch(model: Kinematics, contact: Contact, q: Array, share: float | None = None) -> Touch:
+    """Return where a contact is nearest to its surface at a configuration, (nq,).
+
+    Parameters
+    ----------
+    model : Kinematics
+        Model of the robot.
+    contact : Contact
+        Contact candidate.
+    q : (nq,) ndarray
+        Coordinates [rad or m].
+    share : float, optional
+        Point of a capsule's axis, from 0 at its start to 1 at its end. Default: the point nearest to the surface.
+
+    Returns
+    -------
+    Touch
+        Point and normal.
+
+    Raises
+    ------
+    ModelError
+        If the body or its carrier is unknown.
+    """
+    carrier = -1 if contact.carrier is None else model.body_index(contact.carrier)
+    turned, origin = (np.eye(3), np.zeros(3)) if carrier < 0 else model.body_pose(carrier, q)
+    point, ends = contact.point, contact.point[None] if contact.tip is None else np.array([contact.point, contact.tip])
+    seen = [(model.point_position(contact.body, end, q) - origin) @ turned for end in ends]
+    nearest = seen[0]
+    if contact.tip is not None:
+        share = share_of_axis(contact, *seen) if share is None else share
+        nearest, point = nearest + share * (seen[1] - nearest), point + share * (contact.tip - point)
+    normal = turned @ np.asarray(contact.surface.normal(nearest), dtype=np.float64)
+    link, point = model.robot.attach(contact.body, point)
+    if contact.radius > 0.0:
+        point = point - contact.radius * (model.body_pose(link, q)[0].T @ normal)
+    return Touch(contact, link, point, model.point_position(link, point, q), normal, carrier, nearest)
+
+
+def gap_at(model: Kinematics, contact: Contact, q: Array) -> float:
+    """Return the gap [m] of a contact at a configuration, (nq,); raises ModelError for an unknown body."""
+    return touch(model, contact, q).gap
