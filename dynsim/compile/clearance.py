@@ -120,7 +120,8 @@ def by_surface(sunk: Sequence[Sinking]) -> dict[str, list[Sinking]]:
 
 
 def axis_gaps(robot: Robot, surfaces: Mapping[str, Surface], q: Array) -> Iterator[tuple[Link, str, Array]]:
-    """Yield the minimum distance of each body's axes from each surface, (T,) [m]."""
+    """Yield the minimum distance of each body's axes from each surface of the world, (T,) [m]."""
+    surfaces = {name: surface for name, surface in surfaces.items() if surface.carrier is None}
     tips, carriers = axis_ends(robot), robot.carriers
     for link, R, p in poses(robot, q):
         for name, surface in surfaces.items() if link.name not in carriers else ():

@@ -221,7 +221,8 @@ class Model:
         from dynsim.compile.scene import drawn_surface, with_shapes
         from dynsim.model.mjcf import back_emf_damping, write_mjcf
 
-        drawn = [drawn_surface(name, surface) for name, surface in (surfaces or {}).items()]
+        standing = {name: surface for name, surface in (surfaces or {}).items() if surface.carrier is None}
+        drawn = [drawn_surface(name, surface) for name, surface in standing.items()]
         rubs = {rubbing.joint: rubbing.gear + rubbing.bearing for rubbing in dry_frictions(self.robot)}
         damping = self.damping.copy()
         for motor in self.robot.motors:

@@ -12,7 +12,7 @@ import numpy as np
 from dynsim.model.description import Array, Contact, Link, Robot
 from dynsim.model.drives import Motor
 from dynsim.model.mobile_base import SUPPORTS, MobileBase
-from dynsim.model.surfaces import Box, HeightField, Quadric, Surface
+from dynsim.model.surfaces import Box, Capsule, HeightField, Quadric, Surface
 from dynsim.record.quaternion import of_turn
 from dynsim.record.scene import (
     HERE,
@@ -38,6 +38,8 @@ GRID_LINES = 61
 # Width of a wheel relative to its radius; the description of a snake contains no width.
 WHEEL_WIDTH = 0.48
 BASE_WHEEL_WIDTH = 0.5
+# Size at which infinite surfaces on bodies are drawn [m].
+PATCH = 0.2
 # Radius of the snake's body relative to the wheel radius.
 BODY_RADIUS = 0.5
 _ALONG_X: Quaternion = (math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0)
@@ -53,7 +55,8 @@ def robot_scene(robot: Robot, contacts: Sequence[Contact], surfaces: Mapping[str
         if kind is None:
             return None
         parent = WORLD if link.parent is None else index[link.parent]
-        bodies.append(Body(link.name, parent, _joint(link, kind), shapes(link)))
+        carried = tuple(_solid(surface) for surface in surfaces.values() if surface.carrier == link.name)
+        bodies.append(Body(link.name, parent, _joint(link, kind), shapes(link) + carried))
     hand_body, hand_point = robot.hand
     points = [Point("hand", "hand", index[hand_body], vector3(hand_point))]
     supports: tuple[Point, ...] = ()
@@ -68,7 +71,7 @@ def robot_scene(robot: Robot, contacts: Sequence[Contact], surfaces: Mapping[str
         points.append(Point(contact.name, "contact", body, vector3(point), surface, friction, radius, tip))
     return Scene(
         tuple(bodies),
-        tuple(drawn_surface(name, surface) for name, surface in surfaces.items()),
+        tuple(drawn_surface(name, surface) for name, surface in surfaces.items() if surface.carrier is None),
         tuple(points),
         robot.fixed_shapes,
         supports,
@@ -88,6 +91,24 @@ def _shared(values: Iterable[float]) -> float | None:
     different = set(values)
     value = different.pop() if len(different) == 1 else math.inf
     return float(value) if math.isfinite(value) else None
+
+
+def _solid(surface: Surface) -> Shape:
+    """Return the solid that stands for a surface on a body; only a part of what is infinite is drawn."""
+    if isinstance(surface, Box):
+        return Shape("box", vector3(surface.edges), vector3(surface.centre), quaternion(surface.axes.T))
+    if isinstance(surface, Capsule):
+        length = float(np.linalg.norm(surface.axis))
+        turn = turn_from_z(surface.axis / length) if length > 0.0 else HERE
+        return Shape("capsule", (surface.radius, length), vector3(surface.start + 0.5 * surface.axis), turn)
+    drawn = drawn_surface("", surface)
+    position, radius = drawn.position or (0.0, 0.0, 0.0), abs(drawn.radius or 0.0)
+    if drawn.kind == "sphere":
+        return Shape("sphere", (radius,), position)
+    turn = HERE if drawn.direction is None else turn_from_z(np.array(drawn.direction))
+    if drawn.kind == "cylinder":
+        return Shape("cylinder", (radius, PATCH), position, turn)
+    return Shape("box", (PATCH, PATCH, 0.01 * PATCH), position, turn)
 
 
 def drawn_surface(name: str, surface: Surface) -> SceneSurface:

@@ -25,7 +25,7 @@ def compile_shapes(robot: Robot, contacts: Sequence[Contact]) -> kd.ShapeArrays 
         along = np.zeros(3)
         if contact.tip is not None:
             along = robot.attached_axes(contact.body) @ (contact.tip - contact.point)
-        point = contact.radius == 0.0 and contact.tip is None and contact.carrier is None
+        point = contact.radius == 0.0 and contact.tip is None and contact.surface.carrier is None
         point &= isinstance(contact.surface, Quadric)
         if not contact.radius >= 0.0:
             raise ModelError(f"contact {contact.name}: radius {contact.radius} m must be zero or positive")

@@ -416,10 +416,9 @@ def compile_contacts(robot: Robot, contacts: Sequence[Contact], floors: np.ndarr
         link[k, ka.LEFT_OUT] = contact.left_out
         point[k, ka.POINT : ka.POINT + 3] = on_body
         link[k, ka.CARRIER] = -1
-        if contact.carrier is not None:
-            user = f"surface of contact {contact.name}"
-            link[k, ka.CARRIER], _ = _attached(robot, contact.carrier, np.zeros(3), user)
-        if contact.carrier is not None or not isinstance(surface, Quadric):  # use any plane: its rows are overwritten
+        if surface.carrier is not None:
+            link[k, ka.CARRIER], _ = _attached(robot, surface.carrier, np.zeros(3), f"surface of {contact.name}")
+        if surface.carrier is not None or not isinstance(surface, Quadric):  # use any plane: its rows are overwritten
             point[k, ka.QUADRIC + 8] = 1.0
             continue
         curved = bool(surface.Q.any())

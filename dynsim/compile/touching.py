@@ -98,7 +98,7 @@ def touch(model: Kinematics, contact: Contact, q: Array, share: float | None = N
     ModelError
         If the body or its carrier is unknown.
     """
-    carrier = -1 if contact.carrier is None else model.body_index(contact.carrier)
+    carrier = -1 if contact.surface.carrier is None else model.body_index(contact.surface.carrier)
     turned, origin = (np.eye(3), np.zeros(3)) if carrier < 0 else model.body_pose(carrier, q)
     point, ends = contact.point, contact.point[None] if contact.tip is None else np.array([contact.point, contact.tip])
     seen = [(model.point_position(contact.body, end, q) - origin) @ turned for end in ends]

@@ -45,7 +45,8 @@ from dynsim.record.measures import (
     hand_turn_error,
     sinks,
 )
-from dynsim.record.poses import TOUCHING, add_body_poses, point_positions
+from dynsim.record.poses import ORIENTATION, POSITION, TOUCHING, add_body_poses, point_positions
+from dynsim.record.quaternion import rotated
 from dynsim.record.scene import CarriedMass, Point, Scene, SoftGripper, vector3
 from dynsim.scenario import Scenario, build, to_yaml
 from dynsim.scenario.schema import Payload
@@ -673,7 +674,14 @@ def _add_touching_points(record: Record, robot: Robot, contacts: Sequence[Contac
                     robot.attach(contact.body, end) for end in (contact.point, contact.tip) if end is not None
                 )
             ]
-            places[:, k] = touching_points(contact, *ends)
+            if contact.surface.carrier is None:
+                places[:, k] = touching_points(contact, *ends)
+                continue
+            carrier = [link.name for link in robot.links].index(contact.surface.carrier)
+            origin, turn = record[POSITION][:, carrier], record[ORIENTATION][:, carrier].T.astype(np.float64)
+            back = turn * np.array([[1.0], [-1.0], [-1.0], [-1.0]])
+            local = touching_points(contact, *(rotated(back, (end - origin).T).T for end in ends))
+            places[:, k] = origin + rotated(turn, local.T).T
     names = tuple(contact.name for contact in shaped)
     record.add(TOUCHING, places, "m", labels=names, description="points of force application on spheres and capsules")
 

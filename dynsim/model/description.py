@@ -332,7 +332,6 @@ class Contact:
     radius: float = 0.0
     tip: Array | None = None
     left_out: bool = False
-    carrier: str | None = None
 
     @property
     def friction_at_rest(self) -> float:
@@ -342,7 +341,7 @@ class Contact:
     @property
     def geometry(self) -> tuple[str, str, Array, Surface, float, Array | None]:
         """Everything that determines the location of the contact and the surface that it can touch, without its law."""
-        return self.name, self.body, self.point, self.surface, self.radius, self.tip, self.carrier
+        return self.name, self.body, self.point, self.surface, self.radius, self.tip
 
 
 @dataclass(frozen=True)

@@ -23,11 +23,15 @@ SIMPLE = ("plane", "sphere", "cylinder")
 
 @dataclass(frozen=True)
 class Quadric:
-    """Surface C(r) = r·Q r/2 + b·r + c = 0, Q (3, 3) symmetric, b (3,); C > 0 is outside, where ∇C points."""
+    """Surface C(r) = r·Q r/2 + b·r + c = 0, Q (3, 3) symmetric, b (3,); C > 0 is outside, where ∇C points.
+
+    Like all surfaces it is described in the axes of its ``carrier``, a body, or in the world if this is None.
+    """
 
     Q: Array
     b: Array
     c: float
+    carrier: str | None = None
 
     def __post_init__(self) -> None:
         shapes = np.shape(self.Q), np.shape(self.b)
@@ -75,7 +79,8 @@ class Quadric:
 
     def shifted(self, by: Array) -> Quadric:
         """Return the surface moved by a vector [m]."""
-        return Quadric(self.Q, self.b - self.Q @ by, float(self.c - self.b @ by + 0.5 * by @ self.Q @ by))
+        c = float(self.c - self.b @ by + 0.5 * by @ self.Q @ by)
+        return replace(self, b=self.b - self.Q @ by, c=c)
 
     def normal(self, position: Array) -> Array:
         """Return ∇C/|∇C| at a point, (3,); zero if ∇C vanishes, as at the centre of a sphere."""
@@ -119,7 +124,7 @@ class _Shaped:
 
         points = np.array(positions, dtype=np.float64, order="C")
         gaps, normals = np.zeros(len(points)), np.zeros((len(points), 3))
-        assert isinstance(self, Box | HeightField)
+        assert isinstance(self, Box | Capsule | HeightField)
         surface_distances(shape_arrays([(self, 0.0, np.zeros(3), False)]), points, gaps, normals)
         return gaps, normals
 
@@ -144,6 +149,7 @@ class Box(_Shaped):
     axes: Array
     edges: Array
     edge_radius: float
+    carrier: str | None = None
 
     def shifted(self, by: Array) -> Box:
         """Return the box moved by a vector [m]."""
@@ -152,14 +158,15 @@ class Box(_Shaped):
 
 @dataclass(frozen=True)
 class Capsule(_Shaped):
-    """A capsule from a start along an axis, (3,) each [m]; the free side is outside."""
+    """Capsule from a start along an axis, (3,) each [m]; the free side is outside."""
 
     start: Array
     axis: Array
     radius: float
+    carrier: str | None = None
 
     def shifted(self, by: Array) -> Capsule:
-        """The same capsule elsewhere."""
+        """Return the capsule moved by a vector [m]."""
         return replace(self, start=self.start + by)
 
 
@@ -180,6 +187,7 @@ class HeightField(_Shaped):
     origin: Array
     spacing: Array
     heights: Array = field(repr=False)
+    carrier: str | None = None
 
     def shifted(self, by: Array) -> HeightField:
         """Return the field moved by a vector [m]."""
@@ -194,7 +202,7 @@ class HeightField(_Shaped):
         return _spline(_spline(self.heights).T).T
 
 
-Surface = Quadric | Box | HeightField
+Surface = Quadric | Box | Capsule | HeightField
 """Surface, as a member of the family ``surface`` builds it; its free side is where the distance is positive."""
 
 

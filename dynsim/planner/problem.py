@@ -317,7 +317,7 @@ def task(scenario: Scenario, options: Options) -> Task:
     """
     robot = build.robot(scenario)
     model = Model(robot)
-    surfaces = build.surfaces(scenario)
+    surfaces = {name: surface for name, surface in build.surfaces(scenario).items() if surface.carrier is None}
     if not surfaces and options.count[1] > 0:
         raise ModelError("plan: the scenario has no surfaces; add one, or use --count 0:0")
     hand = getattr(scenario.controller, "hand", None)

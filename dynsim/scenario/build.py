@@ -351,11 +351,13 @@ def surfaces(scenario: Scenario) -> dict[str, Surface]:
 
     def built() -> dict[str, Surface]:
         nominal: dict[str, Surface] = {
-            name: families.build("surface", config, context, Surface) for name, config in configs.items()
+            name: replace(families.build("surface", config, context, Surface), carrier=getattr(config, "on", None))
+            for name, config in configs.items()
         }
         if error is None or not any(error.shift_m):
             return nominal
-        return {name: surface.shifted(np.array(error.shift_m)) for name, surface in nominal.items()}
+        by = np.array(error.shift_m)  # of what stands in the world
+        return {name: s if s.carrier is not None else s.shifted(by) for name, s in nominal.items()}
 
     return recall("surfaces", built, scenario.duration_s, configs, error)
 
@@ -378,11 +380,11 @@ def contacts(scenario: Scenario, described: Robot | None = None) -> list[Contact
     options = scenario.config.contacts
     known = surfaces(scenario)
     described = robot(scenario) if described is None else described
-    carriers = _carriers(scenario, described)
+    _check_carriers(known, described)
     result = [
-        replace(_foot(foot, known, options), carrier=carriers[foot.surface])
+        _foot(foot, known, options)
         for foot in described.feet
-        if carriers.get(foot.surface) != foot.body
+        if foot.surface not in known or known[foot.surface].carrier != foot.body
     ]
     for name, point in options.points.items():
         if not point.enabled:
@@ -402,7 +404,6 @@ def contacts(scenario: Scenario, described: Robot | None = None) -> list[Contact
                 surface=known[point.surface],
                 surface_name=point.surface,
                 radius=point.radius_m,
-                carrier=carriers[point.surface],
                 **_law(options, point),
             )
         )
@@ -420,18 +421,16 @@ def contacts(scenario: Scenario, described: Robot | None = None) -> list[Contact
     return result if error is None else [_scaled_friction(contact, error.friction_factor) for contact in result]
 
 
-def _carriers(scenario: Scenario, described: Robot) -> dict[str, str | None]:
-    """Return the body that carries each surface, None for the world; raises ModelError for an unknown body."""
-    bodies = described.bodies
-    for name, config in scenario.config.surfaces.items():
-        if config.on is not None and config.on not in bodies:
+def _check_carriers(known: Mapping[str, Surface], described: Robot) -> None:
+    """Raise ModelError if a surface is on a body that does not exist."""
+    for name, surface in known.items():
+        if surface.carrier is not None and surface.carrier not in described.bodies:
             keys = ("surfaces", name, "on")
             raise ModelError(
-                f"{dotted(keys)} = {config.on!r}: no such moving body{suggest(config.on, bodies)}; "
-                f"bodies: {', '.join(bodies)}",
+                f"{dotted(keys)} = {surface.carrier!r}: no such moving body"
+                f"{suggest(surface.carrier, described.bodies)}; bodies: {', '.join(described.bodies)}",
                 keys=keys,
             )
-    return {name: config.on for name, config in scenario.config.surfaces.items()}
 
 
 def _foot(foot: Foot, known: Mapping[str, Surface], options: Contacts) -> Contact:

@@ -264,6 +264,12 @@ def pressing(
                 f"controller.brace: {name} is the axis of a link; use points of contacts.points",
                 keys=("controller", "brace"),
             )
+        if contact.surface.carrier is not None:
+            raise ModelError(
+                f"controller.brace: {name} is on {contact.surface_name}, which {contact.surface.carrier} carries; use "
+                "points on surfaces of the world",
+                keys=("controller", "brace"),
+            )
         attached.append(model.robot.attach(contact.body, contact.point))
     planner = BracePlanner(model.robot, model.arrays, [link for link, _ in attached])
     points = np.array([point for _, point in attached]).reshape(-1, 3)
