@@ -68,7 +68,8 @@ def robot_scene(robot: Robot, contacts: Sequence[Contact], surfaces: Mapping[str
         friction = float(contact.friction_at_rest)
         tip = None if contact.tip is None else vector3(robot.attach(contact.body, contact.tip)[1])
         radius, surface = float(contact.radius), contact.surface_name
-        points.append(Point(contact.name, "contact", body, vector3(point), surface, friction, radius, tip))
+        carrier = WORLD if contact.surface.carrier is None else index[contact.surface.carrier]
+        points.append(Point(contact.name, "contact", body, vector3(point), surface, friction, radius, tip, carrier))
     return Scene(
         tuple(bodies),
         tuple(drawn_surface(name, surface) for name, surface in surfaces.items() if surface.carrier is None),

@@ -45,7 +45,7 @@ from dynsim.record.measures import (
     hand_turn_error,
     sinks,
 )
-from dynsim.record.poses import ORIENTATION, POSITION, TOUCHING, add_body_poses, point_positions
+from dynsim.record.poses import NORMAL, ORIENTATION, POSITION, TOUCHING, add_body_poses, point_positions
 from dynsim.record.quaternion import rotated
 from dynsim.record.scene import CarriedMass, Point, Scene, SoftGripper, vector3
 from dynsim.scenario import Scenario, build, to_yaml
@@ -660,30 +660,39 @@ def _add_unilateral(record: Record, prepared: Prepared) -> None:
 
 
 def _add_touching_points(record: Record, robot: Robot, contacts: Sequence[Contact]) -> None:
-    """Add the points of force application on spheres and capsules, in single precision like the poses."""
+    """Add where forces act on spheres and capsules, and normals of surfaces on bodies, in single precision."""
     shaped = [contact for contact in contacts if contact.radius > 0.0 or contact.tip is not None]
-    if not shaped:
-        return
-    places = np.empty((len(record), len(shaped), 3), dtype=np.float32)
+    carried = [contact for contact in contacts if contact.surface.carrier is not None]
+    links, places = [link.name for link in robot.links], dict[str, Array]()
+    normals = np.empty((len(record), len(carried), 3), dtype=np.float32)
     # The last samples of a diverged run may overflow.
     with np.errstate(over="ignore", invalid="ignore"):
-        for k, contact in enumerate(shaped):
+        for contact in contacts:
+            carrier = contact.surface.carrier
+            if carrier is None and contact not in shaped:
+                continue
             ends = [
                 point_positions(record, Point(contact.name, "contact", body, vector3(at)))
                 for body, at in (
                     robot.attach(contact.body, end) for end in (contact.point, contact.tip) if end is not None
                 )
             ]
-            if contact.surface.carrier is None:
-                places[:, k] = touching_points(contact, *ends)
+            if carrier is None:
+                places[contact.name] = touching_points(contact, *ends)
                 continue
-            carrier = [link.name for link in robot.links].index(contact.surface.carrier)
-            origin, turn = record[POSITION][:, carrier], record[ORIENTATION][:, carrier].T.astype(np.float64)
+            origin, turn = (record[name][:, links.index(carrier)] for name in (POSITION, ORIENTATION))
+            turn = turn.T.astype(np.float64)
             back = turn * np.array([[1.0], [-1.0], [-1.0], [-1.0]])
             local = touching_points(contact, *(rotated(back, (end - origin).T).T for end in ends))
-            places[:, k] = origin + rotated(turn, local.T).T
-    names = tuple(contact.name for contact in shaped)
-    record.add(TOUCHING, places, "m", labels=names, description="points of force application on spheres and capsules")
+            places[contact.name] = origin + rotated(turn, local.T).T
+            normals[:, carried.index(contact)] = rotated(turn, contact.surface.normals(local).T).T
+    if shaped:
+        at = np.stack([places[contact.name] for contact in shaped], axis=1).astype(np.float32)
+        text = "points of force application on spheres and capsules"
+        record.add(TOUCHING, at, "m", labels=tuple(contact.name for contact in shaped), description=text)
+    if carried:
+        names, text = tuple(contact.name for contact in carried), "normals of surfaces that bodies carry, in W"
+        record.add(NORMAL, normals, "1", labels=names, description=text)
 
 
 def _add_base(record: Record, prepared: Prepared, base: MobileBase, as_planned: bool) -> None:

@@ -12,7 +12,7 @@ from dynsim.record.quaternion import Array, continuous, of_turn, product, rotate
 from dynsim.record.record import Record
 from dynsim.record.scene import HERE, WORLD, Body, Joint, Point, Scene
 
-POSITION, ORIENTATION, TOUCHING = "body_position", "body_orientation", "contact_position"
+POSITION, ORIENTATION, TOUCHING, NORMAL = "body_position", "body_orientation", "contact_position", "contact_normal"
 
 
 def add_body_poses(record: Record) -> bool:

@@ -275,6 +275,8 @@ class Point(_Finite):
         Radius of the sphere or capsule about a contact point [m].
     tip : tuple of float or None
         Other end of a capsule's axis in the frame of the body [m].
+    carrier : int
+        Index of the body that carries the surface, or ``WORLD``.
     """
 
     name: str
@@ -285,6 +287,7 @@ class Point(_Finite):
     friction: float = 0.0
     radius: float = 0.0
     tip: Vector3 | None = None
+    carrier: int = WORLD
 
 
 @dataclass(frozen=True)

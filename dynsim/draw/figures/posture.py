@@ -35,7 +35,7 @@ from dynsim.draw.geometry.shapes import (
 )
 from dynsim.record import Record
 from dynsim.record.measures import hand_target
-from dynsim.record.poses import POSITION, contact_positions, point_positions
+from dynsim.record.poses import NORMAL, POSITION, contact_positions, point_positions
 from dynsim.record.scene import WORLD, Point, Scene, SceneSurface
 
 # Number of postures, evenly spaced in time, that are drawn faintly in addition to the last one.
@@ -160,8 +160,8 @@ class Skeleton:
             return []
         return list(dict.fromkeys(rows[np.linspace(0, len(rows) - 1, FAINT + 1).astype(int)].tolist()))
 
-    def contacts(self) -> list[tuple[Point, SceneSurface, Array, float]]:
-        """Return the point, surface, position and normal force (NaN if unknown) of each contact at the end of the run.
+    def contacts(self) -> list[tuple[Point, Array, Array, float]]:
+        """Return point, normal, position and normal force (NaN if unknown) of each contact at the end of the run.
 
         If a force acts, the position is on the surface. Under the unilateral law, only contacts that touched are
         returned.
@@ -180,13 +180,17 @@ class Skeleton:
             }
         contacts = []
         for point in self.scene.contacts:
-            surface = self.scene.surface(point.surface)
-            if surface is None or point.name in untouched:
+            surface, carried = self.scene.surface(point.surface), point.carrier != WORLD and NORMAL in record
+            if (surface is None and not carried) or point.name in untouched:
                 continue
             position, force = contact_positions(record, point, len(record) - 1), float(forces.get(point.name, np.nan))
-            if abs(force) > 0.0:
-                position = position - surface.gap(position) * surface.normal(position)
-            contacts.append((point, surface, position, force))
+            if surface is None:
+                normal = record[NORMAL][-1, record.labels[NORMAL].index(point.name)]
+            else:
+                normal = surface.normal(position)
+                if abs(force) > 0.0:
+                    position = position - surface.gap(position) * normal
+            contacts.append((point, normal, position, force))
         return contacts
 
 
@@ -270,8 +274,8 @@ def contact_labels(body: Skeleton, plane: SidePlane, scale: float) -> list[Label
     if len(points) > LABELLED:
         return []
     largest = max((abs(force) for *_, force, _ in points if not np.isnan(force)), default=0.0)
-    for contact, surface, position, force, at in sorted(points, key=lambda entry: float(entry[4][0])):
-        along, up = plane.axes @ surface.gradient(position)
+    for contact, normal, _, force, at in sorted(points, key=lambda entry: float(entry[4][0])):
+        along, up = plane.axes @ normal
         steep = abs(along) > abs(up)
         side = (-1 if along > 0.0 else 1, 0) if steep else (0, 1 if up < 0.0 else -1)
         # Less than a thousandth of the largest force is printed as 0.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -17,7 +17,7 @@ from dynsim.draw.geometry.shapes import body_shapes, drawn_shapes, floor_level, 
 from dynsim.errors import RecordError
 from dynsim.record import Record
 from dynsim.record.measures import hand_target
-from dynsim.record.poses import ORIENTATION, POSITION, TOUCHING, contact_positions, point_positions
+from dynsim.record.poses import NORMAL, ORIENTATION, POSITION, TOUCHING, contact_positions, point_positions
 from dynsim.record.quaternion import rotated
 from dynsim.record.scene import HERE, NOT_BELOW, WORLD, Point, Scene, Vector3
 
@@ -286,21 +286,27 @@ def contacts(robot: DrawnRobot, rows: NDArray[np.intp] | slice = slice(None)) ->
     names = record.labels["contact_normal_force"]
     result = []
     for point in scene.contacts:
-        surface = scene.surface(point.surface)
-        if surface is None or point.name not in names:
+        surface, carried = scene.surface(point.surface), point.carrier != WORLD and NORMAL in record
+        if (surface is None and not carried) or point.name not in names:
             continue
         k = names.index(point.name)
         mode = record["contact_mode"][rows, k] if "contact_mode" in record else None
         if mode is not None and not mode.any():
             continue
         at = np.asarray(contact_positions(record, point, rows), dtype=np.float64)
-        normal = surface.normal(at)
+        if surface is None:
+            normal = np.asarray(record[NORMAL][rows, record.labels[NORMAL].index(point.name)], dtype=np.float64)
+        else:
+            normal = surface.normal(at)
         force = np.asarray(record["contact_normal_force"][rows, k], dtype=np.float64)
         tangent = None
         if "contact_force" in record:
             tangent = record["contact_force"][rows, k] - force[:, None] * normal
-        shaped = TOUCHING in record and point.name in record.labels[TOUCHING]
+        shaped = carried or (TOUCHING in record and point.name in record.labels[TOUCHING])
         result.append(DrawnContact(point, normal, force, tangent, mode, at if shaped else None))
+        if carried:  # the reaction on the other body
+            other = replace(point, name=f"{point.name} on {scene.bodies[point.carrier].name}", body=point.carrier)
+            result.append(DrawnContact(other, -normal, force, None if tangent is None else -tangent, mode, at))
     return result
 
 

@@ -52,7 +52,7 @@ from dynsim.draw.geometry.shapes import (
 from dynsim.errors import RecordError
 from dynsim.record import TIME, Record, Signal
 from dynsim.record.measures import GRIPPER_STATES, hand_target
-from dynsim.record.poses import ORIENTATION, POSITION, TOUCHING, contact_positions, point_positions
+from dynsim.record.poses import NORMAL, ORIENTATION, POSITION, TOUCHING, contact_positions, point_positions
 from dynsim.record.scene import WORLD, Scene, SceneSurface
 from dynsim.system.arguments import names_wrong_types
 from dynsim.system.files import replacing
@@ -152,7 +152,7 @@ SMALL = 0.1
 # samples.
 HEAT_ERROR = 0.05
 # Signals that are shown in the 3D view but not in plots.
-_SHOWN = {POSITION, ORIENTATION, TOUCHING, "posture"}
+_SHOWN = {POSITION, ORIENTATION, TOUCHING, NORMAL, "posture"}
 # Names of signals; the others are their keys in words.
 _NAMES = {
     "q": "joint position",
