@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -21,8 +22,9 @@ from dynsim.errors import ModelError, ScenarioError, brief
 from dynsim.library import families
 from dynsim.model.description import WORLD, Array, Contact, Foot, Inertia, Load, Robot
 from dynsim.model.surfaces import Surface
+from dynsim.scenario.between import contacts_between
 from dynsim.scenario.candidates import candidates
-from dynsim.scenario.schema import ContactPoint, Contacts, LinkSensorConfig, Payload, Scenario
+from dynsim.scenario.schema import ContactLaw, ContactPoint, Contacts, LinkSensorConfig, Payload, Scenario
 from dynsim.system.arguments import names_wrong_types
 from dynsim.system.memo import recall
 
@@ -407,6 +409,10 @@ def contacts(scenario: Scenario, described: Robot | None = None) -> list[Contact
                 **_law(options, point),
             )
         )
+    if options.between:
+        pairs, names = options.between, {contact.name for contact in result}
+        laws = partial(_law, options)
+        result += contacts_between(pairs, described, scenario.config.objects, laws, names)
     if result:
         places = [contact.geometry for contact in result]
         still = recall("left out", lambda: immobile(Model(described), result), described, places)
@@ -452,13 +458,14 @@ def _scaled_friction(contact: Contact, factor: float) -> Contact:
     return replace(contact, friction=factor * contact.friction, static_friction=static, viscous_friction=viscous)
 
 
-def _law(options: Contacts, point: ContactPoint) -> dict[str, Any]:
-    """Return the contact-law parameters of a point, as keyword arguments of `Contact`."""
+def _law(options: Contacts, point: ContactLaw) -> dict[str, Any]:
+    """Return the contact-law parameters of a point or pair, as keyword arguments of `Contact`."""
     friction, static = options.coefficients(point)
     stiffness, damping = options.compliance(point)
     if options.law == "bilateral":
         smoothing, pulling = options.slip_smoothing_m_s, options.pulling_friction
         return {"friction": friction, "slip_smoothing": smoothing, "pulling_friction": pulling}
+    grip = getattr(point, "grip", None)
     return {
         "friction": friction,
         "pulling_friction": "signed",
@@ -468,7 +475,7 @@ def _law(options: Contacts, point: ContactPoint) -> dict[str, Any]:
         "restitution": options.of(point, "restitution"),
         "stiffness": stiffness,
         "damping": damping if stiffness else 0.0,
-        **({} if point.grip is None else {"grip": point.grip.ratio, "grip_axis": np.array(point.grip.axis)}),
+        **({} if grip is None else {"grip": grip.ratio, "grip_axis": np.array(grip.axis)}),
     }
 
 

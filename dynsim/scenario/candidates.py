@@ -65,7 +65,7 @@ def candidates(kind: str, robot: Robot, surfaces: Mapping[str, Surface], declare
         for contact, _ in kept:
             name = contact.name if len(surfaces) == 1 else f"{contact.name}_{surface_name}"
             if moves(model, contact, configurations):
-                contacts.append(replace(contact, name=_unused(name, names)))
+                contacts.append(replace(contact, name=unused(name, names)))
             else:
                 still.append(name)
     if replaced:
@@ -117,7 +117,7 @@ def _same(a: Array, b: Array) -> bool:
     return bool(np.abs(a - b).max() <= SAME)
 
 
-def _unused(name: str, names: set[str]) -> str:
+def unused(name: str, names: set[str]) -> str:
     """Return the name, with a number appended if it is already in use, and add it to ``names``."""
     unused, count = name, 1
     while unused in names:

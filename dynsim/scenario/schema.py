@@ -674,11 +674,9 @@ class Grip(StrictConfig):
     )
 
 
-class ContactPoint(BodyPoint):
-    """Contact of a surface with a point fixed to a body, or with a sphere around this point."""
+class ContactLaw(StrictConfig):
+    """Friction, restitution and compliance of a contact, which default to those of all contacts."""
 
-    surface: str = default("floor", "name of a surface")
-    radius_m: NonNegative = default(0.0, "radius of a sphere around the point; 0: the point touches")
     friction: NonNegative | None = default(None, "kinetic coefficient μ; default: `contacts.friction`")
     static_friction: NonNegative | None = default(
         None, "static coefficient μ_s; default: `contacts.static_friction`; unilateral law"
@@ -686,14 +684,38 @@ class ContactPoint(BodyPoint):
     restitution: Share | None = default(
         None, "coefficient of restitution; default: `contacts.restitution`; unilateral law"
     )
-    grip: Grip | None = default(None, "anisotropic friction; default: isotropic; time_stepping only")
     stiffness_N_per_m: Positive | None = default(
         None, "stiffness along the normal; default: `contacts.stiffness_N_per_m`; time_stepping only"
     )
     damping_N_s_per_m: NonNegative | None = default(
         None, "damping along the normal; default: `contacts.damping_N_s_per_m`; time_stepping only"
     )
+
+
+class ContactPoint(ContactLaw, BodyPoint):
+    """Contact of a surface with a point fixed to a body, or with a sphere around this point."""
+
+    surface: str = default("floor", "name of a surface")
+    radius_m: NonNegative = default(0.0, "radius of a sphere around the point; 0: the point touches")
+    grip: Grip | None = default(None, "anisotropic friction; default: isotropic; time_stepping only")
     enabled: bool = default(True, "whether the point can touch")
+
+
+class BodyPair(ContactLaw):
+    """Bodies that touch each other."""
+
+    bodies: Literal["self"] | list[str] = Field(
+        description="`self`: all links of the robot; or two entries, each a body or the group `links` or `objects`"
+    )
+    ignore: list[list[str]] = default([], "pairs of bodies that do not touch")
+
+    @model_validator(mode="after")
+    def _check_pairs(self) -> Self:
+        if self.bodies != "self" and len(self.bodies) != 2:
+            raise error_at("bodies", "must be `self`, or two bodies or groups")
+        if any(len(pair) != 2 for pair in self.ignore):
+            raise error_at("ignore", "must list pairs of two bodies")
+        return self
 
 
 class Contacts(StrictConfig):
@@ -735,13 +757,14 @@ class Contacts(StrictConfig):
         "or the links as capsules (`links`)",
     )
     points: dict[str, ContactPoint] = default({}, "named contact points")
+    between: list[BodyPair] = default([], "bodies that touch each other; default: none; unilateral law")
 
-    def of(self, point: ContactPoint | None, key: str) -> Any:
+    def of(self, point: ContactLaw | None, key: str) -> Any:
         """Return a key of a point, or the key of `contacts` if the point does not set it."""
         value = getattr(point, key, None)
         return getattr(self, key) if value is None else value
 
-    def coefficients(self, point: ContactPoint | None = None) -> tuple[float, float]:
+    def coefficients(self, point: ContactLaw | None = None) -> tuple[float, float]:
         """Return the kinetic and static friction coefficients of a point, or the values for all contacts.
 
         Keys of the point take precedence over keys of `contacts`. The static coefficient defaults to the kinetic
@@ -750,7 +773,7 @@ class Contacts(StrictConfig):
         kinetic, static = self.of(point, "friction"), self.of(point, "static_friction")
         return kinetic, kinetic if static is None else static
 
-    def compliance(self, point: ContactPoint | None = None) -> tuple[float, float]:
+    def compliance(self, point: ContactLaw | None = None) -> tuple[float, float]:
         """Return stiffness [N/m] (0: rigid) and damping [N s/m] of a point, or the values for all contacts."""
         return self.of(point, "stiffness_N_per_m") or 0.0, self.of(point, "damping_N_s_per_m")
 

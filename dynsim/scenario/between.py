@@ -1,0 +1,201 @@
+"""Contacts between bodies: the solids of links and objects, and the candidates of a pair of solids.
+
+A solid is a surface that its body carries: a capsule, a sphere (a capsule without length) or a box with rounded edges.
+Candidates of a pair are points and axes of each solid against the other.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from dynsim.compile.clearance import axis_ends
+from dynsim.config.problems import suggest
+from dynsim.errors import ModelError
+from dynsim.model.description import Array, Contact, Robot
+from dynsim.model.surfaces import Box, Capsule
+from dynsim.record.quaternion import rotated
+from dynsim.record.scene import Shape
+from dynsim.scenario.candidates import THINNER, unused
+from dynsim.scenario.schema import BodyPair, SceneObject
+
+Solid = Capsule | Box
+
+LINKS, OBJECTS, SELF = "links", "objects", "self"
+# Radius of the edges of boxes that touch bodies [m], at most half the shortest edge.
+ROUNDING = 1e-3
+_CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+
+
+def contacts_between(
+    pairs: Sequence[BodyPair],
+    robot: Robot,
+    objects: Mapping[str, SceneObject],
+    law: Callable[[BodyPair], dict[str, Any]],
+    names: set[str],
+) -> list[Contact]:
+    """Return the contacts between bodies.
+
+    Parameters
+    ----------
+    pairs : sequence of BodyPair
+        Entries of ``contacts.between``; for a pair in several entries the last one counts.
+    robot : Robot
+        Description of the robot.
+    objects : mapping of str to SceneObject
+        Objects of the scenario.
+    law : callable
+        Function that returns the contact-law parameters of an entry, as keyword arguments of :class:`Contact`.
+    names : set of str
+        Names of other contacts; extended by those of the result.
+
+    Raises
+    ------
+    ModelError
+        If a body does not exist or has no solid.
+    """
+    solids = solids_of(robot, objects)
+    chosen: dict[tuple[str, str], BodyPair] = {}
+    for k, entry in enumerate(pairs):
+        for first, second in _bodies(k, entry, robot, objects, solids):
+            chosen.pop((second, first), None)
+            chosen[first, second] = entry
+    result = []
+    for (first, second), entry in chosen.items():
+        parameters = law(entry)
+        for a, b in itertools.product(solids[first], solids[second]):
+            for contact in _candidates(a, b):
+                name = unused(f"{contact.body}-{contact.surface.carrier}", names)
+                result.append(replace(contact, name=name, surface_name=str(contact.surface.carrier), **parameters))
+    return result
+
+
+def solids_of(robot: Robot, objects: Mapping[str, SceneObject]) -> dict[str, list[Solid]]:
+    """Return the solids of each body that has any: parts of objects, and capsules about the axes of links."""
+    of_objects = {link.name for name, body in objects.items() for link in body.links(name)}
+    solids: dict[str, list[Solid]] = {}
+    tips = axis_ends(robot)
+    for link in robot.links:
+        if link.name in robot.carriers:
+            continue
+        if link.name in of_objects:
+            own = [_solid(shape, link.name) for shape in link.shapes]
+        else:
+            axes = [tip for tip in tips[link.name] if tip.any()] if link.radius > 0.0 else []
+            own = [Capsule(np.zeros(3), tip, link.radius, link.name) for tip in axes]
+        if own:
+            solids[link.name] = own
+    return solids
+
+
+def _solid(shape: Shape, body: str) -> Solid:
+    """Return the solid of a shape; a cylinder is the capsule inside it."""
+    R, p = rotated(np.array(shape.orientation), np.eye(3)), np.array(shape.position)
+    if shape.kind == "box":
+        edges = np.array(shape.size)
+        return Box(p, R.T, edges, min(ROUNDING, 0.5 * float(edges.min())), body)
+    radius, *length = shape.size
+    half = max(0.5 * sum(length) - radius, 0.0) * R[:, 2]
+    return Capsule(p - half, 2.0 * half, radius, body)
+
+
+def _bodies(
+    k: int, entry: BodyPair, robot: Robot, objects: Mapping[str, SceneObject], solids: Mapping[str, list[Solid]]
+) -> Iterator[tuple[str, str]]:
+    """Yield the pairs of bodies of entry k, without neighbours on a joint and without ignored pairs."""
+    of_objects = {link.name for name, body in objects.items() for link in body.links(name)}
+    keys: tuple[str | int, ...] = ("contacts", "between", k)
+    groups = {LINKS: [b for b in solids if b not in of_objects], OBJECTS: [b for b in solids if b in of_objects]}
+
+    def members(name: str, key: str) -> list[str]:
+        if name in groups:
+            if not groups[name]:
+                raise ModelError(f"contacts.between: no {name} with a solid; set radius_m", keys=(*keys, key))
+            return groups[name]
+        if name not in robot.bodies:
+            known = [*robot.bodies, *groups]
+            raise ModelError(
+                f"contacts.between: unknown body {name!r}{suggest(name, known)}; bodies: {', '.join(known)}",
+                keys=(*keys, key),
+            )
+        if name not in solids:
+            raise ModelError(f"contacts.between: body {name!r} has no solid; set its radius_m", keys=(*keys, key))
+        return [name]
+
+    for name in itertools.chain.from_iterable(entry.ignore):
+        members(name, "ignore")
+    ignored = {frozenset(pair) for pair in entry.ignore} | _neighbours(robot)
+    sides = [LINKS, LINKS] if entry.bodies == SELF else list(entry.bodies)
+    seen = set[frozenset[str]]()
+    for first, second in itertools.product(*(members(side, "bodies") for side in sides)):
+        pair = frozenset((first, second))
+        if len(pair) == 2 and pair not in ignored and pair not in seen:
+            seen.add(pair)
+            yield first, second
+
+
+def _neighbours(robot: Robot) -> set[frozenset[str]]:
+    """Return the pairs of bodies that a joint connects."""
+    parents = {link.name: link.parent for link in robot.links}
+    pairs = set[frozenset[str]]()
+    for name in robot.bodies:
+        parent = parents[name]
+        while parent is not None and parent in robot.carriers:
+            parent = parents[parent]
+        if parent is not None:
+            pairs.add(frozenset((name, parent)))
+    return pairs
+
+
+def _candidates(a: Solid, b: Solid) -> Iterable[Contact]:
+    """Yield points, spheres and axes of each of two solids against the other."""
+    if isinstance(a, Box) and isinstance(b, Box):
+        yield from (*_corners(a, b), *_corners(b, a), *_edges(a, b))
+    elif isinstance(a, Box):
+        yield from _candidates(b, a)
+    elif isinstance(b, Box):
+        yield from (*_along(a, b), *_corners(b, a))
+    elif not a.axis.any() or b.axis.any():
+        yield from (*_along(a, b), *(_ends(b, a) if b.axis.any() and a.axis.any() else ()))
+    else:
+        yield from _along(b, a)
+
+
+def _contact(body: Solid, point: Array, surface: Solid, radius: float, tip: Array | None = None) -> Contact:
+    assert body.carrier is not None
+    return Contact("", body.carrier, point, surface, radius=radius, tip=tip)
+
+
+def _ends(a: Capsule, b: Solid) -> Iterator[Contact]:
+    """Yield the end spheres of a capsule, one of a sphere, against a solid."""
+    yield _contact(a, a.start, b, a.radius)
+    if a.axis.any():
+        yield _contact(a, a.start + a.axis, b, a.radius)
+
+
+def _along(a: Capsule, b: Solid) -> Iterator[Contact]:
+    """Yield the ends and the axis of a capsule against a solid; the axis is thinner, so that no point counts twice."""
+    yield from _ends(a, b)
+    if a.axis.any():
+        yield _contact(a, a.start, b, max(a.radius - THINNER, 0.0), a.start + a.axis)
+
+
+def _corners(a: Box, b: Solid) -> Iterator[Contact]:
+    """Yield the rounded corners of a box against a solid."""
+    core = 0.5 * a.edges - a.edge_radius
+    for corner in _CORNERS:
+        yield _contact(a, a.centre + (corner * core) @ a.axes, b, a.edge_radius)
+
+
+def _edges(a: Box, b: Box) -> Iterator[Contact]:
+    """Yield the rounded edges of a box against another box."""
+    core = 0.5 * a.edges - a.edge_radius
+    for k in range(3):
+        for corner in _CORNERS[_CORNERS[:, k] < 0.0]:
+            start = a.centre + (corner * core) @ a.axes
+            tip = start + 2.0 * core[k] * a.axes[k]
+            yield _contact(a, start, b, max(a.edge_radius - THINNER, 0.0), tip)
