@@ -45,7 +45,7 @@ def ball(mass: float, radius: float, position: list[float], velocity: list[float
 
 def pushed(body: str, force: list[float], duration: float = 0.1) -> dict[str, Any]:
     """A constant force on the centre of a body until a time."""
-    times = [0.0, duration, duration + 1e-9, 10.0]
+    times = [0.0, duration, duration + 1e-3, 10.0]
     return {
         "type": "samples",
         "interpolation": "linear",
@@ -71,10 +71,9 @@ def test_two_spheres_head_on(tmp_path, restitution):
         restitution=restitution,
         duration_s=0.6,
     )
-    # The force acts for whole steps only to the rounding of its end.
     a, b = rates(record, "a")[0], rates(record, "b")[0]
     before = a[0] + 2.0 * b[0]
-    assert before == pytest.approx(1.0, abs=1e-6)
+    assert before == pytest.approx(1.005, abs=1e-6)
     # Without restitution, the penetration of the landing is undone at a speed that remains where nothing presses.
     error = 0.03 if restitution == 0.0 else 1e-12
     assert a[0] == pytest.approx(before * (1.0 - 2.0 * restitution) / 3.0, abs=error)
@@ -107,13 +106,21 @@ def test_stacks_carry_their_weight(tmp_path):
     assert np.abs(record["v"][-1]).max() < 1e-9
 
 
-def test_momentum_and_angular_momentum_of_a_free_scene(tmp_path):
-    """Oblique impacts with friction and restitution between a sphere, a capsule and a box."""
-    objects = {
-        "a": ball(1.0, 0.05, [0, 0, 0]),
-        "b": {"shape": "cylinder", "radius_m": 0.03, "length_m": 0.2, "mass_kg": 0.5, "position_m": [0.2, 0.02, 0.03]},
-        "c": {"size_m": [0.1, 0.2, 0.15], "mass_kg": 2, "position_m": [0.4, -0.03, 0.0], "rpy_deg": [10, 20, 30]},
-    }
+THREE = {
+    "a": ball(1.0, 0.05, [0, 0, 0]),
+    "b": {"shape": "cylinder", "radius_m": 0.03, "length_m": 0.2, "mass_kg": 0.5, "position_m": [0.2, 0.02, 0.03]},
+    "c": {"size_m": [0.1, 0.2, 0.15], "mass_kg": 2, "position_m": [0.4, -0.03, 0.0], "rpy_deg": [10, 20, 30]},
+}
+BALLS = {
+    "a": ball(1.0, 0.05, [0, 0, 0]),
+    "b": ball(0.5, 0.05, [0.2, 0.02, 0.03]),
+    "c": ball(2.0, 0.06, [0.4, -0.03, 0]),
+}
+
+
+@pytest.mark.parametrize(("objects", "spin_error"), [(BALLS, 1e-8), (THREE, SPIN)], ids=["spheres", "solids"])
+def test_momentum_and_angular_momentum_of_a_free_scene(tmp_path, objects, spin_error):
+    """Oblique impacts with friction and restitution."""
     record = run(
         tmp_path,
         objects,
@@ -123,7 +130,7 @@ def test_momentum_and_angular_momentum_of_a_free_scene(tmp_path):
         duration_s=0.6,
         record={"rate_hz": 1000},
     )
-    masses = {"a": 1.0, "b": 0.5, "c": 2.0}
+    masses = {name: body["mass_kg"] for name, body in objects.items()}
     inertias = {name: SceneObject.model_validate(body).inertia.tensor for name, body in objects.items()}
     momentum, spin = np.zeros((2, len(record), 3))
     for name, mass in masses.items():
@@ -135,7 +142,7 @@ def test_momentum_and_angular_momentum_of_a_free_scene(tmp_path):
     after = record.time > 0.06
     assert record["contact_normal_force"].max() > 1.0
     assert np.ptp(momentum[after], axis=0).max() < 1e-12
-    assert np.ptp(spin[after], axis=0).max() < SPIN
+    assert np.ptp(spin[after], axis=0).max() < spin_error
 
 
 def held(method: str, step: float, friction: float, tmp_path) -> Record:
