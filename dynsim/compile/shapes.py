@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from dynsim.dynamics.contact import distance as kd
+from dynsim.dynamics.contact import solids as ks
 from dynsim.errors import ModelError
 from dynsim.model.description import Contact, Robot
 from dynsim.model.surfaces import SIMPLE, Array, Box, Capsule, Quadric, Surface, shape_arrays
@@ -37,7 +38,40 @@ def compile_shapes(robot: Robot, contacts: Sequence[Contact]) -> kd.ShapeArrays 
         entries.append((None if point else contact.surface, contact.radius, along, moves(contact)))
     if all(surface is None for surface, _, _, _ in entries):
         return None
-    return shape_arrays(entries)
+    arrays, index, solids = shape_arrays(entries), list[tuple[int, int]](), list[list[Array]]()
+    for k, contact in enumerate(contacts):
+        if contact.solid is None:
+            continue
+        if contact.slot == 0:
+            links = [robot.attach(str(s.carrier), np.zeros(3))[0] for s in (contact.solid, contact.surface)]
+            index.append((links[0], links[1]))
+            solids.append([solid_row(contact.solid), solid_row(contact.surface)])
+        arrays.kind[k, [kd.SURFACE, kd.FIELD, kd.COUNT]] = kd.PAIR, len(index) - 1, contact.slot
+    return arrays if not index else arrays._replace(pairs=ks.pair_arrays(np.array(index), np.array(solids)))
+
+
+def solid_row(solid: Surface) -> Array:
+    """Return the kernel table row of a capsule or box, (SOLID_SIZE,)."""
+    row = np.zeros(ks.SOLID_SIZE)
+    if isinstance(solid, Box):
+        axes, centre, radius = solid.axes.T, solid.centre, solid.edge_radius
+        half = 0.5 * solid.edges - radius
+    else:
+        assert isinstance(solid, Capsule)
+        length = float(np.linalg.norm(solid.axis))
+        axes = np.eye(3) if length == 0.0 else axes_along(solid.axis / length)
+        centre, half, radius = solid.start + 0.5 * solid.axis, np.array([0.0, 0.0, 0.5 * length]), solid.radius
+    row[ks.POSE : ks.POSE + 9], row[ks.POSE + 9 : ks.POSE + 12] = axes.ravel(), centre
+    row[ks.CORE : ks.CORE + 3], row[ks.CORE + 3] = half, radius
+    row[ks.BOUND] = float(np.linalg.norm(half)) + radius
+    return row
+
+
+def axes_along(direction: Array) -> Array:
+    """Return a rotation, (3, 3), whose third column is a unit vector."""
+    first = np.cross(direction, np.eye(3)[np.abs(direction).argmin()])
+    first /= np.linalg.norm(first)
+    return np.column_stack([first, np.cross(direction, first), direction])
 
 
 def moves(contact: Contact) -> bool:

@@ -8,8 +8,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dynsim.compile.shapes import share_of_axis
+from dynsim.compile.shapes import share_of_axis, solid_row
+from dynsim.dynamics.contact import solids as ks
 from dynsim.errors import ModelError
+from dynsim.jit.kernel import reals
 from dynsim.model.description import Array, Contact, Robot
 
 
@@ -47,6 +49,8 @@ class Touch:
         Link that carries the surface, or -1 for the world.
     nearest : (3,) ndarray
         Nearest point of the candidate's axis in the frame of the surface [m].
+    apart : float or None
+        Distance of two solids there [m]; None for other candidates.
     """
 
     contact: Contact
@@ -56,10 +60,13 @@ class Touch:
     normal: Array
     carrier: int
     nearest: Array
+    apart: float | None = None
 
     @property
     def gap(self) -> float:
         """Distance from the surface [m]."""
+        if self.apart is not None:
+            return self.apart
         try:
             return float(self.contact.surface.gap(self.nearest) - self.contact.radius)
         except ModelError as error:
@@ -99,6 +106,8 @@ def touch(model: Kinematics, contact: Contact, q: Array, share: float | None = N
         If the body or its carrier is unknown.
     """
     carrier = -1 if contact.surface.carrier is None else model.body_index(contact.surface.carrier)
+    if contact.solid is not None:
+        return _slot(model, contact, carrier, q)
     turned, origin = (np.eye(3), np.zeros(3)) if carrier < 0 else model.body_pose(carrier, q)
     point, ends = contact.point, contact.point[None] if contact.tip is None else np.array([contact.point, contact.tip])
     seen = [(model.point_position(contact.body, end, q) - origin) @ turned for end in ends]
@@ -111,6 +120,25 @@ def touch(model: Kinematics, contact: Contact, q: Array, share: float | None = N
     if contact.radius > 0.0:
         point = point - contact.radius * (model.body_pose(link, q)[0].T @ normal)
     return Touch(contact, link, point, model.point_position(link, point, q), normal, carrier, nearest)
+
+
+def _slot(model: Kinematics, contact: Contact, carrier: int, q: Array) -> Touch:
+    """Return one of the contacts of two solids; see :func:`dynsim.dynamics.contact.solids.find_contacts`."""
+    link, rows, poses = model.body_index(contact.body), [], []
+    for index, solid in ((link, contact.solid), (carrier, contact.surface)):
+        assert solid is not None
+        row = solid_row(solid)
+        R, p = model.body_pose(index, q)
+        local = row[ks.POSE : ks.POSE + 9].reshape(3, 3)
+        rows.append(row)
+        poses.append(np.concatenate([(R @ local).ravel(), p + R @ row[ks.POSE + 9 : ks.POSE + 12]]))
+    pairs = ks.pair_arrays(np.zeros((1, ks.PAIR_SIZE), dtype=np.int64), np.array([rows]))
+    cores = [reals(row[ks.CORE : ks.CORE + 4]) for row in rows]
+    ks.find_contacts(poses[0], cores[0], poses[1], cores[1], pairs.known[0], pairs.slots[0], pairs.places, pairs.chosen)
+    slot = pairs.slots[0, contact.slot]
+    position, normal = slot[ks.PLACE : ks.PLACE + 3].copy(), slot[ks.NORMAL : ks.NORMAL + 3].copy()
+    R, p = model.body_pose(link, q)
+    return Touch(contact, link, R.T @ (position - p), position, normal, carrier, position, float(slot[ks.GAP]))
 
 
 def gap_at(model: Kinematics, contact: Contact, q: Array) -> float:

@@ -95,9 +95,9 @@ def block(layout: StateLayout | OutputLayout, name: str) -> slice:
 
 # Kinetic, potential and magnetic energy.
 ENERGIES = 3
-# Per contact: f_n, force vector (3), gap, slip velocity (3), mode.
-OUT_FORCE, OUT_VECTOR, OUT_GAP, OUT_SLIP, OUT_MODE = 0, 1, 4, 5, 8
-OUTPUTS_PER_CONTACT = 9
+# Per contact: f_n, force vector (3), gap, slip velocity (3), mode, point where it touches (3), normal (3).
+OUT_FORCE, OUT_VECTOR, OUT_GAP, OUT_SLIP, OUT_MODE, OUT_POSITION, OUT_NORMAL = 0, 1, 4, 5, 8, 9, 12
+OUTPUTS_PER_CONTACT = 15
 
 
 def output_layout(

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from dynsim.compile.shapes import touching_points
+from dynsim.dynamics import state as kst
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.tree import joints, sweep
@@ -196,7 +197,11 @@ def _contact_forces(record: Record, prepared: Prepared, motion: LinkMotion, rows
         at, *tip = (motion.point(body, end) for body, end in ends)
         if contact.radius > 0.0 or tip:
             at = touching_points(contact, at, *tip)
-        acting.append((ends[0][0], at, record["contact_force"][rows, k], 0.0))
+        force = record["contact_force"][rows, k]
+        if contact.surface.carrier is not None:
+            at = prepared.run.outputs("contact")[rows, k, kst.OUT_POSITION : kst.OUT_POSITION + 3]
+            acting.append((robot.attach(contact.surface.carrier, np.zeros(3))[0], at, -force, 0.0))
+        acting.append((ends[0][0], at, force, 0.0))
     return acting
 
 

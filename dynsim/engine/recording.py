@@ -18,7 +18,6 @@ from dynsim._version import __version__
 from dynsim.compile.clearance import sinking
 from dynsim.compile.hand_posture import hand_turns
 from dynsim.compile.scene import robot_scene
-from dynsim.compile.shapes import touching_points
 from dynsim.dynamics import state as kst
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.unilateral import UnilateralArrays
@@ -45,9 +44,8 @@ from dynsim.record.measures import (
     hand_turn_error,
     sinks,
 )
-from dynsim.record.poses import NORMAL, ORIENTATION, POSITION, TOUCHING, add_body_poses, point_positions
-from dynsim.record.quaternion import rotated
-from dynsim.record.scene import CarriedMass, Point, Scene, SoftGripper, vector3
+from dynsim.record.poses import NORMAL, TOUCHING, add_body_poses
+from dynsim.record.scene import CarriedMass, Scene, SoftGripper, vector3
 from dynsim.scenario import Scenario, build, to_yaml
 from dynsim.scenario.schema import Payload
 from dynsim.system.files import discard, json_text, replace_together, write_text
@@ -577,7 +575,7 @@ def make_record(
     if pictured:
         record.scene = drawn_scene(scenario, robot, contacts)
         if add_body_poses(record):
-            _add_touching_points(record, robot, contacts)
+            _add_touching_points(record, contacts, touch)
     end = _end(record, prepared, pushed, begun, within=lost)
     record.summary = summarise(record, end, scenario, prepared, wall, begun)
     return record
@@ -659,40 +657,17 @@ def _add_unilateral(record: Record, prepared: Prepared) -> None:
         record.add("tie_force", run.outputs("tie"), both, labels=names, description=text)
 
 
-def _add_touching_points(record: Record, robot: Robot, contacts: Sequence[Contact]) -> None:
-    """Add where forces act on spheres and capsules, and normals of surfaces on bodies, in single precision."""
-    shaped = [contact for contact in contacts if contact.radius > 0.0 or contact.tip is not None]
-    carried = [contact for contact in contacts if contact.surface.carrier is not None]
-    links, places = [link.name for link in robot.links], dict[str, Array]()
-    normals = np.empty((len(record), len(carried), 3), dtype=np.float32)
-    # The last samples of a diverged run may overflow.
-    with np.errstate(over="ignore", invalid="ignore"):
-        for contact in contacts:
-            carrier = contact.surface.carrier
-            if carrier is None and contact not in shaped:
-                continue
-            ends = [
-                point_positions(record, Point(contact.name, "contact", body, vector3(at)))
-                for body, at in (
-                    robot.attach(contact.body, end) for end in (contact.point, contact.tip) if end is not None
-                )
-            ]
-            if carrier is None:
-                places[contact.name] = touching_points(contact, *ends)
-                continue
-            origin, turn = (record[name][:, links.index(carrier)] for name in (POSITION, ORIENTATION))
-            turn = turn.T.astype(np.float64)
-            back = turn * np.array([[1.0], [-1.0], [-1.0], [-1.0]])
-            local = touching_points(contact, *(rotated(back, (end - origin).T).T for end in ends))
-            places[contact.name] = origin + rotated(turn, local.T).T
-            normals[:, carried.index(contact)] = rotated(turn, contact.surface.normals(local).T).T
-    if shaped:
-        at = np.stack([places[contact.name] for contact in shaped], axis=1).astype(np.float32)
-        text = "points of force application on spheres and capsules"
-        record.add(TOUCHING, at, "m", labels=tuple(contact.name for contact in shaped), description=text)
-    if carried:
-        names, text = tuple(contact.name for contact in carried), "normals of surfaces that bodies carry, in W"
-        record.add(NORMAL, normals, "1", labels=names, description=text)
+def _add_touching_points(record: Record, contacts: Sequence[Contact], touch: Array) -> None:
+    """Add where forces act on spheres, capsules and solids, and normals of surfaces on bodies, in single precision."""
+    at = [k for k, c in enumerate(contacts) if c.radius > 0.0 or c.tip is not None or c.solid is not None]
+    carried = [k for k, contact in enumerate(contacts) if contact.surface.carrier is not None]
+    for columns, name, first, unit, text in (
+        (at, TOUCHING, kst.OUT_POSITION, "m", "points of force application on spheres, capsules and solids"),
+        (carried, NORMAL, kst.OUT_NORMAL, "1", "normals of surfaces that bodies carry, in W"),
+    ):
+        if columns:
+            values = touch[:, columns, first : first + 3].astype(np.float32)
+            record.add(name, values, unit, labels=tuple(contacts[k].name for k in columns), description=text)
 
 
 def _add_base(record: Record, prepared: Prepared, base: MobileBase, as_planned: bool) -> None:

@@ -310,6 +310,8 @@ def fill_output(system: System, ws: Workspace, run: Run, out):
         for s in range(3):
             out[k + kst.OUT_VECTOR + s] = state[c, ka.FORCE_VECTOR + s]
             out[k + kst.OUT_SLIP + s] = state[c, ka.SLIP_VELOCITY + s]
+            out[k + kst.OUT_POSITION + s] = state[c, ka.POSITION + s]
+            out[k + kst.OUT_NORMAL + s] = state[c, ka.NORMAL + s]
         k += kst.OUTPUTS_PER_CONTACT
     row_forces(system.unilateral, out[columns.stop :], out[columns.dry :], out[columns.tie :])
 

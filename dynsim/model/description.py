@@ -311,6 +311,10 @@ class Contact:
         point of the axis touches, otherwise ``point``.
     left_out : bool
         True if no joint moves the point along the normal in any posture, so that it never touches.
+    solid : Surface or None
+        Solid of the body, if the contact is one of those between two solids; the surface is the other one.
+    slot : int
+        Number of this contact among those of the two solids.
     """
 
     name: str
@@ -332,6 +336,8 @@ class Contact:
     radius: float = 0.0
     tip: Array | None = None
     left_out: bool = False
+    solid: Surface | None = None
+    slot: int = 0
 
     @property
     def friction_at_rest(self) -> float:
@@ -339,9 +345,9 @@ class Contact:
         return self.friction if self.static_friction is None else self.static_friction
 
     @property
-    def geometry(self) -> tuple[str, str, Array, Surface, float, Array | None]:
+    def geometry(self) -> tuple[str, str, Array, Surface, float, Array | None, Surface | None, int]:
         """Everything that determines the location of the contact and the surface that it can touch, without its law."""
-        return self.name, self.body, self.point, self.surface, self.radius, self.tip
+        return self.name, self.body, self.point, self.surface, self.radius, self.tip, self.solid, self.slot
 
 
 @dataclass(frozen=True)

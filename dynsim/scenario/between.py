@@ -15,6 +15,7 @@ import numpy as np
 
 from dynsim.compile.clearance import axis_ends
 from dynsim.config.problems import suggest
+from dynsim.dynamics.contact.solids import SLOTS
 from dynsim.errors import ModelError
 from dynsim.model.description import Array, Contact, Robot
 from dynsim.model.surfaces import Box, Capsule
@@ -37,6 +38,7 @@ def contacts_between(
     objects: Mapping[str, SceneObject],
     law: Callable[[BodyPair], dict[str, Any]],
     names: set[str],
+    stepped: bool,
 ) -> list[Contact]:
     """Return the contacts between bodies.
 
@@ -52,6 +54,9 @@ def contacts_between(
         Function that returns the contact-law parameters of an entry, as keyword arguments of :class:`Contact`.
     names : set of str
         Names of other contacts; extended by those of the result.
+    stepped : bool
+        True for time stepping: pairs without a sphere have the contacts of two solids, see
+        :mod:`dynsim.dynamics.contact.solids`. False: points and axes of each solid against the other.
 
     Raises
     ------
@@ -68,7 +73,7 @@ def contacts_between(
     for (first, second), entry in chosen.items():
         parameters = law(entry)
         for a, b in itertools.product(solids[first], solids[second]):
-            for contact in _candidates(a, b):
+            for contact in _slots(a, b) if stepped and not (_is_sphere(a) or _is_sphere(b)) else _candidates(a, b):
                 name = unused(f"{contact.body}-{contact.surface.carrier}", names)
                 result.append(replace(contact, name=name, surface_name=str(contact.surface.carrier), **parameters))
     return result
@@ -149,6 +154,16 @@ def _neighbours(robot: Robot) -> set[frozenset[str]]:
         if parent is not None:
             pairs.add(frozenset((name, parent)))
     return pairs
+
+
+def _is_sphere(solid: Solid) -> bool:
+    return isinstance(solid, Capsule) and not solid.axis.any()
+
+
+def _slots(a: Solid, b: Solid) -> Iterator[Contact]:
+    """Yield the contacts of two solids."""
+    for k in range(SLOTS):
+        yield replace(_contact(a, np.zeros(3), b, 0.0), solid=a, slot=k)
 
 
 def _candidates(a: Solid, b: Solid) -> Iterable[Contact]:

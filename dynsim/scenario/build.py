@@ -412,7 +412,8 @@ def contacts(scenario: Scenario, described: Robot | None = None) -> list[Contact
     if options.between:
         pairs, names = options.between, {contact.name for contact in result}
         laws = partial(_law, options)
-        result += contacts_between(pairs, described, scenario.config.objects, laws, names)
+        stepped = scenario.config.integrator.method == "time_stepping"
+        result += contacts_between(pairs, described, scenario.config.objects, laws, names, stepped)
     if result:
         places = [contact.geometry for contact in result]
         still = recall("left out", lambda: immobile(Model(described), result), described, places)

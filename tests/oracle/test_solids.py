@@ -48,7 +48,8 @@ def test_distances_and_normals_are_those_of_coal(first: str, second: str) -> Non
     a, b, at_a, at_b = cores(first, rng), cores(second, rng), poses(rng, 0.6), poses(rng, 0.3)
     gaps, normals = np.zeros(PAIRS), np.zeros((PAIRS, 3))
     slots, places = np.zeros((solids.SLOTS, solids.FOUND_SIZE)), np.zeros((solids.FEATURES, solids.FOUND_SIZE))
-    solids.pair_distances(at_a, a, at_b, b, slots, places, np.zeros(solids.SLOTS, dtype=int), gaps, normals)
+    known, chosen = np.full(solids.SLOTS, -1.0), np.zeros(solids.SLOTS, dtype=int)
+    solids.pair_distances(at_a, a, at_b, b, known, slots, places, chosen, gaps, normals)
     request, apart = coal.DistanceRequest(), 0
     request.gjk_tolerance = 1e-12
     for k in range(PAIRS):

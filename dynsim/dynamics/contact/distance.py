@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from dynsim.dynamics.contact.solids import PairArrays
 from dynsim.dynamics.tree.spatial import first_axis, rotate, rotate_back, rotation, second_axis, third_axis, vector
 from dynsim.jit.kernel import internal_kernel, kernel
 
@@ -23,6 +24,8 @@ COUNT = 3  # 2: numbers of grid lines along x and y
 SHAPE_KIND_SIZE = 5
 # Kinds of surfaces; AS_POINT: the candidate is a point on the quadric of ContactArrays
 AS_POINT, PLANE, SPHERE, CYLINDER, BOX, HEIGHT_FIELD, CAPSULE = 0, 1, 2, 3, 4, 5, 6
+# The candidate is slot COUNT of pair FIELD of ShapeArrays.pairs.
+PAIR = 7
 # ShapeArrays.data
 RADIUS = 0  # ρ [m]
 D = 1  # 3: axis from its start to its end, in the body's frame [m]
@@ -46,6 +49,7 @@ class ShapeArrays(NamedTuple):
     kind: np.ndarray  # (c, SHAPE_KIND_SIZE) int
     data: np.ndarray  # (c, SHAPE_SIZE)
     fields: np.ndarray  # B-spline coefficients of all height fields, (nx + 2) (ny + 2) each, one x after the other
+    pairs: PairArrays | None = None  # pairs of solids; None: there are no such pairs
 
 
 @internal_kernel

@@ -12,8 +12,10 @@ import math
 
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import distance as kd
+from dynsim.dynamics.contact import solids as ks
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.distance import ShapeArrays, distance, nearest
+from dynsim.dynamics.contact.solids import find_pairs
 from dynsim.dynamics.contact.unilateral import UnilateralArrays, slide_direction
 from dynsim.dynamics.tables import ContactArrays, CouplingArrays, ModelArrays, Workspace
 from dynsim.dynamics.tree.spatial import (
@@ -485,9 +487,34 @@ def shaped_rows(
     """
     if shapes is None:  # resolved at compile time; the default program then excludes shapes
         return
+    find_pairs(shapes.pairs, ws)
     for k in range(contacts.link.shape[0]):
-        if shapes.kind[k, kd.SURFACE] != kd.AS_POINT:
+        if shapes.kind[k, kd.SURFACE] == kd.PAIR:
+            pair_row(shapes.pairs, shapes, unilateral, model, contacts, ws, k)
+        elif shapes.kind[k, kd.SURFACE] != kd.AS_POINT:
             shaped_row(shapes, unilateral, model, contacts, ws, k)
+
+
+@internal_kernel
+def pair_row(pairs, shapes: ShapeArrays, unilateral: UnilateralArrays | None, model: ModelArrays, contacts, ws, k):
+    """Compute the rows of a contact of two solids, for time stepping: TARGET is without the turning of the normal."""
+    if pairs is None:
+        return
+    slot, m = pairs.slots[shapes.kind[k, kd.FIELD], shapes.kind[k, kd.COUNT]], ws.active[k, ka.FIRST_ROW]
+    i, carrier = contacts.link[k, ka.LINK], contacts.link[k, ka.CARRIER]
+    at = slot[ks.PLACE], slot[ks.PLACE + 1], slot[ks.PLACE + 2]
+    n = slot[ks.NORMAL], slot[ks.NORMAL + 1], slot[ks.NORMAL + 2]
+    V, other = six(ws.links, i, ka.V), six(ws.links, carrier, ka.V)
+    a = point_acceleration(six(ws.links, i, ka.A), V, at)
+    b = point_acceleration(six(ws.links, carrier, ka.A), other, at)
+    v = point_velocity(minus_scaled(V, other, 1.0), at)
+    rate = dot_vector(n, v)
+    slip = along(v, n, -rate)
+    t, mu = slip_friction(unilateral, contacts, ws, k, slip, n, signed_friction(ws, m))
+    write_candidate(ws, k, at, slot[ks.GAP], n, rate, slip, t, mu, dot_vector(n, b) - dot_vector(n, a))
+    if ws.active[k, ka.MODE] == ka.STICKING:
+        tangents(ws, k)
+        sticking_rows(model, contacts, ws, k, i)
 
 
 @internal_kernel

@@ -9,9 +9,14 @@ the corners of two faces. A slot keeps its place from step to step, because time
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
-from dynsim.dynamics.tree.spatial import along, dot_vector, rotate, rotate_back, transform
-from dynsim.jit.kernel import internal_kernel, kernel
+import numpy as np
+
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.tables import Workspace
+from dynsim.dynamics.tree.spatial import along, compose, dot_vector, rotate, rotate_back, rotation, transform, vector
+from dynsim.jit.kernel import integers, internal_kernel, kernel, reals
 
 SLOTS = 4
 # Row of a found contact
@@ -20,7 +25,7 @@ PLACE = 1  # 3: midpoint between the two surfaces, in W [m]
 NORMAL = 4  # 3: from the second solid to the first, in W
 FEATURE = 7  # corner or edge of one of the solids, −1: empty slot
 FOUND_SIZE = 8
-# Gap of an empty slot [m].
+# Gap of a place that does not exist [m].
 FAR = 1e9
 # Features: corners 0 to 7 and edges 8 to 19 of the first solid, corners 20 to 27 of the second.
 EDGES, OTHERS, FEATURES = 8, 20, 28
@@ -30,6 +35,84 @@ BAND = 2e-3
 LEVEL = 1e-9
 # Largest number of steps of the search along an edge.
 ALONG_STEPS = 60
+# Pairs whose bounding spheres are further apart than this [m] are not examined.
+NEAR = 5e-3
+# PairArrays.index
+LINKS = 0  # 2: links of the first solid and of the second, which carries the surface
+PAIR_SIZE = 2
+# PairArrays.solid
+POSE = 0  # 12: rotation by rows and centre in the frame of its link
+CORE = 12  # 4: half edges and radius
+BOUND = 16  # radius of the sphere about it
+SOLID_SIZE = 17
+
+
+class PairArrays(NamedTuple):
+    """Pairs of solids that can touch, with their contacts."""
+
+    index: np.ndarray  # (m, PAIR_SIZE) int
+    solid: np.ndarray  # (m, 2, SOLID_SIZE)
+    slots: np.ndarray  # (m, SLOTS, FOUND_SIZE): contacts at the present poses
+    known: np.ndarray  # (m, SLOTS): features of the last accepted step
+    poses: np.ndarray  # (2, 12) scratch
+    places: np.ndarray  # (FEATURES, FOUND_SIZE) scratch
+    chosen: np.ndarray  # (SLOTS,) int scratch
+
+
+def pair_arrays(index: np.ndarray, solid: np.ndarray) -> PairArrays:
+    """Allocate :class:`PairArrays` for pairs of links, (m, PAIR_SIZE), with their solids, (m, 2, SOLID_SIZE)."""
+    m = len(index)
+    return PairArrays(
+        index=integers(index),
+        solid=reals(solid),
+        slots=reals(np.zeros((m, SLOTS, FOUND_SIZE))),
+        known=reals(np.full((m, SLOTS), -1.0)),
+        poses=reals(np.zeros((2, 12))),
+        places=reals(np.zeros((FEATURES, FOUND_SIZE))),
+        chosen=integers(np.zeros(SLOTS)),
+    )
+
+
+@internal_kernel
+def find_pairs(pairs, ws: Workspace):
+    """Find the contacts of all pairs of solids at the poses in ``ws``; without pairs (None) nothing is compiled."""
+    if pairs is None:
+        return
+    solid, poses = pairs.solid, pairs.poses
+    for m in range(pairs.index.shape[0]):
+        for side in range(2):
+            i = pairs.index[m, LINKS + side]
+            R = rotation(ws.links, i, ka.R)
+            p = transform(vector(ws.links, i, ka.P), R, vector(solid[m], side, POSE + 9))
+            poses[side, 9], poses[side, 10], poses[side, 11] = p
+        dx, dy, dz = poses[0, 9] - poses[1, 9], poses[0, 10] - poses[1, 10], poses[0, 11] - poses[1, 11]
+        apart = math.sqrt(dx * dx + dy * dy + dz * dz)
+        gap = apart - solid[m, 0, BOUND] - solid[m, 1, BOUND]
+        if gap > NEAR:
+            for j in range(SLOTS):
+                slot = pairs.slots[m, j]
+                slot[GAP], slot[FEATURE] = gap, -1.0
+                slot[NORMAL], slot[NORMAL + 1], slot[NORMAL + 2] = dx / apart, dy / apart, dz / apart
+                for s in range(3):
+                    slot[PLACE + s] = 0.5 * (poses[0, 9 + s] + poses[1, 9 + s])
+            continue
+        for side in range(2):
+            R = compose(rotation(ws.links, pairs.index[m, LINKS + side], ka.R), rotation_of(solid[m, side]))
+            for s in range(9):
+                poses[side, s] = R[s]
+        core, other = solid[m, 0, CORE:BOUND], solid[m, 1, CORE:BOUND]
+        slots, known = pairs.slots[m], pairs.known[m]
+        find_contacts(poses[0], core, poses[1], other, known, slots, pairs.places, pairs.chosen)
+
+
+@internal_kernel
+def remember_pairs(pairs):
+    """Note the features of the slots, so that the slots of the next step are the same."""
+    if pairs is None:
+        return
+    for m in range(pairs.known.shape[0]):
+        for j in range(SLOTS):
+            pairs.known[m, j] = pairs.slots[m, j, FEATURE]
 
 
 @internal_kernel
@@ -103,7 +186,7 @@ def lowest_between(h, start, way):
 
 
 @kernel
-def find_contacts(pose_a, core_a, pose_b, core_b, slots, places, chosen):
+def find_contacts(pose_a, core_a, pose_b, core_b, known, slots, places, chosen):
     """Find the contacts of two solids.
 
     Parameters
@@ -112,8 +195,10 @@ def find_contacts(pose_a, core_a, pose_b, core_b, slots, places, chosen):
         Rotation of the core, by rows, and its centre in W [m].
     core_a, core_b : (4,) ndarray
         Half edges of the core and radius [m].
+    known : (SLOTS,) ndarray
+        Features of the contacts of the last step, which keep their slots.
     slots : (SLOTS, FOUND_SIZE) ndarray
-        Contacts of the last step; they are replaced by those of the present poses.
+        Contacts, overwritten; an empty slot repeats the deepest contact at a gap of at least ``BAND``.
     places : (FEATURES, FOUND_SIZE) ndarray
         Scratch.
     chosen : (SLOTS,) ndarray of int
@@ -149,7 +234,7 @@ def find_contacts(pose_a, core_a, pose_b, core_b, slots, places, chosen):
                 at = along(start, way, lowest_between(hB, x, d))
                 f = EDGES + 4 * axis + edge_number(k, axis)
                 note_place(places, f, at, RB, pB, hB, rA, rB, 1.0)
-    fill_slots(slots, places, chosen)
+    fill_slots(known, slots, places, chosen)
 
 
 @internal_kernel
@@ -184,7 +269,7 @@ def note_place(places, f, at, R, p, h, own, other, sign):
 
 
 @internal_kernel
-def fill_slots(slots, places, chosen):
+def fill_slots(known, slots, places, chosen):
     """Choose at most SLOTS places: the deepest, the furthest from it, and the furthest on either side of their line."""
     chosen[:] = -1
     deepest = 0
@@ -219,11 +304,12 @@ def fill_slots(slots, places, chosen):
     for j in range(SLOTS):
         kept = False
         for s in range(SLOTS):
-            if chosen[s] >= 0 and slots[j, FEATURE] == chosen[s]:
+            if chosen[s] >= 0 and known[j] == chosen[s]:
                 copy_place(slots, j, places, chosen[s])
                 kept, chosen[s] = True, -1
         if not kept:
-            slots[j, GAP], slots[j, FEATURE] = FAR, -1.0
+            copy_place(slots, j, places, deepest)
+            slots[j, GAP], slots[j, FEATURE] = max(places[deepest, GAP], 0.0) + BAND, -1.0
     for s in range(SLOTS):
         for j in range(SLOTS):
             if chosen[s] >= 0 and slots[j, FEATURE] < 0.0:
@@ -245,10 +331,10 @@ def vector_of(places, f):
 
 
 @kernel
-def pair_distances(poses_a, cores_a, poses_b, cores_b, slots, places, chosen, gaps, normals):
+def pair_distances(poses_a, cores_a, poses_b, cores_b, known, slots, places, chosen, gaps, normals):
     """Write the distances, (m,) [m], and normals, (m, 3), of m pairs of solids; see :func:`find_contacts`."""
     for k in range(poses_a.shape[0]):
-        find_contacts(poses_a[k], cores_a[k], poses_b[k], cores_b[k], slots, places, chosen)
+        find_contacts(poses_a[k], cores_a[k], poses_b[k], cores_b[k], known, slots, places, chosen)
         gaps[k] = FAR
         for j in range(SLOTS):
             if slots[j, GAP] < gaps[k]:

@@ -24,12 +24,14 @@ import math
 from dynsim.dynamics import state as kst
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import distance as kd
+from dynsim.dynamics.contact import solids as ks
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.cone import steps as kc
 from dynsim.dynamics.contact.cone.program import select_least_norm
 from dynsim.dynamics.contact.cone.steps import approach, motion, proximal_point
 from dynsim.dynamics.contact.mobility import moves_along_normal
 from dynsim.dynamics.contact.rows import point_row, set_modes
+from dynsim.dynamics.contact.solids import remember_pairs
 from dynsim.dynamics.contact.unilateral import UnilateralArrays, dry_bound, sliding_friction, stop_gap
 from dynsim.dynamics.tables import ModelArrays, Workspace
 from dynsim.dynamics.tree.spatial import (
@@ -393,6 +395,7 @@ def restart_memory(system, s: SteppingArrays, ws: Workspace, y):
     for a in range(s.torque.shape[0]):
         s.torque[a] = math.nan
     geometry(system, system.model, ws)
+    remember_pairs(system.shapes.pairs)
     for k in range(ws.contacts.shape[0]):
         last, state = s.memory[kt.LAST, k], ws.contacts[k]
         last[:] = 0.0
@@ -507,6 +510,8 @@ def is_same_contact(system, last, ws: Workspace, k, h):
     shapes = system.shapes
     if shapes is None:  # resolved at compile time
         return True
+    if shapes.kind[k, kd.SURFACE] == kd.PAIR:
+        return is_same_slot(shapes.pairs, shapes.kind[k, kd.FIELD], shapes.kind[k, kd.COUNT])
     if shapes.kind[k, kd.MOVES] == 0:
         return True
     # Its contact point may have jumped, e.g. from one end of a capsule to the other.
@@ -518,6 +523,14 @@ def is_same_contact(system, last, ws: Workspace, k, h):
         v = point_velocity(six(ws.links, carrier, ka.V), at)
         fastest = max(fastest, dot_vector(v, v))
     return math.sqrt(square) <= SAME_PLACE * h * math.sqrt(fastest) + SHORT_WAY
+
+
+@internal_kernel
+def is_same_slot(pairs, m, j):
+    """Return whether slot j of pair m contains the feature that it contained after the last step."""
+    if pairs is None:
+        return True
+    return pairs.slots[m, j, ks.FEATURE] >= 0.0 and pairs.slots[m, j, ks.FEATURE] == pairs.known[m, j]
 
 
 @internal_kernel

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dynsim.dynamics import state as kst
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
+from dynsim.dynamics.contact.solids import remember_pairs
 from dynsim.dynamics.contact.unilateral import UnilateralArrays, note_stop_forces
 from dynsim.dynamics.derivative import System
 from dynsim.dynamics.drive.law import drive, drive_on_segments, segment_of, take_commands
@@ -630,6 +631,7 @@ def advance_moreau(system: System, ws: Workspace, run: Run, limit):
         watch(ws, run, clock[ki.STEP])
         keep_torques(system, ws, run)
         count_step(system.unilateral, system.contacts.law, run.stepping, ws, clock[ki.STEP])
+        remember_pairs(system.shapes.pairs)  # of the midpoint, before a sample finds others
         sample_moreau(system, ws, run)
         for j in range(run.y.shape[0]):
             run.y[j] = run.y_new[j]
