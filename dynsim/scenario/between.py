@@ -29,6 +29,8 @@ Solid = Capsule | Box
 LINKS, OBJECTS, SELF = "links", "objects", "self"
 # Radius of the edges of boxes that touch bodies [m], at most half the shortest edge.
 ROUNDING = 1e-3
+# Maximum number of candidates between bodies for event-driven methods.
+MOST_CANDIDATES = 20
 _CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 
 
@@ -76,6 +78,12 @@ def contacts_between(
             for contact in _slots(a, b) if stepped and not (_is_sphere(a) or _is_sphere(b)) else _candidates(a, b):
                 name = unused(f"{contact.body}-{contact.surface.carrier}", names)
                 result.append(replace(contact, name=name, surface_name=str(contact.surface.carrier), **parameters))
+    if not stepped and len(result) > MOST_CANDIDATES:
+        raise ModelError(
+            f"contacts.between: {len(result)} candidates between bodies are more than the {MOST_CANDIDATES} for which "
+            "this method locates events; use integrator: {method: time_stepping}, or fewer pairs",
+            keys=("contacts", "between"),
+        )
     return result
 
 

@@ -563,6 +563,8 @@ def check_start(
             off.append((contact, declared, keys, gap))
     if off:
         contact, declared, keys, gap = off[0]
+        if contact.surface_name == contact.surface.carrier:
+            raise _overlap(scenario, contact, gap)
         position = model.point_position(contact.body, contact.point, q)
         remedy = "start from another posture, change the surface"
         if own and scenario.plant.type == "snake":  # `initial` does not place its joints
@@ -583,9 +585,23 @@ def check_start(
         )
 
 
+def _overlap(scenario: Scenario, contact: Contact, gap: float) -> ModelError:
+    """Return the error about two bodies that overlap at the start."""
+    bodies = contact.body, contact.surface_name
+    movable = [name for name in bodies if name in scenario.config.objects]
+    remedy = f"move {movable[0]} (objects.{movable[0]}.position_m)" if movable else "start from another posture"
+    return ModelError(
+        f"contacts.between: {bodies[0]} and {bodies[1]} overlap by {-gap:.4g} m at the start (limit "
+        f"{START_TOLERANCE:g} m); {remedy}, or list the pair in `ignore`",
+        keys=("contacts", "between"),
+    )
+
+
 def _keys_of(scenario: Scenario, contact: Contact) -> tuple[bool, tuple[str, ...]]:
     """Return whether the contact is a declared contact point, and the keys that define it."""
     declared = contact.name in scenario.config.contacts.points
+    if contact.surface_name == contact.surface.carrier:
+        return declared, ("contacts", "between")
     return declared, ("contacts", "points", contact.name) if declared else ("contacts", "candidates")
 
 

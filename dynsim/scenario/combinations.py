@@ -93,6 +93,7 @@ def _contact_keys(*names: str) -> Callable[[Any], Iterator[str]]:
     def used(config: Any) -> Iterator[str]:
         sections = {"contacts": config.contacts}
         sections |= {f"contacts.points.{name}": point for name, point in config.contacts.points.items()}
+        sections |= {f"contacts.between.{k}": pair for k, pair in enumerate(config.contacts.between)}
         for where, section in sections.items():
             for name in names:
                 if name in section.model_fields_set and getattr(section, name, None) is not None:
@@ -108,6 +109,9 @@ def _compliance(config: Any) -> Iterator[str]:
         yield "contacts.damping_N_s_per_m"
     yield from (
         f"contacts.points.{name}.damping_N_s_per_m" for name, p in config.contacts.points.items() if p.damping_N_s_per_m
+    )
+    yield from (
+        f"contacts.between.{k}.damping_N_s_per_m" for k, p in enumerate(config.contacts.between) if p.damping_N_s_per_m
     )
 
 
@@ -160,6 +164,12 @@ RESTRICTIONS = (
         "the bilateral law would hold all of them to their surfaces",
         laws=LAWS[1:],
         keys=_key("contacts.candidates", lambda config: config.contacts.candidates != "points"),
+    ),
+    Restriction(
+        "bodies that touch each other (`contacts.between`)",
+        "the bilateral law would hold all of them together",
+        laws=LAWS[1:],
+        keys=_key("contacts.between", lambda config: bool(config.contacts.between)),
     ),
     Restriction(
         "friction that depends on direction (`grip`)",
