@@ -93,9 +93,9 @@ def _of_contacts(config: Any) -> Iterator[tuple[Keys, str]]:
     has_feet = getattr(config.plant, "level", "") == "dynamic"
     # Free objects always have contacts at their corners and wheels.
     touches = contacts.law == "unilateral" and any(body.joint is None for body in config.objects.values())
-    if not contacts.points and contacts.candidates == "points" and not has_feet and not touches:
+    if not contacts.points and contacts.candidates == "points" and not (has_feet or touches or contacts.between):
         for key in type(contacts).model_fields:
-            if key not in ("law", "candidates", "points", "reference_tolerance_m"):
+            if key not in ("law", "candidates", "points", "between", "reference_tolerance_m"):
                 yield ("contacts", key), "contacts.points is empty, and contacts.candidates is points"
     if contacts.candidates != "points" and not config.surfaces:
         yield ("contacts", "candidates"), "the scenario has no surfaces"

@@ -246,3 +246,26 @@ def test_neighbours_and_ignored_pairs_do_not_touch(tmp_path):
 def test_wrong_pairs_are_errors(tmp_path, between, text):
     with pytest.raises(DynsimError, match=text):
         run(tmp_path, {"a": ball(1.0, 0.05, [0, 0, 0])}, between=between, duration_s=0.01)
+
+
+def test_overlap_at_the_start_is_an_error(tmp_path):
+    objects = {"a": ball(1.0, 0.05, [0, 0, 0]), "b": ball(1.0, 0.05, [0.08, 0, 0])}
+    with pytest.raises(DynsimError, match=r"a and b overlap by 0\.02 m .*move a"):
+        run(tmp_path, objects, duration_s=0.01)
+
+
+def test_many_pairs_need_time_stepping(tmp_path):
+    boxes = {f"b{k}": {"size_m": [0.1, 0.1, 0.1], "mass_kg": 1, "position_m": [0.2 * k, 0, 0]} for k in range(2)}
+    with pytest.raises(DynsimError, match=r"28 candidates .* time_stepping"):
+        run(tmp_path, boxes, duration_s=0.01, integrator={"method": "dopri5"})
+
+
+def test_bilateral_law_is_refused(tmp_path):
+    with pytest.raises(DynsimError, match=r"contacts\.between.*unilateral"):
+        run(
+            tmp_path,
+            BALLS,
+            duration_s=0.01,
+            contacts={"law": "bilateral", "between": [{"bodies": ["a", "b"]}]},
+            integrator={"method": "dopri5"},
+        )
