@@ -49,6 +49,7 @@ from dynsim.integrators.events import TIP_MARGIN
 from dynsim.integrators.methods import METHODS, by_number
 from dynsim.integrators.run import RATE_TOLERANCE
 from dynsim.integrators.simd.forms import has_forms
+from dynsim.integrators.stepping.free_bodies import free_bodies
 from dynsim.integrators.stepping.tables import stepping_arrays
 from dynsim.model.description import Array, Contact, Load, Robot
 from dynsim.model.drives import Drive, Motor
@@ -344,7 +345,9 @@ def prepare(
     stepping = None
     if method == ki.TIME_STEPPING and system.unilateral is not None:
         system = with_shapes(system)
-        stepping = stepping_arrays(model.arrays, system.contacts, na, joint_rows, options.theta)
+        between = bool((system.contacts.link[:, ka.CARRIER] >= 0).any())
+        free = free_bodies(model.arrays) if between else np.zeros(0, dtype=np.int64)
+        stepping = stepping_arrays(model.arrays, system.contacts, na, joint_rows, options.theta, free)
     y = np.zeros(layout.size)
     y[block(layout, "q")] = robot.initial
     if balance is not None:

@@ -34,6 +34,7 @@ from dynsim.integrators.stepping.contacts import (
     strikes,
     tangent_rows,
 )
+from dynsim.integrators.stepping.free_bodies import balance_momentum
 from dynsim.integrators.stepping.tables import (
     SteppingArrays,
     constraint_rates,
@@ -284,6 +285,7 @@ def solve_step(system: System, model: ModelArrays, ws: Workspace, run: Run):
         note_stop_forces(system.unilateral, ws)
         add_row_forces(model, ws)
     accelerate(model, ws)
+    balance_momentum(model, s, ws, h)
     run.count[ki.EVALUATIONS] += 1
     for i in range(joints.shape[0]):
         last[i] = joints[i, ka.QDD]
@@ -309,6 +311,7 @@ def book(system: System, ws: Workspace, run: Run):
     # Use the sweep at the midpoint before it is overwritten.
     stored = -midpoint_work(system.model, ws, s.before[kt.V_START], s.before[kt.ACCELERATION], h)
     stored += drive_work(system, ws, run)
+    stored += s.statistics[kt.BALANCED]
     if system.loads.table.shape[0] > 0:
         # Add the loads again to get their powers at the mean velocities that the links have now.
         add_loads(system.model, system.loads, t + s.theta * h, ws, run.stage[1], layout.load)

@@ -70,7 +70,9 @@ WORST, CAPPED, PENETRATION, SOLVES, LONG_SOLVES, TAKEN, UNSETTLED, HALF_STEP, DR
 # Largest energy removed by steps up to any time, and largest energy created since then [J].
 MOST_TAKEN, MADE = 9, 10
 STIFFEST = 11  # largest stiffness times mobility of a compliant row [1/s²]
-STATISTICS_SIZE = 12
+# Work of the changes of free bodies' rates in this step, which no force does [J].
+BALANCED = 12
+STATISTICS_SIZE = 13
 # SteppingArrays.before: rates at the start; rates used for the velocity products; acceleration of the last step, which
 # the acceleration of this step replaces; applied torques at the start, without loads; rates at the end of the last
 # accepted step; acceleration of the last step without an impact.
@@ -117,6 +119,7 @@ class SteppingArrays(NamedTuple):
     room: np.ndarray  # (CONE_ROOM, p, p)
     statistics: np.ndarray  # (STATISTICS_SIZE,)
     grid: np.ndarray  # (GRID_SIZE,)
+    free: np.ndarray  # (k,) int: first rotational rows of free bodies, if bodies touch each other
 
 
 def stepping_arrays(
@@ -125,8 +128,9 @@ def stepping_arrays(
     na: int,
     joint_rows: int,
     theta: float,
+    free: np.ndarray,
 ) -> SteppingArrays:
-    """Allocate :class:`SteppingArrays` for ``joint_rows`` rows of joints and the rows of all candidates."""
+    """Allocate :class:`SteppingArrays` for ``joint_rows`` rows of joints, and the rows of all candidates."""
     n, c = model.body.shape[0], contacts.link.shape[0]
     p = row_limit(c, joint_rows)
     return SteppingArrays(
@@ -155,6 +159,7 @@ def stepping_arrays(
         room=np.zeros((kc.CONE_ROOM, p, p)),
         statistics=np.zeros(STATISTICS_SIZE),
         grid=np.zeros(GRID_SIZE),
+        free=integers(free),
     )
 
 
