@@ -223,7 +223,7 @@ def _alone(scenario: Scenario) -> Scenario:
         "ties": {},
         "sensors": None,
         "surfaces": {name: surface for name, surface in config.surfaces.items() if name == GROUND},
-        "contacts": config.contacts.model_copy(update={"points": points}),
+        "contacts": config.contacts.model_copy(update={"points": points, "between": []}),
     }
     return replace(scenario, config=config.model_copy(update=changes))
 

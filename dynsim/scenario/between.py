@@ -88,30 +88,33 @@ def contacts_between(
 
 
 def solids_of(robot: Robot, objects: Mapping[str, SceneObject]) -> dict[str, list[Solid]]:
-    """Return the solids of each body that has any: parts of objects, and capsules about the axes of links."""
-    of_objects = {link.name for name, body in objects.items() for link in body.links(name)}
+    """Return the solids of each body that has any: parts of objects, capsules about the axes of links, and wheels."""
     solids: dict[str, list[Solid]] = {}
     tips = axis_ends(robot)
     for link in robot.links:
         if link.name in robot.carriers:
             continue
-        if link.name in of_objects:
+        if link.name in objects:
             own = [_solid(shape, link.name) for shape in link.shapes]
         else:
             axes = [tip for tip in tips[link.name] if tip.any()] if link.radius > 0.0 else []
             own = [Capsule(np.zeros(3), tip, link.radius, link.name) for tip in axes]
+            # Wheels touch bodies with the spheres with which they touch the ground.
+            wheels = {(*foot.point, foot.radius) for foot in robot.feet if foot.body == link.name}
+            own += [Capsule(np.array(at), np.zeros(3), r, link.name) for *at, r in wheels if r > link.radius]
         if own:
             solids[link.name] = own
     return solids
 
 
 def _solid(shape: Shape, body: str) -> Solid:
-    """Return the solid of a shape; a cylinder is the capsule inside it."""
+    """Return the solid of a shape; a cylinder is the capsule inside it, and a disc the box inside it."""
     R, p = rotated(np.array(shape.orientation), np.eye(3)), np.array(shape.position)
-    if shape.kind == "box":
-        edges = np.array(shape.size)
-        return Box(p, R.T, edges, min(ROUNDING, 0.5 * float(edges.min())), body)
     radius, *length = shape.size
+    disc = shape.kind == "cylinder" and length[0] < 2.0 * radius
+    if shape.kind == "box" or disc:
+        edges = np.array([2**0.5 * radius, 2**0.5 * radius, *length] if disc else shape.size)
+        return Box(p, R.T, edges, min(ROUNDING, 0.5 * float(edges.min())), body)
     half = max(0.5 * sum(length) - radius, 0.0) * R[:, 2]
     return Capsule(p - half, 2.0 * half, radius, body)
 
@@ -152,7 +155,7 @@ def _bodies(
 
 
 def _neighbours(robot: Robot) -> set[frozenset[str]]:
-    """Return the pairs of bodies that a joint connects."""
+    """Return the pairs of bodies that a joint connects; a wheel also ignores the neighbours of its axle."""
     parents = {link.name: link.parent for link in robot.links}
     pairs = set[frozenset[str]]()
     for name in robot.bodies:
@@ -161,7 +164,9 @@ def _neighbours(robot: Robot) -> set[frozenset[str]]:
             parent = parents[parent]
         if parent is not None:
             pairs.add(frozenset((name, parent)))
-    return pairs
+    wheels = {foot.body for foot in robot.feet if foot.radius and not foot.point.any()}
+    beside = {frozenset((wheel, body)) for wheel in wheels for pair in pairs if parents[wheel] in pair for body in pair}
+    return pairs | beside
 
 
 def _is_sphere(solid: Solid) -> bool:

@@ -14,6 +14,7 @@ from dynsim.config.base import error_at
 from dynsim.config.problems import dotted, listed
 from dynsim.errors import ModelError
 from dynsim.integrators import methods
+from dynsim.library.families import engine
 from dynsim.model.description import Robot
 from dynsim.model.drives import Motor
 
@@ -228,6 +229,9 @@ RESTRICTIONS = (
 
 def check_keys(config: Any) -> None:
     """Raise an error, for a pydantic validator, if the keys of a ScenarioConfig violate a restriction."""
+    if config.contacts.between and engine(config.plant) == "kinematic":
+        text = "requires plant.level: dynamic, because a kinematic plant has no forces; remove it or set the level"
+        raise error_at("contacts.between", text)
     for restriction in RESTRICTIONS:
         if restriction.keys is None or not (conflict := restriction.conflict(config)):
             continue

@@ -64,6 +64,7 @@ def main() -> None:
         {"scenario": name, "variant": variant, "level": level, **outcome(name, variant, level)}
         for name in TASKS
         for variant in variant_names(name)
+        if variant != "pushes"
         for level in ("kinematic", "dynamic")
     ]
     for entry in runs:

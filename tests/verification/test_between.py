@@ -144,7 +144,7 @@ def test_momentum_and_angular_momentum_of_a_free_scene(tmp_path, objects):
     assert record.summary["energy_residual_relative"] < 1e-12
 
 
-def held(method: str, step: float, friction: float, tmp_path) -> Record:
+def held(method: str, step: float, friction: float, tmp_path, solver: str = "articulated") -> Record:
     integrator = {"method": method} | (
         {"step_s": step} if method == "time_stepping" else {"rtol": 1e-10, "atol": 1e-12}
     )
@@ -168,7 +168,7 @@ def held(method: str, step: float, friction: float, tmp_path) -> Record:
         weight=True,
         friction=friction,
         duration_s=0.3,
-        integrator=integrator,
+        integrator=integrator | {"solver": solver},
     )
 
 
