@@ -61,7 +61,11 @@ def export(
         ),
     ] = None,
     contacts: Annotated[
-        bool, typer.Option("--contacts", help="Let contact points and surfaces collide in MuJoCo (mjcf only).")
+        bool,
+        typer.Option(
+            "--contacts",
+            help="Let contact points and surfaces, and the solids of contacts.between, collide in MuJoCo (mjcf only).",
+        ),
     ] = False,
     check: Annotated[
         bool,
@@ -146,7 +150,9 @@ def _export_mjcf(scenario: Scenario, target: Path, touching: bool, check: bool) 
         for text in mujoco_check.omissions(scenario, prepared, touching):
             print_warning(text)
     files, contents = _stl_files(scenario, _shapes(model.robot), f"{target.name.split('.')[0]}_meshes")
-    text = model.to_mjcf(contacts, build.surfaces(scenario), gains=gains, meshes=files, touching=touching)
+    pairs = build.solid_pairs(scenario, model.robot) if touching else []
+    surfaces = build.surfaces(scenario)
+    text = model.to_mjcf(contacts, surfaces, gains=gains, meshes=files, touching=touching, pairs=pairs)
     for name, content in contents.items():
         with replacing(target.parent / name) as stream:
             stream.write(content)

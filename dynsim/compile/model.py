@@ -21,7 +21,7 @@ from dynsim.dynamics.tree import articulated, joints, sweep
 from dynsim.errors import ModelError, brief
 from dynsim.model.description import Array, Contact, Robot
 from dynsim.model.drives import Servo
-from dynsim.model.surfaces import Surface
+from dynsim.model.surfaces import SolidPair, Surface
 from dynsim.record import record
 from dynsim.system.arguments import names_wrong_types
 
@@ -152,7 +152,7 @@ class Model:
         return cls(read_urdf(Path(path), lock))
 
     def to_urdf(self) -> str:
-        """Return the tree of bodies as URDF text, with masses, limits, viscous losses and shapes.
+        """Return the tree of bodies as URDF text, with masses, limits, viscous losses, and visual and collision shapes.
 
         Returns
         -------
@@ -172,9 +172,10 @@ class Model:
         True
         """
         from dynsim.compile.scene import with_shapes
+        from dynsim.compile.solids import with_solids
         from dynsim.model.urdf.writer import write_urdf
 
-        return write_urdf(with_shapes(self.robot))
+        return write_urdf(with_solids(with_shapes(self.robot)))
 
     def to_mjcf(
         self,
@@ -184,6 +185,7 @@ class Model:
         gains: Mapping[str, tuple[float, float]] | None = None,
         meshes: Mapping[str, str] | None = None,
         touching: bool = False,
+        pairs: Sequence[SolidPair] = (),
     ) -> str:
         """Return the tree of bodies as MJCF text (MuJoCo's format), with motors, their loops, and losses.
 
@@ -199,7 +201,10 @@ class Model:
         meshes : mapping of str to str, optional
             Paths of mesh files that MuJoCo can read, by the name of the mesh in the shapes; default: no meshes.
         touching : bool, optional
-            If True, contact points collide with their surfaces; otherwise nothing collides.
+            If True, contact points collide with their surfaces, and pairs of solids with each other; otherwise nothing
+            collides.
+        pairs : sequence of SolidPair, optional
+            Pairs of solids that collide if ``touching`` is True.
 
         Returns
         -------
@@ -221,8 +226,9 @@ class Model:
         from dynsim.compile.scene import drawn_surface, with_shapes
         from dynsim.model.mjcf import back_emf_damping, write_mjcf
 
-        standing = {name: surface for name, surface in (surfaces or {}).items() if surface.carrier is None}
-        drawn = [drawn_surface(name, surface) for name, surface in standing.items()]
+        known = surfaces or {}
+        drawn = [(drawn_surface(name, surface), surface.carrier) for name, surface in known.items()]
+        own = [contact for contact in contacts if contact.surface.carrier is None or contact.surface_name in known]
         rubs = {rubbing.joint: rubbing.gear + rubbing.bearing for rubbing in dry_frictions(self.robot)}
         damping = self.damping.copy()
         for motor in self.robot.motors:
@@ -230,7 +236,9 @@ class Model:
             if isinstance(motor, Servo) and motor.coulomb_speed is not None:  # smoothed friction becomes dry
                 rubs[motor.joint] = rubs.get(motor.joint, 0.0) + motor.coulomb_friction
         described = with_shapes(self.robot, "capsule")
-        return write_mjcf(described, contacts, drawn, damping, self.armature, rubs, gains or {}, meshes or {}, touching)
+        return write_mjcf(
+            described, own, drawn, damping, self.armature, rubs, gains or {}, meshes or {}, touching, pairs
+        )
 
     @property
     def joint_names(self) -> tuple[str, ...]:

@@ -55,7 +55,7 @@ def robot_scene(robot: Robot, contacts: Sequence[Contact], surfaces: Mapping[str
         if kind is None:
             return None
         parent = WORLD if link.parent is None else index[link.parent]
-        carried = tuple(_solid(surface) for surface in surfaces.values() if surface.carrier == link.name)
+        carried = tuple(solid_shape(surface) for surface in surfaces.values() if surface.carrier == link.name)
         bodies.append(Body(link.name, parent, _joint(link, kind), shapes(link) + carried))
     hand_body, hand_point = robot.hand
     points = [Point("hand", "hand", index[hand_body], vector3(hand_point))]
@@ -94,7 +94,7 @@ def _shared(values: Iterable[float]) -> float | None:
     return float(value) if math.isfinite(value) else None
 
 
-def _solid(surface: Surface) -> Shape:
+def solid_shape(surface: Surface) -> Shape:
     """Return the solid that stands for a surface on a body; only a part of what is infinite is drawn."""
     if isinstance(surface, Box):
         return Shape("box", vector3(surface.edges), vector3(surface.centre), quaternion(surface.axes.T))

@@ -1,15 +1,20 @@
-"""Bodies that touch surfaces from outside (boxes, spheres, cylinders), and the parts of link axes inside them."""
+"""Solids of bodies that touch each other, and the parts of link axes inside solid surfaces."""
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 
 from dynsim.compile.clearance import axis_ends, poses
+from dynsim.compile.scene import solid_shape
 from dynsim.compile.shapes import bends_outward
 from dynsim.model.description import Array, Contact, Robot
-from dynsim.model.surfaces import Box, Quadric, Surface
+from dynsim.model.surfaces import Box, Capsule, Quadric, Surface
+from dynsim.record.quaternion import rotated
+from dynsim.record.scene import Shape
 
 # Depth up to which an axis does not count as inside a sphere or cylinder, and least depth for a box [m].
 SLACK = 1e-4
@@ -17,6 +22,63 @@ SLACK = 1e-4
 CORNER = 1.0 - 3.0**-0.5
 # Cosine between the normals where the arm enters a solid and where it touches it; below, it passes through the solid.
 THROUGH = -0.5
+# Radius of the edges of boxes that touch bodies [m], at most half the shortest edge.
+ROUNDING = 1e-3
+
+Solid = Capsule | Box
+
+
+def solids_of(robot: Robot) -> dict[str, list[Solid]]:
+    """Return the solids of each body that has any.
+
+    Those of a link with a radius are capsules about its axes, those of other bodies their shapes. Wheels are the
+    spheres with which they touch the ground.
+    """
+    solids: dict[str, list[Solid]] = {}
+    tips = axis_ends(robot)
+    for link in robot.links:
+        if link.name in robot.carriers:
+            continue
+        own: list[Solid] = [_solid_of(shape, link.name) for shape in link.solids]
+        if link.radius > 0.0:
+            own = [Capsule(np.zeros(3), tip, link.radius, link.name) for tip in tips[link.name] if tip.any()] or own
+        if not link.solids:
+            wheels = {(*foot.point, foot.radius) for foot in robot.feet if foot.body == link.name}
+            own += [Capsule(np.array(at), np.zeros(3), r, link.name) for *at, r in wheels if r > link.radius]
+        if own:
+            solids[link.name] = own
+    return solids
+
+
+def with_solids(robot: Robot) -> Robot:
+    """Return the robot whose links have the shapes of :func:`solids_of`; a capsule replaces the shapes of its link."""
+    solids = solids_of(robot)
+    return replace(
+        robot,
+        links=tuple(
+            replace(link, solids=tuple(map(solid_shape, solids[link.name])))
+            if link.radius > 0.0 and link.name in solids
+            else link
+            for link in robot.links
+        ),
+    )
+
+
+def _solid_of(shape: Shape, body: str) -> Solid:
+    """Return the solid of a shape; a cylinder is the capsule inside it, or the rounded plate if it is a flat disc."""
+    R, p = rotated(np.array(shape.orientation), np.eye(3)), np.array(shape.position)
+    if shape.kind == "box":
+        edges = np.array(shape.size)
+        return Box(p, R.T, edges, min(ROUNDING, 0.5 * float(edges.min())), body)
+    radius, *length = shape.size
+    half = 0.5 * sum(length) - (radius if shape.kind == "cylinder" else 0.0)
+    if half < 0.0:
+        # A square plate whose corners, rounded like its edges, are on the rim.
+        thickness = length[0]
+        edge = math.sqrt(2.0) * (radius - 0.5 * thickness) + thickness
+        return Box(p, R.T, np.array([edge, edge, thickness]), 0.5 * thickness, body)
+    along = half * R[:, 2]
+    return Capsule(p - along, 2.0 * along, radius, body)
 
 
 def tangent_planes(surface: Surface) -> list[Quadric]:

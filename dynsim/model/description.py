@@ -193,6 +193,10 @@ class Link:
     shapes : tuple of Shape
         Visual shapes of the body, in B. If empty, a cylinder about its axis is drawn if ``radius`` and ``tip`` are
         known.
+    solids : tuple of Shape
+        Collision shapes of the body, in B: boxes, spheres, cylinders and capsules that can touch other bodies.
+    omitted : tuple of str
+        Collision shapes that cannot be solids, such as meshes, as texts for messages.
     """
 
     name: str
@@ -215,6 +219,8 @@ class Link:
     joint_of_rows: str | None = None
     armature: float = 0.0
     friction: float = 0.0
+    solids: tuple[Shape, ...] = ()
+    omitted: tuple[str, ...] = ()
 
     @property
     def row(self) -> Row:
@@ -248,7 +254,7 @@ class Link:
 
 def without_body(link: Link) -> Link:
     """Return the link without mass, extent and shapes."""
-    return replace(link, inertia=Inertia(0.0), radius=0.0, tip=None, shapes=())
+    return replace(link, inertia=Inertia(0.0), radius=0.0, tip=None, shapes=(), solids=(), omitted=())
 
 
 def in_rows(link: Link, rows: Sequence[tuple[str, str, Array]]) -> tuple[Link, ...]:

@@ -4,7 +4,7 @@ The export contains bodies, joints with limits, viscous losses, dry friction and
 the initial posture. MuJoCo's format represents all of these exactly. DC motors become ``dcmotor`` actuators with their
 circuits and voltage loops. Servos become ``position`` actuators, ``general`` ones in velocity mode, or ``dcmotor``
 actuators without inductance if their current is limited. Contact points become sites; on request, they and the surfaces
-also become colliding geoms, whose contacts are soft in MuJoCo.
+also become colliding geoms, whose contacts are soft in MuJoCo, as do the solids of bodies that touch each other.
 
 Every actuator has one control c, in the unit of the reference. Notation: gains k_p and k_d, torque constant K,
 resistance R, reference q_d with rate v_d, feed-forward voltage u_f.
@@ -26,6 +26,7 @@ import numpy as np
 from dynsim.errors import ModelError
 from dynsim.model.description import Array, Contact, Link, Robot
 from dynsim.model.drives import Drive, Servo, TorqueSource
+from dynsim.model.surfaces import Box, SolidPair
 from dynsim.record.quaternion import of_matrix
 from dynsim.record.scene import HERE, SceneSurface, Shape
 from dynsim.record.urdf_text import Element, numbers, xml_text
@@ -49,13 +50,14 @@ Gains = Mapping[str, tuple[float, float]]
 def write_mjcf(
     robot: Robot,
     contacts: Sequence[Contact],
-    surfaces: Sequence[SceneSurface],
+    surfaces: Sequence[tuple[SceneSurface, str | None]],
     damping: Array,
     armature: Array,
     rubs: Mapping[str, float],
     gains: Gains,
     meshes: Mapping[str, str],
     touching: bool,
+    pairs: Sequence[SolidPair],
 ) -> str:
     """Write the bodies, joints, motors and shapes of a robot as MJCF text.
 
@@ -65,8 +67,9 @@ def write_mjcf(
         Robot whose links include the masses of its motors.
     contacts : sequence of Contact
         Contact points, which become sites ``contact_NAME``; the hand is the site ``hand``.
-    surfaces : sequence of SceneSurface
-        Surfaces; only planes, spheres, cylinders and boxes are drawn.
+    surfaces : sequence of (SceneSurface, str or None)
+        Surfaces with the bodies that carry them, None for the world; only planes, spheres, cylinders and boxes are
+        drawn, on bodies no planes.
     damping, armature : (n,) ndarray
         Damping and armature of each row of the joints [N m s/rad, kg m²; N s/m, kg].
     rubs : mapping of str to float
@@ -76,7 +79,9 @@ def write_mjcf(
     meshes : mapping of str to str
         Paths of mesh files that MuJoCo can read, by the name of the mesh; other meshes are omitted.
     touching : bool
-        Whether contact points and surfaces collide.
+        Whether contact points and surfaces collide, and pairs of solids.
+    pairs : sequence of SolidPair
+        Pairs of solids.
 
     Raises
     ------
@@ -93,10 +98,10 @@ def write_mjcf(
     looks.attrib.update(contype="0", conaffinity="0", group="1", mass="0")
     world = ElementTree.SubElement(root, "worldbody")
     ElementTree.SubElement(world, "light", pos="0 0 5", dir="0 0 -1", directional="true")
-    solid = {surface.name: surface for surface in surfaces if _add_surface(world, surface, touching)}
     assets = _add_meshes(root, robot, meshes)
-    _add_shapes(world, robot.fixed_shapes, assets)
     elements: dict[str | None, Element] = {None: world}
+    solid = {s.name: s for s, carrier in surfaces if carrier is None and _add_surface(world, s, touching)}
+    _add_shapes(world, robot.fixed_shapes, assets)
     below: dict[str | None, list[list[Link]]] = {}
     for group in _joints(robot):
         below.setdefault(group[0].parent, []).append(group)
@@ -116,6 +121,9 @@ def write_mjcf(
             add(link.name)
 
     add(None)
+    for surface, carrier in surfaces:
+        if carrier is not None and surface.kind != "plane" and _add_surface(elements[carrier], surface, touching):
+            solid[surface.name] = surface
     hand, point = robot.hand
     ElementTree.SubElement(elements[hand], "site", name="hand", pos=numbers(point), size="0.005")
     for contact in contacts:
@@ -124,6 +132,7 @@ def write_mjcf(
         ElementTree.SubElement(elements[robot.links[index].name], "site", site)
     if touching:
         _add_contacts(root, robot, contacts, solid, elements)
+        _add_pairs(root, pairs, elements)
     _add_couplings(root, robot)
     if robot.motors:
         actuators = ElementTree.SubElement(root, "actuator")
@@ -279,10 +288,39 @@ def _add_contacts(
             ends = numbers([*start, *robot.attach(contact.body, contact.tip)[1]])
             geom |= {"type": "capsule", "fromto": ends}
         ElementTree.SubElement(elements[robot.links[index].name], "geom", geom)
-        pair = {"geom1": f"surface_{contact.surface_name}", "geom2": name}
-        pair["margin"] = numbers(_edge_radius(surfaces[contact.surface_name]) - _PAD)
-        friction = numbers([contact.friction, contact.friction, 0.0, 0.0, 0.0])
-        ElementTree.SubElement(pairs, "pair", {**pair, "condim": "3", "friction": friction, **_STIFF})
+        margin = _edge_radius(surfaces[contact.surface_name]) - _PAD
+        _add_pair(pairs, f"surface_{contact.surface_name}", name, margin, contact.friction)
+
+
+def _add_pairs(root: Element, pairs: Sequence[SolidPair], elements: Mapping[str | None, Element]) -> None:
+    """Add a geom for each solid, which collides only with its partners in the pairs."""
+    contact, names = ElementTree.SubElement(root, "contact"), dict[int, str]()
+    for first, second, friction in pairs:
+        geoms, margin = list[str](), 0.0
+        for solid in (first, second):
+            if id(solid) not in names:
+                names[id(solid)] = f"solid_{solid.carrier}_{len(names) + 1}"
+                geom = {"name": names[id(solid)], "group": "3"}
+                if isinstance(solid, Box):
+                    half = np.maximum(0.5 * solid.edges - solid.edge_radius, _LEAST_SIZE)
+                    turn = numbers(of_matrix(solid.axes.T))
+                    geom |= {"type": "box", "pos": numbers(solid.centre), "quat": turn, "size": numbers(half)}
+                elif solid.axis.any():
+                    ends = numbers([*solid.start, *solid.start + solid.axis])
+                    geom |= {"type": "capsule", "fromto": ends, "size": numbers(solid.radius)}
+                else:
+                    geom |= {"type": "sphere", "pos": numbers(solid.start), "size": numbers(solid.radius)}
+                ElementTree.SubElement(elements[solid.carrier], "geom", geom)
+            geoms.append(names[id(solid)])
+            margin += solid.edge_radius if isinstance(solid, Box) else 0.0
+        _add_pair(contact, geoms[0], geoms[1], margin, friction)
+
+
+def _add_pair(contact: Element, first: str, second: str, margin: float, friction: float) -> None:
+    """Add a contact between two geoms; ``margin`` is by how much both together are too small [m]."""
+    sliding = numbers([friction, friction, 0.0, 0.0, 0.0])
+    geoms = {"geom1": first, "geom2": second, "margin": numbers(margin)}
+    ElementTree.SubElement(contact, "pair", {**geoms, "condim": "3", "friction": sliding, **_STIFF})
 
 
 def _add_couplings(root: Element, robot: Robot) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -203,6 +203,16 @@ class HeightField(_Shaped):
 
 
 Surface = Quadric | Box | Capsule | HeightField
+
+
+class SolidPair(NamedTuple):
+    """Two solids that can touch, each carried by a body, and their kinetic friction coefficient."""
+
+    first: Box | Capsule
+    second: Box | Capsule
+    friction: float
+
+
 """Surface, as a member of the family ``surface`` builds it; its free side is where the distance is positive."""
 
 

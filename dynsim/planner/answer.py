@@ -547,10 +547,7 @@ def _failure(search: Search, count: int) -> str:
     tally, options = search.tally, search.task.options
     if not tally.drawn_on:
         if within := search.never_clear():
-            return (
-                f"none of {tally.drawn} random postures could be projected onto the hand path: {within[0]} is always "
-                "too close to that surface; move the base away from the surface"
-            )
+            return f"none of {tally.drawn} random postures could be projected onto the hand path: {within[0]}"
         return (
             f"none of {tally.drawn} random postures could be projected onto the hand path within joint limits and "
             "clear of the surfaces; the path or its orientation may be out of reach"

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, get_type_hints
 
 import numpy as np
 
 from dynsim.compile.clearance import axis_ends
 from dynsim.compile.model import Model
+from dynsim.compile.shapes import solid_row
+from dynsim.compile.solids import Solid
+from dynsim.dynamics.contact.solids import pair_arrays
 from dynsim.errors import ModelError
 from dynsim.jit.kernel import integers, reals
-from dynsim.model.description import Array
+from dynsim.model.description import Array, Robot
 from dynsim.model.drives import Motor
 from dynsim.model.surfaces import Surface, shape_arrays
 from dynsim.planner import compiled
@@ -39,6 +42,8 @@ class MovingArm:
         Column of each joint in q.
     surfaces : tuple of str
         Names of the surfaces, in the order of the tables.
+    pairs : tuple of (str, str)
+        Bodies whose solids must stay clear of each other, for each pair of solids in the tables.
     """
 
     model: Model
@@ -46,6 +51,7 @@ class MovingArm:
     links: tuple[int, ...]
     columns: tuple[int, ...]
     surfaces: tuple[str, ...]
+    pairs: tuple[tuple[str, str], ...] = ()
 
     @property
     def n(self) -> int:
@@ -139,6 +145,30 @@ def moving_arm(model: Model, surfaces: Mapping[str, Surface]) -> MovingArm:
         bound[one_sided] += sign * FROM_STOP
     columns = tuple(robot.position_index[i] for i in links)
     return MovingArm(model, tables, tuple(links), columns, tuple(surfaces))
+
+
+def with_pairs(arm: MovingArm, described: Robot, pairs: Sequence[tuple[Solid, Solid]]) -> MovingArm:
+    """Return the arm whose tables include pairs of solids; bodies that no joint of the arm moves keep their poses.
+
+    ``described`` is the robot with the objects. Pairs that cannot move against each other are omitted.
+    """
+    model, index, rows, names = Model(described), list[list[int]](), list[list[Array]](), list[tuple[str, str]]()
+    joint = {arm.model.robot.links[i].name: k for k, i in enumerate(arm.links)}
+    for pair in pairs:
+        bodies, solids = [str(solid.carrier) for solid in pair], [solid_row(solid) for solid in pair]
+        joints = [joint.get(body, -1) for body in bodies]
+        if max(joints) < 0:
+            continue
+        for body, row, k in zip(bodies, solids, joints, strict=True):
+            if k < 0:
+                R, p = model.body_pose(body, described.initial)
+                row[:9] = (R @ row[:9].reshape(3, 3)).ravel()
+                row[9:12] = p + R @ row[9:12]
+        index.append(joints)
+        rows.append(solids)
+        names.append((bodies[0], bodies[1]))
+    tables = pair_arrays(np.array(index), np.array(rows)) if index else None
+    return replace(arm, tables=arm.tables._replace(pairs=tables), pairs=tuple(names))
 
 
 def axis_points(arm: MovingArm, shares: Sequence[float]) -> list[tuple[int, Array, float, float]]:

@@ -19,7 +19,9 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
+from dynsim.dynamics.contact import solids as ks
 from dynsim.dynamics.contact.distance import ShapeArrays, distance
+from dynsim.dynamics.contact.solids import PairArrays, find_contacts, rotation_of
 from dynsim.dynamics.tree.spatial import (
     ZERO_VECTOR,
     along,
@@ -52,6 +54,8 @@ REACH = 0.6
 PROJECTION_REACH = 2.0 * REACH / 3.0
 # In a step, points are ignored if their distance from a surface exceeds their margin by more than this [m].
 NEARBY = 0.5
+# Solids are examined if the spheres about them are closer than their margin plus this [m].
+SOLIDS_NEARBY = 0.1
 # The projection fails if the residual does not halve within this number of steps.
 PATIENCE = 12
 # Fraction of the torque limits above which torques have an additional cost, and the factor of this cost relative to the
@@ -83,15 +87,16 @@ class Arm(NamedTuple):
     hand: np.ndarray  # (1,) int, body of the hand
     hand_point: np.ndarray  # (1, 3) [m]
     shapes: ShapeArrays  # the surfaces
+    pairs: PairArrays | None = None  # solids that must stay clear of each other, on bodies or (−1) fixed in W
 
 
 class Points(NamedTuple):
-    """Contact points of c braces, followed by points that must stay clear; P points in total."""
+    """Contact points of c braces, followed by points and pairs of solids that must stay clear; P in total."""
 
     body: np.ndarray  # (P,) int
     point: np.ndarray  # (P, 3) in the body's frame [m]
     radius: np.ndarray  # (P,) radius of a sphere around the point [m]
-    surface: np.ndarray  # (P,) int
+    surface: np.ndarray  # (P,) int; −1 − m: pair m of solids
     margin: np.ndarray  # (P,) minimum distance [m]; zero for braces
     friction: np.ndarray  # (c,) μ
 
@@ -253,6 +258,9 @@ def geometry(arm: Arm, points: Points, work: Work, q, k, count):
         put_vector(work.hand, k, row, axis)
         copy(jacobian.T, work.hand_rate[k, row : row + 3])
     for i in range(count):
+        if points.surface[i] < 0:
+            pair_geometry(arm.pairs, arm, points, work, k, i)
+            continue
         body, radius = points.body[i], points.radius[i]
         x = body_point(work, body, points.point, i)
         far, nx, ny, nz, xx, xy, xz, yy, yz, zz = distance(arm.shapes, points.surface[i], x[0], x[1], x[2])
@@ -274,6 +282,44 @@ def geometry(arm: Arm, points: Points, work: Work, q, k, count):
             dn = times_inertia((xx, xy, xz, yy, yz, zz), centre)
             put_vector(turned, j, 0, dn)
             put_vector(shift, j, 0, along(along(centre, dn, -radius), vector(touch, j, 0), -1.0))
+
+
+@internal_kernel
+def pair_geometry(pairs, arm: Arm, points: Points, work: Work, k, i):
+    """Compute the distance of a pair of solids in row k with its rates; without pairs (None) nothing is compiled.
+
+    If the spheres about the solids are far apart, the distance is infinite, so that the pair is ignored.
+    """
+    if pairs is None:
+        return
+    m = -1 - points.surface[i]
+    index, solid, poses = pairs.index[m], pairs.solid[m], pairs.poses
+    for side in range(2):
+        R, p = rotation_of(solid[side]), vector(solid, side, ks.POSE + 9)
+        if index[side] >= 0:
+            body = rotation(work.R, index[side], 0)
+            R, p = compose(body, R), transform(vector(work.p, index[side], 0), body, p)
+        put_rotation(poses, side, 0, R)
+        put_vector(poses, side, 9, p)
+    apart = along(vector(poses, 0, 9), vector(poses, 1, 9), -1.0)
+    far = math.sqrt(dot_vector(apart, apart)) - solid[0, ks.BOUND] - solid[1, ks.BOUND]
+    if far > points.margin[i] + SOLIDS_NEARBY:
+        work.gap[k, i] = math.inf
+        return
+    core, other, slots = solid[0, ks.CORE : ks.BOUND], solid[1, ks.CORE : ks.BOUND], pairs.slots[m]
+    find_contacts(poses[0], core, poses[1], other, pairs.known[m], slots, pairs.places, pairs.chosen)
+    best = 0
+    for j in range(ks.SLOTS):
+        if slots[j, ks.GAP] < slots[best, ks.GAP]:
+            best = j
+    normal, x = vector(slots, best, ks.NORMAL), vector(slots, best, ks.PLACE)
+    work.gap[k, i], work.gap_rate[k, i] = slots[best, ks.GAP], 0.0
+    for side in range(2):
+        if index[side] >= 0:
+            rates(arm, work, index[side], x, work.turn)
+            for j in range(arm.parent.shape[0]):
+                rate = dot_vector(normal, vector(work.turn, j, 0))
+                work.gap_rate[k, i, j] += rate if side == 0 else -rate
 
 
 @kernel

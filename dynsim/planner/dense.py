@@ -167,7 +167,7 @@ def statics(task: Task, braces: tuple[Candidate, ...], times: Array, q: Array, r
 def nearest(
     task: Task, braces: tuple[Candidate, ...], times: Array, q: Array, shift: Array | None = None
 ) -> tuple[float, str, float]:
-    """Find the smallest distance of an unbraced point from a surface.
+    """Find the smallest distance of an unbraced point from a surface, or of two solids.
 
     A link that is braced at both ends may rest on the surface.
 
@@ -189,11 +189,11 @@ def nearest(
     distance : float
         Smallest distance [m].
     part : str
-        Point and surface; empty if there are no points.
+        Point and surface, or two bodies; empty if there are no points.
     time : float
         Time [s].
     """
-    best = (np.inf, "", 0.0)
+    best = task.nearest_pair(times, q)
     robot, arm = task.arm.model.robot, task.arm
     surfaces = build.surfaces(task.scenario)
     if shift is not None and shift.any():
@@ -203,10 +203,10 @@ def nearest(
     whole = arm.coordinates(q)
     for index, name in enumerate(arm.surfaces):
         free: dict[str, list[Clear]] = {}
-        for at, point in task.clear.items():
+        for point in task.free(braces).values():
             children = [(k, index) for k in range(arm.n) if arm.tables.parent[k] == point.joint]
             on_link = np.any(point.point) and (point.joint, index) in leaning and leaning.intersection(children)
-            if point.surface == index and at not in braced and not on_link:
+            if point.surface == index and not on_link:
                 free.setdefault(robot.links[arm.links[point.joint]].name, []).append(point)
         targets = {body: [(surfaces[name], point.point) for point in points] for body, points in free.items()}
         for link, distances in gaps(robot, whole, targets):
@@ -218,10 +218,16 @@ def nearest(
 
 
 def touching_links(task: Task, times: Array, q: Array) -> str:
-    """Check whether links that are not neighbours touch each other, at some instants of the first pass.
+    """Check whether pairs of solids touch each other; without pairs of links, whether links that are not neighbours do.
 
-    Returns a text with the links and the time; empty if no links touch.
+    The latter is checked at some instants of the first pass. Returns a text with the links and the time; empty if no
+    links touch.
     """
+    distance, bodies, time = task.nearest_pair(times, q)
+    if distance < 0.0:
+        return f"{bodies} touch each other at t = {time:.3g} s"
+    if task.self_contact:
+        return ""
     chosen = np.unique(np.linspace(0, np.searchsorted(times, task.span), CHECKS).astype(int))
     arm, links = task.arm, task.arm.model.robot.links
     segments = axis_points(arm, (1.0,))

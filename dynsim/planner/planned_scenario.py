@@ -71,8 +71,13 @@ def stiffness_gains(task: Task, braces: tuple[Candidate, ...], dense: Dense, k_p
 
 
 def shared_sections(task: Task) -> dict[str, Any]:
-    """Return the part that all plans of a scenario share: the scenario without the keys that plans replace."""
+    """Return the part that all plans of a scenario share: the scenario without the keys that plans replace.
+
+    Objects are omitted, because planned voltages require a motor on every joint.
+    """
     data = dict(task.scenario.resolved)
+    links = {"self", "links", *task.arm.model.robot.bodies}
+    data.pop("objects", None)
     data["name"] = f"{task.scenario.name}_plan"
     data.pop("variant", None)
     hand = {key: value for key, value in data["controller"]["hand"].items() if key in ("path", "orientation")}
@@ -84,6 +89,15 @@ def shared_sections(task: Task) -> dict[str, Any]:
     data["controller"] = controller | {"hand": hand | {"joints": []}}
     contacts = {key: value for key, value in data["contacts"].items() if key not in DROPPED}
     data["contacts"] = contacts | {"law": "unilateral", "candidates": "points", "points": {}}
+    between = [
+        entry | {"ignore": [pair for pair in entry.get("ignore", ()) if links.issuperset(pair)]}
+        for entry in contacts.get("between", ())
+        if entry["bodies"] == "self" or links.issuperset(entry["bodies"])
+    ]
+    if between:
+        data["contacts"]["between"] = between
+    else:
+        data["contacts"].pop("between", None)
     data["integrator"] = {"method": method(task)}
     data.pop("initial", None)
     return data

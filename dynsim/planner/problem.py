@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import product
 from typing import Any, Literal, NamedTuple, TypeVar, cast
 
 import numpy as np
@@ -12,13 +13,16 @@ import numpy as np
 from dynsim.compile.control import HandPath
 from dynsim.compile.model import Model
 from dynsim.compile.protocols import BuildContext
+from dynsim.compile.solids import solids_of
 from dynsim.errors import ModelError
 from dynsim.jit.kernel import integers, reals
-from dynsim.model.description import Array
-from dynsim.model.surfaces import Quadric
-from dynsim.planner.arm import MovingArm, Problem, axis_points, moving_arm, workspace
+from dynsim.model.description import Array, Robot
+from dynsim.model.surfaces import Capsule, Quadric
+from dynsim.planner.arm import MovingArm, Problem, axis_points, moving_arm, with_pairs, workspace
 from dynsim.planner.compiled import Course, Points
 from dynsim.scenario import Scenario, build
+from dynsim.scenario.between import LINKS, OBJECTS, solid_pairs
+from dynsim.scenario.schema import BodyPair
 
 # Weight of the curvature of the postures along the path [W/rad²]. It makes the solution unique and is excluded from the
 # reported cost.
@@ -96,6 +100,8 @@ class Clear(NamedTuple):
         Name of point and surface.
     surface : int
         Index of the surface.
+    solid : bool
+        Whether the point belongs to a collision shape.
     """
 
     joint: int
@@ -104,6 +110,7 @@ class Clear(NamedTuple):
     margin: float
     label: str
     surface: int
+    solid: bool = False
 
 
 Key = tuple[int, int, tuple[float, ...]]
@@ -218,6 +225,12 @@ class Task:
             return np.linspace(0.0, self.span, count, endpoint=False)
         return np.linspace(0.0, self.span, count)
 
+    @property
+    def self_contact(self) -> bool:
+        """Whether there are pairs of links that must stay clear of each other."""
+        links = {link.name for link in self.arm.model.robot.links}
+        return any(links.issuperset(pair) for pair in self.arm.pairs)
+
     @cached_property
     def clear(self) -> dict[Key, Clear]:
         """Points that must stay clear of surfaces unless they are braced; for planes, the ends of links suffice."""
@@ -238,6 +251,7 @@ class Task:
             (k, point, radius, LINK_CLEARANCE, f"{robot.links[arm.links[k]].name} at {share:g}")
             for k, point, radius, share in axis_points(arm, ALONG)
         ]
+        solids = [(k, *entry) for k, i in enumerate(arm.links) for entry in solid_points(robot, robot.links[i].name)]
         surfaces = build.surfaces(self.scenario)
         for index, name in enumerate(arm.surfaces):
             surface = surfaces[name]
@@ -245,7 +259,33 @@ class Task:
             for k, point, radius, least, label in ends if flat else [*ends, *middles]:
                 if moves(arm.links[k], point):
                     points[key(k, index, point)] = Clear(k, point, radius, least, f"{label} on {name}", index)
+            for k, point, radius, edge in solids:
+                if (edge or not flat) and moves(arm.links[k], point):
+                    at = key(k, index, point)
+                    label = f"{robot.links[arm.links[k]].name} on {name}"
+                    made = Clear(k, point, radius, LINK_CLEARANCE, label, index, solid=True)
+                    if (joint := points.get(at)) is not None:
+                        made = joint._replace(radius=max(radius, joint.radius))
+                    points[at] = made
         return points
+
+    def free(self, braces: Sequence[Candidate]) -> dict[Key, Clear]:
+        """Points that must stay clear: neither braced, nor parts of solids within the spheres of the braces."""
+        tables, surfaces = self.arm.tables, self.arm.surfaces
+        braced = {key(b.joint, surfaces.index(b.surface), b.on_joint) for b in braces}
+        spheres = [(b.joint, b.on_joint, b) for b in braces]
+        # The end of a link is the start of the next one.
+        spheres += [(int(tables.parent[j]), tables.origin[j], b) for j, at, b in spheres if not at.any()]
+
+        def within(point: Clear) -> bool:
+            return any(
+                joint == point.joint
+                and surfaces.index(b.surface) == point.surface
+                and float(np.linalg.norm(point.point - centre)) + point.radius <= b.radius + LINK_CLEARANCE
+                for joint, centre, b in spheres
+            )
+
+        return {k: point for k, point in self.clear.items() if k not in braced and not (point.solid and within(point))}
 
     def points(self, braces: Sequence[Candidate]) -> Points:
         """Return the tables of the braces, followed by the points that must stay clear."""
@@ -254,7 +294,9 @@ class Task:
             key(b.joint, s, b.on_joint): Clear(b.joint, b.on_joint, b.radius, 0.0, b.name, s)
             for b, s in zip(braces, on, strict=True)
         }
-        rows = [*braced.values(), *(point for at, point in self.clear.items() if at not in braced)]
+        rows = [*braced.values(), *self.free(braces).values()]
+        apart = range(len(self.arm.pairs))
+        rows += [Clear(0, np.zeros(3), 0.0, LINK_CLEARANCE, "", -1 - m) for m in apart]
         return Points(
             body=integers([row.joint for row in rows]),
             point=reals([row.point for row in rows]).reshape(-1, 3),
@@ -263,6 +305,22 @@ class Task:
             margin=reals([row.margin for row in rows]),
             friction=reals(np.full(len(braces), self.friction)),
         )
+
+    def pair_gaps(self, q: Array) -> Array:
+        """Return the distances of pairs of solids in postures (T, n), shape (T, m) [m]; inf if far apart."""
+        problem, gaps = self.problem((), 1), np.zeros((len(q), len(self.arm.pairs)))
+        for row, gap in zip(q, gaps, strict=True):
+            problem.evaluate(reals(row)[None], np.zeros((len(problem.course.knot), 0)))
+            gap[:] = problem.work.gap[0, len(self.clear) :]
+        return gaps
+
+    def nearest_pair(self, times: Array, q: Array) -> tuple[float, str, float]:
+        """Return the smallest distance [m] of two solids, their bodies and the time [s]; inf without pairs."""
+        if not self.arm.pairs:
+            return np.inf, "", 0.0
+        gaps = self.pair_gaps(q)
+        t, m = np.unravel_index(gaps.argmin(), gaps.shape)
+        return float(gaps[t, m]), " and ".join(self.arm.pairs[m]), float(times[t])
 
     def course(self, count: int) -> Course:
         """Return ``count`` knots, and instants halfway between neighbouring knots, whose velocities are chord slopes.
@@ -315,8 +373,8 @@ def task(scenario: Scenario, options: Options) -> Task:
     ModelError
         If the scenario has no arm with DC motors, no hand path or no surface, or a candidate does not exist.
     """
-    robot = build.robot(scenario)
-    model = Model(robot)
+    described = build.robot(scenario)
+    model = Model(build.robot(_without_objects(scenario)) if scenario.config.objects else described)
     surfaces = {name: surface for name, surface in build.surfaces(scenario).items() if surface.carrier is None}
     if not surfaces and options.count[1] > 0:
         raise ModelError("plan: the scenario has no surfaces; add one, or use --count 0:0")
@@ -340,7 +398,58 @@ def task(scenario: Scenario, options: Options) -> Task:
         )
     kind = _kind(path, scenario.duration_s)
     friction = scenario.config.contacts.friction
-    return Task(scenario, options, arm, path, hand.turn_in_world(context), kind, tuple(candidates), friction)
+    made = Task(scenario, options, arm, path, hand.turn_in_world(context), kind, tuple(candidates), friction)
+    return _with_pairs(made, described)
+
+
+def _without_objects(scenario: Scenario) -> Scenario:
+    """Return the scenario of the arm alone."""
+    config = scenario.config
+    contacts = config.contacts.model_copy(update={"between": []})
+    return replace(scenario, config=config.model_copy(update={"objects": {}, "contacts": contacts}))
+
+
+def _with_pairs(made: Task, described: Robot) -> Task:
+    """Return the task with the pairs of ``contacts.between``.
+
+    Without that key, links with collision shapes stay clear of each other, except for shapes that overlap in the
+    initial posture, and all links stay clear of the objects.
+    """
+    arm, config = made.arm, made.scenario.config
+    entries, stated = list(config.contacts.between), bool(config.contacts.between)
+    if not stated:
+        moving = {arm.model.robot.links[i].name for i in arm.links}
+        if any(link.solids and not link.radius for link in arm.model.robot.links):
+            entries.append(BodyPair(bodies="self"))
+        if config.objects and moving & solids_of(described).keys():
+            entries.append(BodyPair(bodies=[LINKS, OBJECTS]))
+    pairs = [(a, b) for a, b, _ in solid_pairs(entries, described, config.objects)]
+    made = replace(made, arm=with_pairs(arm, described, pairs))
+    if stated or not made.arm.pairs:
+        return made
+    start = made.pair_gaps(arm.model.robot.initial[None, list(arm.columns)])[0]
+    touching = {pair for pair, gap in zip(made.arm.pairs, start, strict=True) if gap <= 0.0}
+    pairs = [pair for pair in pairs if (pair[0].carrier, pair[1].carrier) not in touching]
+    return replace(made, arm=with_pairs(arm, described, pairs)) if touching else made
+
+
+def solid_points(robot: Robot, body: str) -> list[tuple[Array, float, bool]]:
+    """Return spheres of the collision shapes of a link: centre [m], radius [m], and whether it is at a corner or end.
+
+    The corners suffice for planes. Links with a radius have no collision shapes.
+    """
+    link = next(link for link in robot.links if link.name == body)
+    points: list[tuple[Array, float, bool]] = []
+    for solid in solids_of(robot).get(body, ()) if link.solids and not link.radius else ():
+        if isinstance(solid, Capsule):
+            shares = (0.0, 1.0, *ALONG) if solid.axis.any() else (0.0,)
+            points += [(solid.start + share * solid.axis, solid.radius, share in (0.0, 1.0)) for share in shares]
+        else:
+            core = 0.5 * solid.edges - solid.edge_radius
+            corners = np.array(list(product((-1.0, 1.0), repeat=3))) * core
+            points += [(solid.centre + corner @ solid.axes, solid.edge_radius, True) for corner in corners]
+            points.append((solid.centre, 0.5 * float(solid.edges.min()), False))
+    return points
 
 
 def _kind(path: HandPath, duration: float) -> Kind:

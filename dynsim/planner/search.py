@@ -151,13 +151,16 @@ class Search:
         return np.clip(initial + spread * rng.normal(size=len(spread)), tables.lower, tables.upper)
 
     def never_clear(self) -> list[str]:
-        """Return the points that violate their clearance in every one of a number of random postures."""
-        problem, greatest = self.task.problem((), 1), np.full(len(self.task.clear), -np.inf)
+        """Return texts about points and pairs that violate their clearance in every one of some random postures."""
+        problem, task = self.task.problem((), 1), self.task
+        greatest = np.full(len(problem.points.body), -np.inf)
         for _ in range(DRAWS):
             problem.evaluate(reals(self.draw())[None], np.zeros((1, 0)))
             greatest = np.maximum(greatest, problem.work.gap[0])
-        points = self.task.clear.values()
-        return [point.label for point, gap in zip(points, greatest, strict=True) if gap < point.margin]
+        advice = "is always too close to that surface; move the base away from the surface"
+        texts = [f"{point.label} {advice}" for point in task.clear.values()]
+        texts += [f"{a} always touches {b}; add [{a}, {b}] to contacts.between.ignore" for a, b in task.arm.pairs]
+        return [text for text, gap, least in zip(texts, greatest, problem.points.margin, strict=True) if gap < least]
 
     def run(self) -> dict[int, list[Planned]]:
         """Run the search and return the best sets of each size, sorted by heat along their dense references.

@@ -278,14 +278,14 @@ class Verifier:
         return Corner(mu, shift, heat, rms, energy, rate, turn, closed, reason)
 
     def _touches(self, braces: tuple[Candidate, ...], record: Record, shift: float) -> str:
-        """Return a text about an unbraced point that touches a surface; empty if no such point does."""
+        """Return a text about an unbraced point or pair of solids that touches; empty if nothing does."""
         arm = self.task.arm
         places = np.array([record.labels["q"].index(joint) for joint in arm.joints])
         q = record["q"][:, places]
         # The surfaces of the run are displaced by the shift.
         distance, part, when = nearest(self.task, braces, record.time, q, shift * self._up)
         if distance < -DEPTH_MAX:
-            return f"{part}: touches although it is not a brace, {-1e3 * distance:.3g} mm deep at t = {when:.3g} s"
+            return f"{part}: contact without a brace, {-1e3 * distance:.3g} mm deep at t = {when:.3g} s"
         return ""
 
     def _limits(self, record: Record) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -61,10 +61,11 @@ def fixed_frames(scene: Scene) -> list[FixedFrame]:
     return [frame for frame in scene.frames if frame.name not in taken]
 
 
-def add_shapes(link: Element, shapes: Sequence[Shape]) -> None:
-    """Add the ``visual`` elements of shapes to a link; a capsule becomes a cylinder and two spheres."""
-    for shape in _simple(shapes):
-        visual = ElementTree.SubElement(link, "visual")
+def add_shapes(link: Element, shapes: Sequence[Shape], tag: Literal["visual", "collision"] = "visual") -> None:
+    """Add the elements of shapes to a link; a visual capsule becomes a cylinder and two spheres, a colliding one the
+    cylinder about it."""
+    for shape in _simple(shapes) if tag == "visual" else shapes:
+        visual = ElementTree.SubElement(link, tag)
         R = rotation(shape.orientation)
         ElementTree.SubElement(visual, "origin", xyz=numbers(shape.position), rpy=numbers(roll_pitch_yaw(R)))
         geometry = ElementTree.SubElement(visual, "geometry")
@@ -73,12 +74,13 @@ def add_shapes(link: Element, shapes: Sequence[Shape]) -> None:
                 ElementTree.SubElement(geometry, "box", size=numbers(shape.size))
             case "sphere":
                 ElementTree.SubElement(geometry, "sphere", radius=numbers(shape.size[0]))
-            case "cylinder":
+            case "cylinder" | "capsule":
                 radius, length = shape.size
+                length += 2.0 * radius if shape.kind == "capsule" else 0.0
                 ElementTree.SubElement(geometry, "cylinder", radius=numbers(radius), length=numbers(length))
             case "mesh":
                 ElementTree.SubElement(geometry, "mesh", filename=shape.file, scale=numbers(shape.size))
-        if shape.colour is not None:
+        if shape.colour is not None and tag == "visual":
             material = ElementTree.SubElement(visual, "material", name=f"rgba {numbers(shape.colour)}")
             ElementTree.SubElement(material, "color", rgba=numbers(shape.colour))
 

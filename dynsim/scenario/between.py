@@ -7,28 +7,24 @@ Candidates of a pair are points and axes of each solid against the other.
 from __future__ import annotations
 
 import itertools
+import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from dynsim.compile.clearance import axis_ends
+from dynsim.compile.solids import Solid, solids_of
 from dynsim.config.problems import suggest
 from dynsim.dynamics.contact.solids import SLOTS
-from dynsim.errors import ModelError
+from dynsim.errors import ModelError, first_few
 from dynsim.model.description import Array, Contact, Robot
 from dynsim.model.surfaces import Box, Capsule
-from dynsim.record.quaternion import rotated
-from dynsim.record.scene import Shape
 from dynsim.scenario.candidates import THINNER, unused
 from dynsim.scenario.schema import BodyPair, SceneObject
 
-Solid = Capsule | Box
-
+log = logging.getLogger(__name__)
 LINKS, OBJECTS, SELF = "links", "objects", "self"
-# Radius of the edges of boxes that touch bodies [m], at most half the shortest edge.
-ROUNDING = 1e-3
 # Maximum number of candidates between bodies for event-driven methods.
 MOST_CANDIDATES = 20
 _CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
@@ -65,19 +61,11 @@ def contacts_between(
     ModelError
         If a body does not exist or has no solid.
     """
-    solids = solids_of(robot, objects)
-    chosen: dict[tuple[str, str], BodyPair] = {}
-    for k, entry in enumerate(pairs):
-        for first, second in _bodies(k, entry, robot, objects, solids):
-            chosen.pop((second, first), None)
-            chosen[first, second] = entry
     result = []
-    for (first, second), entry in chosen.items():
-        parameters = law(entry)
-        for a, b in itertools.product(solids[first], solids[second]):
-            for contact in _slots(a, b) if stepped and not (_is_sphere(a) or _is_sphere(b)) else _candidates(a, b):
-                name = unused(f"{contact.body}-{contact.surface.carrier}", names)
-                result.append(replace(contact, name=name, surface_name=str(contact.surface.carrier), **parameters))
+    for a, b, entry in solid_pairs(pairs, robot, objects):
+        for contact in _slots(a, b) if stepped and not (_is_sphere(a) or _is_sphere(b)) else _candidates(a, b):
+            name = unused(f"{contact.body}-{contact.surface.carrier}", names)
+            result.append(replace(contact, name=name, surface_name=str(contact.surface.carrier), **law(entry)))
     if not stepped and len(result) > MOST_CANDIDATES:
         raise ModelError(
             f"contacts.between: {len(result)} candidates between bodies are more than the {MOST_CANDIDATES} for which "
@@ -87,36 +75,27 @@ def contacts_between(
     return result
 
 
-def solids_of(robot: Robot, objects: Mapping[str, SceneObject]) -> dict[str, list[Solid]]:
-    """Return the solids of each body that has any: parts of objects, capsules about the axes of links, and wheels."""
-    solids: dict[str, list[Solid]] = {}
-    tips = axis_ends(robot)
-    for link in robot.links:
-        if link.name in robot.carriers:
-            continue
-        if link.name in objects:
-            own = [_solid(shape, link.name) for shape in link.shapes]
-        else:
-            axes = [tip for tip in tips[link.name] if tip.any()] if link.radius > 0.0 else []
-            own = [Capsule(np.zeros(3), tip, link.radius, link.name) for tip in axes]
-            # Wheels touch bodies with the spheres with which they touch the ground.
-            wheels = {(*foot.point, foot.radius) for foot in robot.feet if foot.body == link.name}
-            own += [Capsule(np.array(at), np.zeros(3), r, link.name) for *at, r in wheels if r > link.radius]
-        if own:
-            solids[link.name] = own
-    return solids
-
-
-def _solid(shape: Shape, body: str) -> Solid:
-    """Return the solid of a shape; a cylinder is the capsule inside it, and a disc the box inside it."""
-    R, p = rotated(np.array(shape.orientation), np.eye(3)), np.array(shape.position)
-    radius, *length = shape.size
-    disc = shape.kind == "cylinder" and length[0] < 2.0 * radius
-    if shape.kind == "box" or disc:
-        edges = np.array([2**0.5 * radius, 2**0.5 * radius, *length] if disc else shape.size)
-        return Box(p, R.T, edges, min(ROUNDING, 0.5 * float(edges.min())), body)
-    half = max(0.5 * sum(length) - radius, 0.0) * R[:, 2]
-    return Capsule(p - half, 2.0 * half, radius, body)
+def solid_pairs(
+    pairs: Sequence[BodyPair], robot: Robot, objects: Mapping[str, SceneObject]
+) -> list[tuple[Solid, Solid, BodyPair]]:
+    """Return the pairs of solids that can touch, each with its entry; see :func:`contacts_between`."""
+    solids = solids_of(robot)
+    chosen: dict[tuple[str, str], BodyPair] = {}
+    for k, entry in enumerate(pairs):
+        for first, second in _bodies(k, entry, robot, objects, solids):
+            chosen.pop((second, first), None)
+            chosen[first, second] = entry
+    touching = set(itertools.chain.from_iterable(chosen))
+    if left_out := [text for link in robot.links if link.name in touching and not link.radius for text in link.omitted]:
+        log.warning(
+            "contacts.between: %s: left out; use boxes, spheres, cylinders or plant.links.NAME.radius_m",
+            first_few(left_out),
+        )
+    return [
+        (a, b, entry)
+        for (first, second), entry in chosen.items()
+        for a, b in itertools.product(solids[first], solids[second])
+    ]
 
 
 def _bodies(
@@ -139,7 +118,11 @@ def _bodies(
                 keys=(*keys, key),
             )
         if name not in solids:
-            raise ModelError(f"contacts.between: body {name!r} has no solid; set its radius_m", keys=(*keys, key))
+            (omitted,) = (link.omitted for link in robot.links if link.name == name)
+            reason = f" ({first_few(omitted)})" if omitted else ""
+            raise ModelError(
+                f"contacts.between: body {name!r} has no solid{reason}; set its radius_m", keys=(*keys, key)
+            )
         return [name]
 
     for name in itertools.chain.from_iterable(entry.ignore):
@@ -213,9 +196,9 @@ def _along(a: Capsule, b: Solid) -> Iterator[Contact]:
 
 
 def _corners(a: Box, b: Solid) -> Iterator[Contact]:
-    """Yield the rounded corners of a box against a solid."""
+    """Yield the rounded corners of a box against a solid; those of a thin plate once."""
     core = 0.5 * a.edges - a.edge_radius
-    for corner in _CORNERS:
+    for corner in _CORNERS[((_CORNERS < 0.0) | (core > 0.0)).all(axis=1)]:
         yield _contact(a, a.centre + (corner * core) @ a.axes, b, a.edge_radius)
 
 

@@ -21,8 +21,8 @@ from dynsim.config.problems import dotted, errors_at, suggest
 from dynsim.errors import ModelError, ScenarioError, brief
 from dynsim.library import families
 from dynsim.model.description import WORLD, Array, Contact, Foot, Inertia, Load, Robot
-from dynsim.model.surfaces import Surface
-from dynsim.scenario.between import contacts_between
+from dynsim.model.surfaces import SolidPair, Surface
+from dynsim.scenario import between
 from dynsim.scenario.candidates import candidates
 from dynsim.scenario.schema import ContactLaw, ContactPoint, Contacts, LinkSensorConfig, Payload, Scenario
 from dynsim.system.arguments import names_wrong_types
@@ -413,7 +413,7 @@ def contacts(scenario: Scenario, described: Robot | None = None) -> list[Contact
         pairs, names = options.between, {contact.name for contact in result}
         laws = partial(_law, options)
         stepped = scenario.config.integrator.method == "time_stepping"
-        result += contacts_between(pairs, described, scenario.config.objects, laws, names, stepped)
+        result += between.contacts_between(pairs, described, scenario.config.objects, laws, names, stepped)
     if result:
         places = [contact.geometry for contact in result]
         still = recall("left out", lambda: immobile(Model(described), result), described, places)
@@ -426,6 +426,14 @@ def contacts(scenario: Scenario, described: Robot | None = None) -> list[Contact
         result += [replace(contact, **law) for contact in own]
     error = scenario.config.surface_error
     return result if error is None else [_scaled_friction(contact, error.friction_factor) for contact in result]
+
+
+def solid_pairs(scenario: Scenario, described: Robot) -> list[SolidPair]:
+    """Return the pairs of solids of ``contacts.between`` with their kinetic friction."""
+    options, error = scenario.config.contacts, scenario.config.surface_error
+    factor = 1.0 if error is None else error.friction_factor
+    pairs = between.solid_pairs(options.between, described, scenario.config.objects)
+    return [SolidPair(a, b, factor * options.coefficients(entry)[0]) for a, b, entry in pairs]
 
 
 def _check_carriers(known: Mapping[str, Surface], described: Robot) -> None:

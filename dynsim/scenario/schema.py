@@ -517,6 +517,7 @@ class ObjectWheel(StrictConfig):
             damping=self.damping_N_m_s_per_rad,
             friction=self.friction_N_m,
             shapes=(Shape("cylinder", width, orientation=turn_from_z(axis)),),
+            solids=(Shape("sphere", (self.radius_m,)),),
         )
 
 
@@ -579,7 +580,7 @@ class SceneObject(Sized):
         back = -self._origin
         shapes = tuple(shape.placed(back, HERE) for shape in self.shapes)
         inertia = self.inertia.placed(np.eye(3), back)
-        link = Link(name, name, None, "revolute", np.array([0.0, 0.0, 1.0]), inertia, shapes=shapes)
+        link = Link(name, name, None, "revolute", np.array([0.0, 0.0, 1.0]), inertia, shapes=shapes, solids=shapes)
         if self.joint is None:
             return (*floating(link), *(wheel.link(f"{name}.{own}", name) for own, wheel in self.wheels.items()))
         R = _turn(self.rpy_deg)

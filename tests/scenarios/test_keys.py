@@ -365,6 +365,9 @@ CHANGES: dict[tuple[str, str], dict[str, Any]] = {
         "plant.links.upper_arm.com_m": [0, 0, 0.13],
         "plant.links.upper_arm.inertia_kg_m2": [0.005, 0, 0, 0.005, 0, 0.0004],
         "plant.links.forearm.density_kg_m3": 1500,
+        "plant.links.forearm.radius_m": With(
+            0.05, {"surfaces.wall": {"type": "plane", "normal": [-1, 0, 0], "point_m": [0.1, 0, 0]}}
+        ),
         "plant.joints.shoulder.damping": 0.2,
         "plant.joints.shoulder.friction": 0.1,
         "plant.joints.elbow.limit_deg": [5, 140],

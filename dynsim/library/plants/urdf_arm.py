@@ -47,6 +47,9 @@ class LinkCorrection(StrictConfig):
         max_length=6,
     )
     density_kg_m3: Positive | None = default(None, "density of the link's shapes, which then give mass and inertia")
+    radius_m: Positive | None = default(
+        None, "radius of a capsule about the link's axis, which replaces its collision shapes; default: the shapes"
+    )
 
     @model_validator(mode="after")
     def _check_density(self) -> Self:
@@ -220,6 +223,13 @@ def build(config: Config, context: BuildContext) -> Robot:
     links = tuple(
         dataclasses.replace(link, **losses(link)) if link.joint_of_rows is None else link for link in robot.links
     )
+    radii = {name: link.radius_m for name, link in config.links.items() if link.radius_m is not None}
+    for name in radii:
+        with errors_at("plant", "links", name, "radius_m"):
+            carrier = robot.links[robot.attach(name, np.zeros(3))[0]].name
+            if carrier != name:
+                raise ModelError(f"{name!r} is fixed to {carrier!r}; set plant.links.{carrier}.radius_m")
+    links = tuple(dataclasses.replace(link, radius=radii.get(link.name, link.radius)) for link in links)
     followers = {coupling.joint for coupling in robot.couplings}
     motors = config.motors | {name: joint.motor for name, joint in config.joints.items() if joint.motor is not None}
     chosen = {link.joint: motors.get(link.joint, None if link.joint in followers else config.motor) for link in single}

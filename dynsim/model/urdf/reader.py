@@ -1,4 +1,4 @@
-"""URDF import: strict reading of links and joints, lenient reading of visual shapes, and conversion to a robot.
+"""URDF import: strict reading of links and joints, lenient reading of shapes, and conversion to a robot.
 
 All numbers are checked, and one error lists all problems with element and line. Elements that are optional in the URDF
 specification get its defaults (a link without ``<inertial>`` has no mass, a joint without ``<axis>`` turns about x).
@@ -17,7 +17,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 from xml.parsers import expat
 
 import numpy as np
@@ -426,6 +426,24 @@ def _shapes_of(link: Element, named_colours: Mapping[str, Colour | None], tag: s
     return tuple(shapes)
 
 
+def _collisions_of(link: Element) -> tuple[tuple[Shape, ...], tuple[str, ...]]:
+    """Return the collision shapes of a link that can be solids, and texts about the others."""
+    solids, omitted = list[Shape](), list[str]()
+    for collision in link.children:
+        if collision.tag == "collision":
+            text = f"{link.path.name}:{collision.line}: <collision> of {link.owner}"
+            try:
+                shape = _shape(collision, {})
+            except (ModelError, ValueError):
+                omitted.append(f"{text} has no valid geometry")
+            else:
+                if shape.kind == "mesh":
+                    omitted.append(f"{text} is the mesh {shape.file}")
+                else:
+                    solids.append(shape)
+    return tuple(solids), tuple(omitted)
+
+
 def _shape(visual: Element, named_colours: Mapping[str, Colour | None]) -> Shape:
     """Return a shape; raise ModelError or ValueError if it cannot be drawn."""
     (solid,) = visual.required("geometry", "add it").children
@@ -517,7 +535,7 @@ class UrdfLink:
     """Link as stated in the file.
 
     ``inertia`` is None if the link has no ``<inertial>``; ``shaped`` is True if it has a visual or collision element;
-    ``shapes`` are the visual elements that can be drawn.
+    ``shapes`` are the visual elements that can be drawn; ``solids`` and ``omitted`` as in :class:`Link`.
     """
 
     name: str
@@ -525,6 +543,8 @@ class UrdfLink:
     inertia: Inertia | None
     shaped: bool
     shapes: tuple[Shape, ...] = ()
+    solids: tuple[Shape, ...] = ()
+    omitted: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -690,7 +710,7 @@ def _link(
             inertia = _inertia(inertial, correction)
         elif correction:
             inertia = Inertia(**{"mass": 0.0, **correction})
-    return UrdfLink(name, element.line, inertia, shaped, shapes)
+    return UrdfLink(name, element.line, inertia, shaped, shapes, *_collisions_of(element))
 
 
 def _inertia(element: Element, correction: Mapping[str, Any]) -> Inertia | None:
@@ -1067,7 +1087,7 @@ def _places(tree: UrdfTree) -> dict[str, _Place]:
 def _links(tree: UrdfTree, places: Mapping[str, _Place]) -> tuple[Link, ...]:
     """Return the moving bodies with everything fixed to them; a floating or planar joint is a single link here."""
     joint_to = {joint.child: joint for joint in tree.joints.values()}
-    inertias, shapes = _inertias(tree, places), _shapes(tree, places)
+    inertias, shapes, solids = _inertias(tree, places), _shapes(tree, places), _shapes(tree, places, "solids")
     links = []
     for name, pose in places.items():
         if pose.body != name:
@@ -1083,6 +1103,10 @@ def _links(tree: UrdfTree, places: Mapping[str, _Place]) -> tuple[Link, ...]:
                 R_PJ=parent.R @ link.R_PJ,
                 p_PJ=parent.p + parent.R @ link.p_PJ,
                 shapes=shapes.get(name, ()),
+                solids=solids.get(name, ()),
+                omitted=tuple(
+                    text for part, at in places.items() if at.body == name for text in tree.links[part].omitted
+                ),
             )
         )
     return tuple(links)
@@ -1098,12 +1122,14 @@ def _inertias(tree: UrdfTree, places: Mapping[str, _Place]) -> dict[str | None, 
     return {body: Inertia.merged(fixed) for body, fixed in parts.items()}
 
 
-def _shapes(tree: UrdfTree, places: Mapping[str, _Place]) -> dict[str | None, tuple[Shape, ...]]:
+def _shapes(
+    tree: UrdfTree, places: Mapping[str, _Place], kind: Literal["shapes", "solids"] = "shapes"
+) -> dict[str | None, tuple[Shape, ...]]:
     """Return the shapes of each moving body and of the world (None), with everything fixed to it."""
     drawn: dict[str | None, tuple[Shape, ...]] = {}
     for name, pose in places.items():
         turn = quaternion(pose.R)
-        shapes = tuple(shape.placed(pose.p, turn) for shape in tree.links[name].shapes)
+        shapes = tuple(shape.placed(pose.p, turn) for shape in getattr(tree.links[name], kind))
         drawn[pose.body] = (*drawn.get(pose.body, ()), *shapes)
     return drawn
 

@@ -18,7 +18,7 @@ def write_urdf(robot: Robot) -> str:
     """Write the bodies, joints and shapes of a robot as URDF text.
 
     Frames, including the hand's frame, become links without mass. Joint losses contain only bearing losses, not motor
-    losses.
+    losses. A capsule becomes the cylinder about it, which :func:`dynsim.compile.solids.solids_of` reads as the capsule.
 
     Numbers are written with all digits, so that reading the text gives the same dynamics up to rounding errors.
 
@@ -43,6 +43,7 @@ def write_urdf(robot: Robot) -> str:
         moments = {f"i{'xyz'[i]}{'xyz'[j]}": numbers(link.inertia.tensor[i, j]) for i in range(3) for j in range(i, 3)}
         ElementTree.SubElement(inertial, "inertia", moments)
         add_shapes(body, link.shapes)
+        add_shapes(body, link.solids, "collision")
     leads = {coupling.joint: coupling for coupling in robot.couplings}
     for link in links:
         limits = (link.lower, link.upper, link.effort_limit, link.velocity_limit)

@@ -1,0 +1,144 @@
+"""Planner with solids: gradients of distances, self-contact that steers the search, collision shapes, objects."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from support.messages import raises
+
+import dynsim
+from dynsim.compile.touching import touch
+from dynsim.errors import ModelError
+from dynsim.planner.problem import LINK_CLEARANCE, Options, Task, task
+from dynsim.planner.search import Search
+from dynsim.planner.verify import Tolerances
+from dynsim.scenario import build
+
+SELF = {"contacts.between": [{"bodies": "self"}]}
+# Many short links that coil up without limits.
+LONG = {
+    "plant.link.radius_m": 0.05,
+    "plant.link.length_m": 0.2,
+    "plant.chain": [{"axis": "z", "length_m": 0.0}, {"axis": "y", "count": 14}],
+    "plant.initial_deg": [0, 45, 90, -90, 45, 45, -90, 45, -45, 45, 0, 0, 0, 0, 0],
+}
+BOX = {"mass_kg": 1, "size_m": [0.3, 0.3, 0.1], "position_m": [0.75, 0.8, 0.05]}
+
+
+def arm(**changes: Any) -> dynsim.Scenario:
+    return dynsim.load_scenario("pressing", "plain", {key.replace("__", "."): value for key, value in changes.items()})
+
+
+def search(scenario: dynsim.Scenario, **options: Any) -> tuple[Search, dict[int, list]]:
+    found = Search(task(scenario, Options(**{"count": (0, 1), "starts": 1} | options)))
+    return found, found.run()
+
+
+def least(planned: Task, q: np.ndarray) -> float:
+    return float(planned.pair_gaps(q).min())
+
+
+def test_distances_of_solids_and_their_rates(tmp_path):
+    """By the public model, and by differences: capsules of links against each other and against a box."""
+    chain = [{"axis": "z", "length_m": 0.0}, *({"axis": axis} for axis in "yyxyyxyyy")]
+    between = [{"bodies": "self"}, {"bodies": ["links", "box"]}]
+    keys = {"contacts.between": between, "objects.box": BOX, "plant.chain": chain, "plant.link.radius_m": 0.05}
+    scenario = arm(**keys)
+    planned, described = task(scenario, Options(count=(0, 1))), build.robot(scenario)
+    stepped = arm(**keys, **{"integrator.method": "time_stepping"})
+    model, contacts = dynsim.Model(described), [c for c in build.contacts(stepped) if c.solid is not None]
+    names = [frozenset((c.body, c.surface.carrier)) for c in contacts]
+    rng, problem, checked = np.random.default_rng(3), planned.problem((), 1), 0
+    none, first = np.zeros((1, 0)), len(planned.clear)
+    for _ in range(10):
+        q = rng.normal(size=planned.arm.n)
+        problem.evaluate(q[None], none)
+        gap, rate = problem.work.gap[0].copy(), problem.work.gap_rate[0].copy()
+        whole = described.initial.copy()
+        whole[list(planned.arm.columns)] = q
+        for m, pair in enumerate(planned.arm.pairs):
+            if np.isinf(gap[first + m]):
+                continue
+            own = min(
+                touch(model, c, whole).gap for c, name in zip(contacts, names, strict=True) if name == frozenset(pair)
+            )
+            assert gap[first + m] == pytest.approx(own, abs=1e-12)
+            if own == pytest.approx(-2.0 * described.links[1].radius, abs=1e-9):
+                continue  # axes that cross are pushed apart along one of them
+            for j in range(planned.arm.n):
+                ends = []
+                for step in (1e-6, -1e-6):
+                    moved = q.copy()
+                    moved[j] += step
+                    ends.append(planned.pair_gaps(moved[None])[0, m])
+                assert rate[first + m, j] == pytest.approx((ends[0] - ends[1]) / 2e-6, abs=1e-5)
+            checked += 1
+    assert checked >= 40
+
+
+def test_self_contact_steers_the_search():
+    """Without `between` every path without braces is rejected, because links touch."""
+    refused, without = search(arm(**LONG), count=(0, 0), starts=2)
+    assert not without[0]
+    assert "touch each other" in refused.tally.refused[()]
+    found, planned = search(arm(**LONG, **SELF), count=(0, 0))
+    for plans in planned.values():
+        assert least(found.task, plans[0].dense.q) > LINK_CLEARANCE - 1e-6
+
+
+@pytest.mark.long
+def test_collision_shapes_keep_links_apart(tmp_path):
+    """The same arm as a file: its shapes count without `between`, against each other and against the floor."""
+    data = dict(arm(**LONG).resolved)
+    (tmp_path / "arm.urdf").write_text(dynsim.build_model(arm(**LONG)).to_urdf())
+    data["plant"] = {"type": "urdf_arm", "file": "arm.urdf", "motor": {"type": "wang_minami"}}
+    data["contacts"] = {"law": "unilateral", "friction": 0.1}
+    (tmp_path / "arm.yaml").write_text(yaml.safe_dump(data | {"variants": {}}))
+    found, planned = search(dynsim.load_scenario(tmp_path / "arm.yaml"), radius_m=0.05)
+    assert found.task.self_contact
+    model, arm_of = found.task.arm.model, found.task.arm
+    for count in (0, 1):
+        q = planned[count][0].dense.q
+        assert least(found.task, q) > LINK_CLEARANCE - 1e-6
+        for link in model.robot.links[2:]:
+            for point in (np.zeros(3), np.array([0.0, 0.0, 0.2])):
+                heights = [model.point_position(link.name, point, row)[2] for row in arm_of.coordinates(q)]
+                assert min(heights) > 0.05 - 1e-6
+
+
+def test_shapes_that_overlap_at_the_start_do_not_count():
+    scenario = dynsim.load_scenario("six_axis_arm", None, {"plant.initial_deg.elbow_pitch": 149})
+    joints = ["base_yaw", "shoulder_pitch", "elbow_pitch", "forearm_roll", "wrist_pitch", "tool_roll"]
+    keys = {"controller.hand.joints": joints, "contacts.law": "unilateral"}
+    all_pairs = task(dynsim.load_scenario("six_axis_arm", None, keys), Options(count=(0, 0)))
+    coiled = task(
+        dynsim.load_scenario("six_axis_arm", None, keys | {"plant.initial_deg.elbow_pitch": 149,
+                             "plant.initial_deg.wrist_pitch": 119}), Options(count=(0, 0)))  # fmt: skip
+    assert scenario.name
+    assert set(coiled.arm.pairs) < set(all_pairs.arm.pairs)
+    assert len(set(all_pairs.arm.pairs)) == 10
+
+
+def test_objects_are_obstacles():
+    """An arm that rests on the floor where a box is now; the plan keeps clear, and its runs confirm it."""
+    _, without = search(arm(), count=(1, 1))
+    scenario = arm(**{"objects.box": BOX})
+    made = task(scenario, Options(count=(1, 1)))
+    assert least(made, without[1][0].dense.q) < 0.0
+    plan = dynsim.plan_braces(
+        scenario, count=(1, 1), starts=1, tolerances=Tolerances(friction=(1.0,), shift_m=(0.0,)), jobs=1
+    )
+    (size,) = plan.sizes
+    assert size.verdict is not None
+    assert size.verdict.survives, size.reason
+    record = plan.record(1)
+    assert least(made, record["q"]) > 0.0
+    assert "objects" not in plan.scenario(1).resolved
+
+
+def test_pairs_without_a_solid_are_refused_with_their_key():
+    with raises(ModelError, "contacts.between", "link_30"):
+        task(arm(**{"contacts.between": [{"bodies": ["link_2", "link_30"]}]}), Options())
