@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from combinations.bodies import position_rates, times
 from combinations.coulomb import Point, Rest, forces_exist, parts
 from combinations.observed import Observed
-from combinations.surfaces import nearest
 from dynsim.model.drives import Motor
 
 Array = NDArray[np.float64]
@@ -364,11 +363,7 @@ def _drifts(seen: Observed, state: State) -> Array:
     by_name = {contact.name: contact for contact in seen.described_contacts}
     for name in state.names:
         contact = by_name[name]
-        body, point = seen.robot.attach(contact.body, contact.point)
-        tip = None if contact.tip is None else motion.point(body, seen.robot.attach(contact.body, contact.tip)[1])
-        surface = seen.shapes[contact.surface_name]
-        centre = nearest(surface, motion.point(body, point), tip)
-        far, normal = surface.look(centre)
+        body, centre, far, normal = seen.nearest_point(contact, motion)
         velocity = motion.velocity(body, centre - contact.radius * normal)
         rate = (velocity[2] - velocity[0]) / (2.0 * step)
         n = np.asarray(normal[1])

@@ -17,6 +17,9 @@ from dynsim.model.description import Robot
 
 Array = NDArray[np.float64]
 
+# A body, or two bodies that touch each other: motions are those of the first relative to the second.
+Ends = int | tuple[int, int]
+
 # Rows whose axes are fixed in the body that the whole joint carries; they share the velocity of their mount.
 _SEVERAL = ("ball_x", "ball_y", "ball_z", "roll", "turn", "left_wheel", "right_wheel")
 _FIRST = ("ball_x", "roll", "left_wheel")
@@ -63,8 +66,10 @@ class Motion:
         """Return the position of a point of a body's frame, (T, 3) [m]; ``at`` : (3,) or (T, 3)."""
         return self.origin[body] + times(self.rotation[body], np.broadcast_to(at, self.origin[body].shape))
 
-    def velocity(self, body: int, position: Array) -> Array:
+    def velocity(self, body: Ends, position: Array) -> Array:
         """Return the velocity of the body's point at a world position, (T, 3)."""
+        if isinstance(body, tuple):
+            return self.velocity(body[0], position) - self.velocity(body[1], position)
         return self.flow[body] + np.cross(self.spin[body], position)
 
 
@@ -189,15 +194,20 @@ class Bodies:
                 forces[self.parent[i]] += forces[i]
         return rows
 
-    def force_along_rows(self, m: Motion, body: int, position: Array, force: Array, moment: Array) -> Array:
-        """Return generalised forces of a force at a world position and a moment, both on one body, (T, n)."""
+    def force_along_rows(self, m: Motion, body: Ends, position: Array, force: Array, moment: Array) -> Array:
+        """Return generalised forces of a force at a world position and a moment, both on a body, (T, n)."""
+        if isinstance(body, tuple):
+            on = [self.force_along_rows(m, end, position, force, moment) for end in body]
+            return on[0] - on[1]
         about, rows = moment + np.cross(position, force), np.zeros((len(force), self.n))
         for i in self.ancestors(body):
             rows[:, i] = (m.axis[i] * about).sum(axis=1) + (m.drift[i] * force).sum(axis=1)
         return rows
 
-    def jacobian(self, m: Motion, body: int, position: Array) -> Array:
+    def jacobian(self, m: Motion, body: Ends, position: Array) -> Array:
         """Return the velocity per unit rate of a body's point at a world position, (T, 3, n)."""
+        if isinstance(body, tuple):
+            return self.jacobian(m, body[0], position) - self.jacobian(m, body[1], position)
         J = np.zeros((len(position), 3, self.n))
         for i in self.ancestors(body):
             J[:, :, i] = m.drift[i] + np.cross(m.axis[i], position)

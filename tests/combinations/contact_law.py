@@ -38,6 +38,8 @@ def touching(seen: Observed) -> Finding:
         # The foot of the perpendicular to waves far below is not unique.
         if isinstance(touch.contact.surface, HeightField):
             off[touch.gap > FAR] = 0.0
+        if touch.contact.solid is not None:  # slots that are not in use
+            off[touch.mode == OPEN] = 0.0
         # Errors of two searches for a nearest point.
         if off.max() > 1e-8 + 1e-6 * np.abs(touch.gap[off.argmax()]):
             i = int(off.argmax())
@@ -213,7 +215,8 @@ def _creep(seen: Observed, touch: Touch) -> Array:
     moved = np.linalg.norm(np.diff(touch.position, axis=0, prepend=touch.position[:1]), axis=1)
     speed = np.abs(touch.approach) + np.linalg.norm(touch.slip, axis=1)
     soft = 1e-3 if touch.contact.stiffness > 0.0 else 0.0
-    spin = np.linalg.norm(seen.motion.spin[touch.body], axis=1)
+    ends = touch.body if isinstance(touch.body, tuple) else (touch.body,)
+    spin = np.sum([np.linalg.norm(seen.motion.spin[end], axis=1) for end in ends], axis=0)
     return np.asarray(SLOW + soft + 2.0 * (spin * moved + touch.turned * speed) + _turned_rows(seen, touch)[1])
 
 

@@ -67,13 +67,16 @@ def triples(seed: int) -> list[dict[str, str]]:
 
 
 def draw(seed: int, number: int) -> dict[str, str]:
-    """Return a random assignment by its number: always the same, in any order."""
+    """Return a random assignment by its number: always the same, in any order.
+
+    The last factor is drawn after the others, which are thus the same as before it was added.
+    """
     random = np.random.default_rng([seed, number])
     kind = KINDS[int(random.integers(len(KINDS)))]
     for _ in range(ATTEMPTS):
-        levels = _filled(random, _law(kind), [])
+        levels = _filled(random, _law(kind), [], CHOICES[:-1])
         if levels is not None:
-            return _named(levels)
+            return _named([*levels, int(random.choice(_law(kind).open(levels, CHOICES[-1])))])
     raise AssertionError("nearly all assignments are refused")
 
 
@@ -112,7 +115,9 @@ def _covering(seed: int, size: int) -> list[dict[str, str]]:
             if not len(left):
                 break
             wanted = left[int(random.integers(len(left)))].tolist()
-            drawn = [levels for _ in range(CANDIDATES) if (levels := _filled(random, law, wanted, lacks)) is not None]
+            drawn = [
+                levels for _ in range(CANDIDATES) if (levels := _filled(random, law, wanted, lacks=lacks)) is not None
+            ]
             for _ in range(ATTEMPTS):
                 if drawn:
                     break
@@ -135,12 +140,16 @@ def _named(chosen: Sequence[int]) -> dict[str, str]:
 
 
 def _filled(
-    random: Generator, law: _Law, wanted: Sequence[int], lacks: NDArray[np.bool_] | None = None
+    random: Generator,
+    law: _Law,
+    wanted: Sequence[int],
+    choices_of: Sequence[Sequence[int]] = CHOICES,
+    lacks: NDArray[np.bool_] | None = None,
 ) -> list[int] | None:
     """Complete some levels to an assignment, preferring levels with many missing combinations; None if impossible."""
     chosen = list(wanted)
     there = {LEVELS[k][0] for k in chosen}
-    left = [choices for factor, choices in zip(FACTORS, CHOICES, strict=True) if factor not in there]
+    left = [choices for choices in choices_of if LEVELS[choices[0]][0] not in there]
     for index in random.permutation(len(left)).tolist():
         choices = law.open(chosen, left[index])
         if not choices:

@@ -48,6 +48,8 @@ FACTORS: dict[str, tuple[str, ...]] = {
     "precision": ("default", "tight", "coarse"),
     "solver": ("articulated", "m_star"),
     "way": ("simulate", "pieces", "snapshot", "batch"),
+    # A ball that falls on an object, on a link, or on a plate that the last link carries; links of the arm.
+    "between": ("none", "objects", "links", "carried", "self"),
 }  # fmt: skip
 METHODS = ("auto", "dopri5", "radau5", "time_stepping")
 METHOD = "method"
@@ -99,6 +101,8 @@ SAMPLED = ("sampled", "encoders", "delayed")
 PLANNED = ("gravity", "pressing")
 DC = ("published", "dc")
 STEPPED = "only time stepping has it"
+
+WITH_BALL = ("objects", "links", "carried")
 
 REFUSALS: tuple[Refusal, ...] = (
     # Feature × law.
@@ -166,6 +170,19 @@ REFUSALS: tuple[Refusal, ...] = (
             motor=("none", "torque")),
     _refuse("a glued point starts on its surface", OFF_SURFACE, start="above", contact="glued"),
     _refuse("no declared point", r"brace|contact", controller="pressing", contact=("nothing", "free")),
+    # Bodies that touch each other.
+    _refuse("under the glued law bodies do not touch each other", r"contacts\.between.*unilateral",
+            between=("objects", "links", "self"), contact=GLUED),
+    _refuse("a ball on a glued arm touches nothing", "", between="carried", contact=GLUED),
+    _refuse("there is only one object", "", between="objects", objects="none"),
+    _refuse("links of files have no radius", r"no links with a solid", between=("links", "self"),
+            plant=("urdf", "mimic", "floating", "planar")),
+    _refuse("a snake moves its links as its own controller wants", "", between=("links", "carried", "self"),
+            plant="snake"),
+    _refuse("a plan of voltages needs a DC motor at each joint, those of objects too", r"\bDC\b",
+            between=WITH_BALL, controller=PLANNED),
+    _refuse("a ball on a ball or on a link has no equilibrium", "", between=WITH_BALL, start="equilibrium"),
+    _refuse("links and joints near a plate start in it", "", between="carried", contact=("joints", "links")),
 )  # fmt: skip
 
 

@@ -10,7 +10,7 @@ PLAIN = {
     "plant": "revolute", "motor": "published", "rubbing": "nothing", "stops": "none", "contact": "points",
     "points": "elbow", "shape": "point", "surface": "plane", "friction": "coulomb", "give": "rigid",
     "controller": "hold", "start": "given", "loads": "none", "objects": "none", "ties": "none",
-    "precision": "default", "solver": "articulated", "way": "simulate",
+    "precision": "default", "solver": "articulated", "way": "simulate", "between": "none",
 }  # fmt: skip
 
 

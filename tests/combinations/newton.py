@@ -125,8 +125,11 @@ def _acting_on(
         body = seen.bodies.robot.links[i].inertia
         add(seen.motion.point(i, body.com), np.broadcast_to(body.mass * seen.bodies.gravity, (len(seen), 3)))
     for touch in seen.touches():
-        if touch.body in chosen:
+        first, *second = touch.body if isinstance(touch.body, tuple) else (touch.body,)
+        if first in chosen:
             add(touch.position, touch.force)
+        if not chosen.isdisjoint(second):
+            add(touch.position, -touch.force)
     for load in seen.loads:
         body, point = seen.robot.attach(load.body, load.point)
         if body in chosen:

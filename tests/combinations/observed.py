@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from combinations.bodies import Bodies, Motion, position_rates, times
+from combinations.bodies import Bodies, Ends, Motion, position_rates, times
 from combinations.running import Run
 from combinations.sentences import SHARED
-from combinations.surfaces import Shape, nearest, shape
+from combinations.surfaces import Shape, nearest, seen_from, shape, solid
 from dynsim.model.description import WORLD, Contact, Load, Robot
 from dynsim.model.drives import Motor, Servo, TorqueSource
-from dynsim.model.surfaces import HeightField
+from dynsim.model.surfaces import Box, Capsule, HeightField
 from dynsim.record import Record
 from dynsim.scenario import build
 
@@ -45,7 +45,7 @@ class Touch:
 
     Attributes
     ----------
-    contact : description of the contact; body : index of its body
+    contact : description of the contact; body : index of its body, or of two bodies that touch each other
     position : touching point, (T, 3) [m]; normal : (T, 3)
     gap, gap_before : (T,) [m]; the second at the midpoint of the sample's step; equal for event-driven methods
     slip, slip_before : (T, 3) tangential velocity [m/s]; the second with the rates at the start of the sample's step
@@ -59,7 +59,7 @@ class Touch:
     """
 
     contact: Contact
-    body: int
+    body: Ends
     position: Array
     normal: Array
     gap: Array
@@ -115,6 +115,8 @@ class Observed:
         shift, fields = np.array(error.get("shift_m", [0.0, 0.0, 0.0])), build.surfaces(self.scenario)
         made = {}
         for name, config in self.config["surfaces"].items():
+            if config.get("on") is not None:
+                continue
             described, grid = fields[name], None
             if isinstance(described, HeightField):
                 grid = described.origin - shift[:2], described.spacing, described.heights - shift[2]
@@ -145,15 +147,29 @@ class Observed:
         q = self.q - self.step * position_rates(self.bodies, self.q, self.v)
         return self.touches(self.bodies.motion(q, self.v, np.zeros_like(self.v)))
 
-    def nearest_point(self, contact: Contact, motion: Motion) -> tuple[int, Array, Array, Array]:
+    def nearest_point(self, contact: Contact, motion: Motion) -> tuple[Ends, Array, Array, Array]:
         """Return a contact's body, and at each instant the centre nearest to its surface [m], distance and normal."""
+        if contact.solid is not None:
+            # Slots of two links: the axis of one against the other.
+            assert isinstance(contact.solid, Capsule)
+            own = contact.solid
+            contact = replace(contact, solid=None, point=own.start, tip=own.start + own.axis, radius=own.radius)
         body, point = self.robot.attach(contact.body, contact.point)
         start = motion.point(body, point)
         tip = None if contact.tip is None else motion.point(body, self.robot.attach(contact.body, contact.tip)[1])
-        surface = self.shapes[contact.surface_name]
+        ends, surface = self.surface_of(contact, body, motion)
         centre = nearest(surface, start, tip)
         far, normal = surface.look(centre)
-        return body, centre, far, normal
+        return ends, centre, far, normal
+
+    def surface_of(self, contact: Contact, body: int, motion: Motion) -> tuple[Ends, Shape]:
+        """Return the bodies of a contact and its surface at each instant."""
+        described = contact.surface
+        if described.carrier is None:
+            return body, self.shapes[contact.surface_name]
+        assert isinstance(described, Box | Capsule)
+        carrier, _ = self.robot.attach(described.carrier, np.zeros(3))
+        return (body, carrier), seen_from(solid(described), motion.rotation[carrier], motion.origin[carrier])
 
     def _touch(self, k: int, contact: Contact, motion: Motion) -> Touch:
         body, centre, far, normal = self.nearest_point(contact, motion)

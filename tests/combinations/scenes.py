@@ -15,8 +15,8 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from combinations import drives, plants
-from combinations.factors import FACTORS, GLUED, SAMPLED, Levels, methods
-from combinations.sentences import OFF_SURFACE
+from combinations.factors import FACTORS, GLUED, SAMPLED, WITH_BALL, Levels, methods
+from combinations.sentences import OFF_SURFACE, OVERLAP
 from dynsim import Model, check
 from dynsim.errors import DynsimError
 from dynsim.scenario import Scenario, build_model, load_scenario
@@ -32,6 +32,8 @@ SPHERE, THICKER = 0.02, 0.002
 SHIN = 0.05
 # Radius of the balls that single points touch [m].
 BALL_M = 0.03
+# Radius of the ball that falls on a body [m]; number of pairs of links that may touch each other.
+RIDER_M, MOST_PAIRS = 0.02, 4
 # Maximum number of scenes drawn until no body starts in a surface.
 ATTEMPTS = 12
 # Number of grid heights along each side, and their spacing [m].
@@ -110,7 +112,8 @@ def scene(
     ``change`` : its sections, as they would be written
     """
     # This number is the same in every process, unlike Python's own hashes of strings.
-    number = zlib.crc32("/".join(levels[factor] for factor in FACTORS).encode())
+    chosen = [levels[factor] for factor in FACTORS if factor != "between" or levels[factor] != "none"]
+    number = zlib.crc32("/".join(chosen).encode())
     for attempt in range(ATTEMPTS):
         random = np.random.default_rng([seed, number, attempt])
         draft = _snake(random, levels) if levels["plant"] == "snake" else _arm(random, levels, folder)
@@ -142,7 +145,7 @@ def _in_a_surface(drawn: Scene) -> bool:
     try:
         check(drawn.load(drawn.methods[-1]))
     except DynsimError as error:
-        return OFF_SURFACE in str(error)
+        return OFF_SURFACE in str(error) or OVERLAP in str(error)
     return False
 
 
@@ -157,6 +160,9 @@ def _arm(random: Generator, levels: Levels, folder: Path) -> dict[str, Any]:
         (folder / name).write_text(text, "utf-8")
     model = _model(robot, folder)
     touching = _Touching(random, levels, robot, model, folder)
+    objects = touching.objects()
+    if levels["between"] != "none":
+        touching.add_between(objects)
     settings: dict[str, Any] = {
         "duration_s": duration,
         "plant": robot.section,
@@ -165,7 +171,7 @@ def _arm(random: Generator, levels: Levels, folder: Path) -> dict[str, Any]:
         "contacts": touching.contacts,
         "initial": _initial(levels, touching, robot),
         "loads": _loads(random, levels, robot, duration),
-        "objects": touching.objects(),
+        "objects": objects,
         "ties": _ties(random, levels, robot),
         "sensors": _sensors(random, levels),
         "record": {"rate_hz": 500.0},
@@ -251,6 +257,7 @@ class _Touching:
         """Add the surface below the elbow."""
         random, kind = self._random, self._levels["surface"]
         wide = self._levels["contact"] in ("joints", "links") or self._levels["objects"] not in ("none", "hinge")
+        wide = wide or self._levels["between"] in WITH_BALL
         # Tilt the surface across the plane of the arm, so that the other joints stay equally far above it.
         heading = self._across()
         normal = _unit(np.array([0.0, 0.0, 1.0]) + float(random.uniform(-0.05, 0.05)) * heading)
@@ -457,6 +464,53 @@ class _Touching:
         thing["position_m"] = (there + np.array([0.0, 0.0, height + drop])).tolist()
         return {"thing": thing}
 
+    def add_between(self, objects: dict[str, Any]) -> None:
+        """Add bodies that touch each other: pairs of links, or a ball above an object, a link or a carried plate."""
+        random, level, robot = self._random, self._levels["between"], self._robot
+        # A link that moves: the hand of a file is fixed to one.
+        index, tip = self._model.robot.attach(robot.hand[0], np.array(robot.hand[1]))
+        body = self._model.robot.links[index].name
+        if level == "self":
+            # Few pairs, which event-driven methods support.
+            names = self._model.robot.bodies
+            ignore = [[a, b] for k, a in enumerate(names) for b in names[k + 1 :] if names[k + 2 :][:1] != [b]]
+            self.contacts["between"] = [{"bodies": "self", "ignore": ignore[MOST_PAIRS:]}]
+            return
+        if level == "objects":
+            thing = objects["thing"]
+            half = thing.get("radius_m", 0.5 * thing.get("size_m", [0.0, 0.0, 0.0])[2])
+            up = np.array([0.0, 0.0, 1.0])
+            top = np.array(thing["position_m"]) + half * up
+        elif level == "links":
+            middle = [0.0, 0.0, 0.5 * tip[2]]
+            along = _unit(self._model.point_position(body, np.array(tip), self._q) - self._start_of(body))
+            up = np.cross(np.cross(along, [0.0, 0.0, 1.0]), along)
+            up = _unit(up) if np.linalg.norm(up) > 0.1 else np.array([1.0, 0.0, 0.0])
+            top = self._model.point_position(body, np.array(middle), self._q) + robot.radius * up
+        else:
+            centre = [0.0, 0.0, tip[2] + 0.08]
+            axes = [self._model.point_position(body, centre + axis, self._q) for axis in np.eye(3)]
+            at = self._model.point_position(body, np.array(centre), self._q)
+            k = int(np.argmax([abs(axis[2] - at[2]) for axis in axes]))
+            up = (axes[k] - at) * math.copysign(1.0, axes[k][2] - at[2])
+            edges = np.full(3, 0.08)
+            edges[k] = 0.02
+            self.surfaces["plate"] = {"type": "box", "center_m": centre, "edges_m": edges.tolist(), "on": body}
+            top = at + 0.01 * up
+        gap = float(random.choice((0.0, random.uniform(1e-3, 0.01)))) + 1e-9
+        centre_of_ball = top + (RIDER_M + gap) * up
+        mass = float(random.uniform(0.05, 0.2))
+        objects["rider"] = {
+            "shape": "sphere", "radius_m": RIDER_M, "mass_kg": mass, "position_m": centre_of_ball.tolist(),
+        }  # fmt: skip
+        if level != "carried":
+            self.contacts["between"] = [{"bodies": ["rider", "thing" if level == "objects" else "links"]}]
+            if random.random() < 0.3:
+                self.contacts["between"][0]["friction"] = float(random.uniform(0.0, 1.0))
+
+    def _start_of(self, body: str) -> Array:
+        return self._model.point_position(body, np.zeros(3), self._q)
+
     def _away(self) -> Array:
         side = np.cross(self.normal, [0.0, 0.0, 1.0])
         return _unit(side) if np.linalg.norm(side) > 0.1 else np.array([1.0, 0.0, 0.0])
@@ -582,6 +636,11 @@ def _snake(random: Generator, levels: Levels) -> dict[str, Any]:
         if levels["objects"] == "hinge":
             thing["hinge"] = {"axis": [0.0, 0.0, 1.0]}
         settings["objects"] = {"thing": thing}
+        if levels["between"] == "objects":
+            half = shape.get("radius_m", 0.05)
+            ball = {"shape": "sphere", "radius_m": RIDER_M, "mass_kg": 0.1}
+            settings["objects"]["rider"] = {**ball, "position_m": [2.0, 0.5, height + half + RIDER_M + 1e-3]}
+            settings["contacts"]["between"] = [{"bodies": ["rider", "thing"]}]
         if levels["ties"] != "none":
             settings["ties"] = {
                 "spring": {

@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dynsim.model.surfaces import Box, Capsule
+
 Array = NDArray[np.float64]
 
 # Initial positions along an axis at which its distance is evaluated, and number of bisections of the best part.
@@ -65,6 +67,32 @@ def shape(config: Mapping[str, Any], shift: Array, heights: Any = None) -> Shape
     raise NotImplementedError(kind)
 
 
+def solid(described: Box | Capsule) -> Shape:
+    """Return a solid of a body, or a surface that a body carries, in the frame of this body."""
+    if isinstance(described, Box):
+        core, radius = 0.5 * described.edges - described.edge_radius, described.edge_radius
+        return Shape(_rounded(described.centre, described.axes.T, core, radius), True)
+    start, axis, radius = described.start, described.axis, described.radius
+
+    def look(r: Array) -> tuple[Array, Array]:
+        share = np.clip((r - start) @ axis / max(float(axis @ axis), 1e-300), 0.0, 1.0)
+        away = r - start - np.outer(share, axis)
+        far = np.linalg.norm(away, axis=1)
+        return far - radius, away / np.maximum(far, 1e-300)[:, None]
+
+    return Shape(look, True)
+
+
+def seen_from(surface: Shape, rotation: Array, origin: Array) -> Shape:
+    """Return a surface in the world that moves with a frame, (T, 3, 3) and (T, 3)."""
+
+    def look(r: Array) -> tuple[Array, Array]:
+        far, normal = surface.look(np.einsum("tij,ti->tj", rotation, r - origin))
+        return far, np.einsum("tij,tj->ti", rotation, normal)
+
+    return Shape(look, surface.bends)
+
+
 def nearest(surface: Shape, start: Array, end: Array | None) -> Array:
     """Return the point of the axis from start to end, (T, 3) each, that is nearest to a surface."""
     if end is None or not surface.bends:
@@ -98,8 +126,10 @@ def _box(config: Mapping[str, Any], shift: Array) -> Callable[[Array], tuple[Arr
     R = about[2] @ about[1] @ about[0]
     rounding = config.get("edge_radius_m", 0.005)
     core = 0.5 * np.array(config["edges_m"]) - rounding
-    centre = np.array(config["center_m"]) + shift
+    return _rounded(np.array(config["center_m"]) + shift, R, core, rounding)
 
+
+def _rounded(centre: Array, R: Array, core: Array, rounding: float) -> Callable[[Array], tuple[Array, Array]]:
     def look(r: Array) -> tuple[Array, Array]:
         own = (r - centre) @ R
         outside = np.maximum(np.abs(own) - core, 0.0)

@@ -185,7 +185,8 @@ def test_scenes_that_were_wrong_once(name: str, number: int, tmp_path: Path) -> 
 @pytest.mark.long
 @pytest.mark.parametrize(("seed", "number"), FOUND.values(), ids=FOUND)
 def test_fresh_scenes_that_were_wrong_once(seed: int, number: int, tmp_path: Path) -> None:
-    levels = study.assignment("none", seed, number)
+    # These scenes are older than the factor of bodies that touch each other.
+    levels = study.assignment("none", seed, number) | {"between": "none"}
     _all_holds(levels, seed, number, tmp_path, thorough=False, takes=_shares_a_program)
 
 

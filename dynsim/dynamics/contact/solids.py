@@ -27,8 +27,15 @@ FEATURE = 7  # corner or edge of one of the solids, −1: empty slot
 FOUND_SIZE = 8
 # Gap of a place that does not exist [m].
 FAR = 1e9
-# Features: corners 0 to 7 and edges 8 to 19 of the first solid, corners 20 to 27 of the second.
-EDGES, OTHERS, FEATURES = 8, 20, 28
+# Features: corners 0 to 7 and edges 8 to 19 of the first solid, corners 20 to 27 of the second, and the places where
+# the edges of one solid begin and end to be above a face of the other, 28 to 39 and 40 to 51.
+EDGES, OTHERS, BORDERS, FEATURES = 8, 20, 28, 52
+# Smallest cosine between the normal and a face for which two solids touch in more places than corners.
+FLAT = 0.98
+# Difference of gaps below which the nearest place of an edge is where the edge begins or ends to be above a face [m].
+SAME = 1e-12
+# A feature of the last step keeps its slot unless another one is deeper by this distance [m], or further by this factor.
+STAYS, STAYS_FACTOR = 1e-6, 1.02
 # Places within this distance behind the deepest one can touch as well [m].
 BAND = 2e-3
 # Slope of the distance along an edge below which its ends are as near as its middle.
@@ -234,7 +241,49 @@ def find_contacts(pose_a, core_a, pose_b, core_b, known, slots, places, chosen):
                 at = along(start, way, lowest_between(hB, x, d))
                 f = EDGES + 4 * axis + edge_number(k, axis)
                 note_place(places, f, at, RB, pB, hB, rA, rB, 1.0)
+    if min(hB[0], hB[1], hB[2]) > 0.0:
+        note_borders(places, known, RA, pA, hA, RB, pB, hB, rA, rB, 1.0)
+    elif min(hA[0], hA[1], hA[2]) > 0.0:
+        note_borders(places, known, RB, pB, hB, RA, pA, hA, rB, rA, -1.0)
     fill_slots(known, slots, places, chosen)
+
+
+@internal_kernel
+def note_borders(places, known, R, p, h, Q, q, box, own, other, sign):
+    """Write the places where edges of a solid (R, p, h) begin and end to be above the nearest face of a box (Q, q, box).
+
+    The corners of the area in which two faces touch are corners of the faces, or such places.
+    """
+    deepest = deepest_place(places, known)
+    n = rotate_back(Q, (places[deepest, NORMAL], places[deepest, NORMAL + 1], places[deepest, NORMAL + 2]))
+    k = 0 if abs(n[0]) >= max(abs(n[1]), abs(n[2])) else 1 if abs(n[1]) >= abs(n[2]) else 2
+    if abs(n[k]) < FLAT:
+        return
+    side = math.copysign(1.0, sign * n[k])
+    depth = places[deepest, GAP]
+    up = rotate(Q, (side if k == 0 else 0.0, side if k == 1 else 0.0, side if k == 2 else 0.0))
+    for axis in range(3):
+        bit = 1 << axis
+        for c in range(8):
+            if h[axis] == 0.0 or c & bit or not is_corner(h, c):
+                continue
+            start = transform(p, R, corner(h, c))
+            way = along(transform(p, R, corner(h, c | bit)), start, -1.0)
+            x, d, low, high = rotate_back(Q, along(start, q, -1.0)), rotate_back(Q, way), 0.0, 1.0
+            for m in range(3):
+                if m != k and d[m] != 0.0:
+                    a, b = (-box[m] - x[m]) / d[m], (box[m] - x[m]) / d[m]
+                    low, high = max(low, min(a, b)), min(high, max(a, b))
+                elif m != k and abs(x[m]) > box[m]:
+                    high = low
+            f = 4 * axis + edge_number(c, axis)
+            for end in range(2):
+                u = low if end == 0 else high
+                gap = side * (x[k] + u * d[k]) - box[k] - own - other
+                if low < high and 0.0 < u < 1.0 and abs(gap - depth) <= BAND:
+                    put_place(places, BORDERS + 12 * end + f, along(start, way, u), up, gap, own, sign)
+                    if sign > 0.0 and gap <= places[EDGES + f, GAP] + SAME:
+                        places[EDGES + f, GAP] = FAR
 
 
 @internal_kernel
@@ -258,8 +307,12 @@ def note_place(places, f, at, R, p, h, own, other, sign):
     """Write the place where the point ``at`` of one core is nearest to the other core (R, p, h)."""
     x, y, z = rotate_back(R, along(at, p, -1.0))
     far, nx, ny, nz = core_distance(h[0], h[1], h[2], x, y, z)
-    n = rotate(R, (nx, ny, nz))
-    gap = far - own - other
+    put_place(places, f, at, rotate(R, (nx, ny, nz)), far - own - other, own, sign)
+
+
+@internal_kernel
+def put_place(places, f, at, n, gap, own, sign):
+    """Write the place below the point ``at`` of a core with radius ``own``, at this gap along the normal n."""
     row = places[f]
     # From the axis to the own surface, and half of the gap further.
     c = along(at, n, -(own + 0.5 * gap))
@@ -272,18 +325,16 @@ def note_place(places, f, at, R, p, h, own, other, sign):
 def fill_slots(known, slots, places, chosen):
     """Choose at most SLOTS places: the deepest, the furthest from it, and the furthest on either side of their line."""
     chosen[:] = -1
-    deepest = 0
-    for f in range(FEATURES):
-        if places[f, GAP] < places[deepest, GAP]:
-            deepest = f
+    deepest = deepest_place(places, known)
     chosen[0] = deepest
     limit = places[deepest, GAP] + BAND
     first, best = vector_of(places, deepest), 1e-12
     for f in range(FEATURES):
         if places[f, GAP] <= limit:
             way = along(vector_of(places, f), first, -1.0)
-            if dot_vector(way, way) > best:
-                best, chosen[1] = dot_vector(way, way), f
+            square = dot_vector(way, way) * (STAYS_FACTOR if is_known(known, f) else 1.0)
+            if square > best:
+                best, chosen[1] = square, f
     if chosen[1] >= 0:
         n = places[deepest, NORMAL], places[deepest, NORMAL + 1], places[deepest, NORMAL + 2]
         line = along(vector_of(places, chosen[1]), first, -1.0)
@@ -296,6 +347,7 @@ def fill_slots(known, slots, places, chosen):
         for f in range(FEATURES):
             if places[f, GAP] <= limit:
                 side = dot_vector(across, along(vector_of(places, f), first, -1.0))
+                side *= STAYS_FACTOR if is_known(known, f) else 1.0
                 if side < least:
                     least, chosen[2] = side, f
                 elif side > most:
@@ -315,6 +367,26 @@ def fill_slots(known, slots, places, chosen):
             if chosen[s] >= 0 and slots[j, FEATURE] < 0.0:
                 copy_place(slots, j, places, chosen[s])
                 chosen[s] = -1
+
+
+@internal_kernel
+def deepest_place(places, known):
+    """Return the feature of the deepest place; a known one keeps this role until another is deeper by ``STAYS``."""
+    deepest, least = 0, FAR
+    for f in range(FEATURES):
+        gap = places[f, GAP] - (STAYS if is_known(known, f) else 0.0)
+        if gap < least:
+            deepest, least = f, gap
+    return deepest
+
+
+@internal_kernel
+def is_known(known, f):
+    """Return whether feature f had a slot in the last step."""
+    for j in range(SLOTS):
+        if known[j] == f:
+            return True
+    return False
 
 
 @internal_kernel
