@@ -37,6 +37,8 @@ COLUMNS = 4
 SHOTS: dict[str, tuple[str | None, str, float]] = {
     "block_on_slope": ("slides", "iso", 0.5),
     "bouncing_link": ("lively", "side", 0.25),
+    "box_on_brace": ("heavy", "side", 0.5),
+    "brace_on_itself": ("braced", "iso", 0.5),
     "brace_on_shapes": ("terrain", "iso", 0.5),
     "elbow_comparison_floor": ("elbow_7", "side", 0.6),
     "elbow_comparison_links": ("soft", "side", 0.5),
@@ -48,6 +50,7 @@ SHOTS: dict[str, tuple[str | None, str, float]] = {
     "mobile_reach": (None, "side", 1.0),
     "mobile_turns": ("fast_arc", "iso", 0.9),
     "pressing": ("optimal", "side", 0.5),
+    "push_box": ("pushes", "iso", 0.5),
     "single_pendulum": (None, "side", 0.5),
     "snake_circle": ("forward", "iso", 0.35),
     "snake_circle_backward": (None, "top", 0.9),

@@ -231,9 +231,9 @@ def check(
     """Validate scenarios without simulating them: keys, model, contacts at the start, reachable references.
 
     For each variant, the command prints the start position of the hand and of each contact point (in full precision,
-    ready to be copied into a path or surface), the gap at each contact, the joints that `initial` moved, the joints
-    that start at a limit because no position is set, and the tip margin of a mobile base at rest. `dynsim pose` changes
-    a start posture.
+    ready to be copied into a path or surface), the gap at each contact and of the nearest pairs of bodies, the joints
+    that `initial` moved, the joints that start at a limit because no position is set, and the tip margin of a mobile
+    base at rest. `dynsim pose` changes a start posture.
     """
     from dynsim.engine import check as check_scenario
     from dynsim.scenario import load_scenario, variant_names

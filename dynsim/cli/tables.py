@@ -304,12 +304,17 @@ def _print_choice(
 def print_starts(console: Console, starts: Mapping[str, Start]) -> None:
     """Print the start positions of the hand and contact points [m] of each variant, as YAML lists in full precision.
 
-    Also print the contact gaps, the joints that `initial` moved, and the tip margin of a mobile base at rest.
+    Also print the gaps of contacts and of pairs of bodies, the joints that `initial` moved, and the tip margin of a
+    mobile base at rest.
     """
     for variant, start in starts.items():
         values = {"hand": f"{_coordinates(start.hand)}"}
         values |= {f"contact {name}": f"{_coordinates(point)}" for name, point in start.contacts.items()}
-        values |= {f"gap of {name}": f"{_format(_without_rounding(gap), '+.4g')} m" for name, gap in start.gaps.items()}
+        pairs = list(start.pairs.items())
+        gaps = {**start.gaps, **dict(pairs[:_MOST_PAIRS])}
+        values |= {f"gap of {name}": f"{_format(_without_rounding(gap), '+.4g')} m" for name, gap in gaps.items()}
+        if further := pairs[_MOST_PAIRS:]:
+            values[f"{len(further)} more pairs"] = f"{further[0][1]:+.4g} m or more"
         for joint, (to, was, unit) in start.solved.items():
             values[joint] = f"{to!r} {unit}, set by `initial`; was {was:.6g}"
         for joint, (at, unit) in start.nearest.items():
@@ -461,6 +466,8 @@ _RATED = (
     ("force", "N", "rms of nominal [N]"),
 )
 _MOST_MOTORS = 10
+# Maximum number of pairs of bodies whose gaps are printed.
+_MOST_PAIRS = 20
 
 
 def warning_text(text: str, name: str = "") -> str:

@@ -89,9 +89,18 @@ def gaps(
 
     ``points`` contains surface and point, (3,) in the body's frame [m], for each body.
     """
-    for link, R, p in poses(robot, q):
-        if link.name in points:
-            yield link, [surface.gaps((p + point @ R).T) for surface, point in points[link.name]]
+    needed = {*points, *(surface.carrier for own in points.values() for surface, _ in own)}
+    placed = {link.name: (link, R, p) for link, R, p in poses(robot, q) if link.name in needed}
+    for body, own in points.items():
+        link, R, p = placed[body]
+        distances = []
+        for surface, point in own:
+            at = p + point @ R
+            if surface.carrier is not None:
+                _, turn, origin = placed[surface.carrier]
+                at = np.einsum("abt,at->bt", turn, at - origin)
+            distances.append(surface.gaps(at.T))
+        yield link, distances
 
 
 def sinking(robot: Robot, surfaces: Mapping[str, Surface], q: Array) -> list[Sinking]:

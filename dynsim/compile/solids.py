@@ -82,8 +82,11 @@ def _solid_of(shape: Shape, body: str) -> Solid:
 
 
 def tangent_planes(surface: Surface) -> list[Quadric]:
-    """Return planes that touch a solid on its sides: six for a box or sphere, four for a cylinder; none for others."""
-    if not bends_outward(surface):
+    """Return planes that touch a solid on its sides: six for a box or sphere, four for a cylinder; none for others.
+
+    A surface on a body has no planes, because they would move with it.
+    """
+    if surface.carrier is not None or not bends_outward(surface):
         return []
     if isinstance(surface, Box):
         centre, axes, sizes = surface.centre, np.asarray(surface.axes), 0.5 * np.asarray(surface.edges)

@@ -49,7 +49,7 @@ class Start:
     hand : (3,) ndarray
         Position of the controlled point [m].
     contacts : dict of str to (3,) ndarray
-        Position of each enabled contact point [m].
+        Position of each enabled contact point [m]; contacts of `contacts.between` are in ``pairs``.
     gaps : dict of str to float
         Distance of each of these points from its surface [m]; negative: below the surface.
     aloft : str
@@ -70,6 +70,8 @@ class Start:
         Distance of the hand from the start of its path [m]; None without a path.
     scene : Scene or None
         Bodies, surfaces and points for pictures; None if the plant cannot be drawn.
+    pairs : dict of str to float
+        Distance of each pair of bodies that can touch each other [m], in ascending order.
     """
 
     hand: NDArray[np.float64]
@@ -82,6 +84,7 @@ class Start:
     warnings: Sequence[str] = ()
     off_path: float | None = None
     scene: Scene | None = None
+    pairs: Mapping[str, float] = field(default_factory=dict)
     nearest: Mapping[str, tuple[float, str]] = field(default_factory=dict)
 
 

@@ -633,19 +633,17 @@ def _check_held(model: Model, contacts: Sequence[Contact], control: JointControl
     followed: dict[str, list[tuple[Contact, Array]]] = {}
     for contact in contacts:
         index, point = robot.attach(contact.body, contact.point)
-        carrier = body = robot.links[index].name
         chain = []
-        while True:
-            chain.append(motor_of.get(links[body].joint, -1))
-            parent = links[body].parent
-            if parent is None:
-                break
-            body = parent
+        for end in (robot.links[index].name, contact.surface.carrier):
+            body = end
+            while body is not None:
+                chain.append(motor_of.get(links[body].joint, -1))
+                body = links[body].parent
         # A joint that does not follow a reference yields, so references do not determine the position of the point. If
         # no reference moves, the point stays at its initial position, which is checked separately.
         follows = all(a >= 0 and control.k_p[a] > 0.0 for a in chain)
         if follows and any(control.reference.spline[a] >= 0 for a in chain):
-            followed.setdefault(carrier, []).append((contact, point))
+            followed.setdefault(robot.links[index].name, []).append((contact, point))
     if not followed:
         return
     worst: dict[str, tuple[float, float, np.ndarray]] = {}

@@ -321,6 +321,8 @@ class Simulation:
                 force=float(row[kst.OUT_FORCE]),
                 vector=row[kst.OUT_VECTOR : kst.OUT_VECTOR + 3].copy(),
                 mode=int(row[kst.OUT_MODE]) if real else None,
+                position=row[kst.OUT_POSITION : kst.OUT_POSITION + 3].copy(),
+                normal=row[kst.OUT_NORMAL : kst.OUT_NORMAL + 3].copy(),
             )
             for contact, row in zip(self._prepared.contacts, rows, strict=True)
         }
@@ -1579,10 +1581,10 @@ def check(scenario: Scenario, started: Callable[[Start], None]) -> Start:
     start = replace(start, scene=drawn_scene(scenario, model.robot, prepared.contacts))
     if prepared.balance is not None:
         # Pressing compliant contacts in moves joints.
-        points, gaps = _touching(model, prepared.contacts)
+        points, gaps, pairs = _touching(model, prepared.contacts)
         hand = model.point_position(*model.robot.hand, model.robot.initial)
         said = [*start.warnings, *prepared.balance.warnings]
-        start = replace(start, hand=hand, contacts=points, gaps=gaps, warnings=said)
+        start = replace(start, hand=hand, contacts=points, gaps=gaps, pairs=pairs, warnings=said)
     if (unstable := unstable_loop(scenario, prepared)) is not None:
         start = replace(start, warnings=[*start.warnings, unstable[0]])
     if control.path is not None and control.teleop is None:
@@ -1628,7 +1630,7 @@ def start_of(scenario: Scenario) -> Start:
     described, contacts, piloted = at_start(scenario)
     model = recall("model", lambda: Model(described), described)
     robot = model.robot
-    q, (points, gaps) = robot.initial, _touching(model, contacts)
+    q, (points, gaps, pairs) = robot.initial, _touching(model, contacts)
     declared = scenario.config.contacts.points
     movable = declared.keys() - {contact.name for contact in contacts if contact.left_out}
     if piloted is not None:  # `initial` does not place the joints of a snake
@@ -1652,7 +1654,8 @@ def start_of(scenario: Scenario) -> Start:
         *build.left_out_warnings(scenario, contacts),
     ]
     start = Start(hand, points, gaps, key, solved, *_margins(scenario, model, contacts), warnings)
-    return replace(start, nearest={name: at for name, at in _nearest(robot).items() if name not in solved})
+    nearest = {name: at for name, at in _nearest(robot).items() if name not in solved}
+    return replace(start, nearest=nearest, pairs=pairs)
 
 
 def _nearest(robot: Robot) -> dict[str, tuple[float, str]]:
@@ -1665,16 +1668,21 @@ def _nearest(robot: Robot) -> dict[str, tuple[float, str]]:
     }
 
 
-def _touching(model: Model, contacts: Sequence[Contact]) -> tuple[dict[str, Array], dict[str, float]]:
-    """Return the positions (3,) of contact points at the start, and their gaps [m]."""
-    points, gaps, q = dict[str, Array](), dict[str, float](), model.robot.initial
+def _touching(model: Model, contacts: Sequence[Contact]) -> tuple[dict[str, Array], dict[str, float], dict[str, float]]:
+    """Return the positions (3,) of contact points at the start, their gaps, and the gaps of pairs of bodies [m]."""
+    points, gaps, pairs, q = dict[str, Array](), dict[str, float](), dict[str, float](), model.robot.initial
     for contact in contacts:
         try:
-            gaps[contact.name] = gap_at(model, contact, q)
+            gap = gap_at(model, contact, q)
         except ModelError:  # an unknown body; the contact check reports it with its line
             continue
-        points[contact.name] = model.point_position(contact.body, contact.point, q)
-    return points, gaps
+        if contact.is_between_bodies:
+            name = f"{contact.body}-{contact.surface_name}"
+            pairs[name] = min(gap, pairs.get(name, gap))
+        else:
+            gaps[contact.name] = gap
+            points[contact.name] = model.point_position(contact.body, contact.point, q)
+    return points, gaps, dict(sorted(pairs.items(), key=lambda entry: entry[1]))
 
 
 def _below(scenario: Scenario, robot: Robot) -> list[str]:

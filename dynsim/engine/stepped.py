@@ -153,11 +153,15 @@ class Touch:
         Normal and friction force in the world frame [N].
     mode : int or None
         0 off its surface, 1 sliding, 2 sticking; None under the bilateral law.
+    position, normal : (3,) ndarray
+        Point at which the force acts [m], and normal of the surface there, in the world frame.
     """
 
     force: float
     vector: Array
     mode: int | None
+    position: Array
+    normal: Array
 
 
 @dataclass(frozen=True)

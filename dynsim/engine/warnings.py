@@ -109,7 +109,7 @@ def warnings_of(
             "tighten integrator.rtol or the step"
         )
     if (stepping := summary.get("time_stepping")) is not None:
-        warnings += [*capped(stepping), *coarse(stepping, scale)]
+        warnings += [*capped(stepping), *coarse(stepping, scale, summary["contacts"])]
     elif summary["constraint_drift_max_m"] > DRIFT_LIMIT_M:
         warnings.append(f"contacts drifted by {summary['constraint_drift_max_m']:.1e} m")
     warnings += _undetermined(record, prepared, stepping is not None)
@@ -503,11 +503,12 @@ def _beyond_stops(robot: Robot, stops: Sequence[JointStop], control: JointContro
     ]
 
 
-def coarse(stepping: dict[str, Any], scale: float) -> list[str]:
+def coarse(stepping: dict[str, Any], scale: float, contacts: Sequence[dict[str, Any]] = ()) -> list[str]:
     """Warn of steps that are too long, and suggest a shorter step.
 
     Such steps remove or add too much energy, leave the energy uncertain, or let points sink in too far. ``scale`` is
-    the energy turnover [J], but at least the resolution of the ledger; it is zero before the first motion.
+    the energy turnover [J], but at least the resolution of the ledger; it is zero before the first motion. ``contacts``
+    are the contacts of the summary; the deepest one is named.
     """
     step, worst, deepest = stepping["step_s"], stepping["scheme_loss_worst_J"], stepping["penetration_max_m"]
     # This value is missing for a ring buffer.
@@ -537,7 +538,9 @@ def coarse(stepping: dict[str, Any], scale: float) -> list[str]:
         warn(f"the power changes so fast that {text}", step * HALF_STEP_LIMIT * scale / blurred)
     if deepest > PENETRATION_LIMIT_M:
         text = f"points sink up to {1e3 * deepest:.3g} mm into their surfaces as they land"
-        warn(f"{text} (limit {1e3 * PENETRATION_LIMIT_M:g} mm)", step * PENETRATION_LIMIT_M / deepest)
+        name = max(contacts, key=lambda contact: contact["penetration_max_m"])["name"] if contacts else ""
+        limit = f"{name and f'{name}; '}limit {1e3 * PENETRATION_LIMIT_M:g} mm"
+        warn(f"{text} ({limit})", step * PENETRATION_LIMIT_M / deepest)
     return warnings
 
 

@@ -351,6 +351,11 @@ class Contact:
         return self.friction if self.static_friction is None else self.static_friction
 
     @property
+    def is_between_bodies(self) -> bool:
+        """Whether the surface is a solid of another body, from ``contacts.between``."""
+        return self.surface_name == self.surface.carrier
+
+    @property
     def geometry(self) -> tuple[str, str, Array, Surface, float, Array | None, Surface | None, int]:
         """Everything that determines the location of the contact and the surface that it can touch, without its law."""
         return self.name, self.body, self.point, self.surface, self.radius, self.tip, self.solid, self.slot

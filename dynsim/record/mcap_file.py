@@ -4,7 +4,7 @@ Topics: ``/joint_states``, ``/tf`` and ``/tf_static`` (each body, including a ba
 parent; the root is ``world``), ``/robot_description`` (see :mod:`dynsim.record.urdf_text`), and ``/contacts/NAME`` for
 each contact point, with the force that the surface exerts on it. The frame ``contact_NAME`` of this force has the axes
 of the world. Its origin is the point where the force acts (for a sphere or capsule the point of contact), so that the
-torque is zero.
+torque is zero. If a body carries the surface, ``/contacts/NAME_on_BODY`` has the opposite force on this body.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from dynsim.record.joint_motion import joint_motion
 from dynsim.record.poses import contact_positions, relative_pose
 from dynsim.record.quaternion import Array
 from dynsim.record.record import Record
+from dynsim.record.scene import WORLD
 from dynsim.record.urdf_text import WORLD_LINK, fixed_frames, scene_urdf
 from dynsim.system.files import replacing
 
@@ -195,10 +196,17 @@ def _forces(record: Record, bag: _Bag, stamps: list[int]) -> list[tuple[int, str
     kind, vector = "geometry_msgs/msg/WrenchStamped", "geometry_msgs/msg/Vector3"
     nothing = bag.make(vector, x=0.0, y=0.0, z=0.0)
     messages = []
+    scene = record.scene
+    points = () if scene is None else scene.contacts
+    carriers = {point.name: scene.bodies[point.carrier].name for point in points if scene and point.carrier != WORLD}
     for label, forces in zip(record.labels["contact_force"], record["contact_force"].swapaxes(0, 1), strict=True):
-        topic = f"/contacts/{re.sub(r'[^A-Za-z0-9_]', '_', label)}"
-        for stamp, (x, y, z) in zip(stamps, forces.tolist(), strict=True):
-            wrench = bag.make("geometry_msgs/msg/Wrench", force=bag.make(vector, x=x, y=y, z=z), torque=nothing)
-            message = bag.make(kind, header=bag.header(stamp, f"contact_{label}"), wrench=wrench)
-            messages.append((stamp, topic, kind, message))
+        wrenches = {label: forces}
+        if label in carriers:
+            wrenches[f"{label}_on_{carriers[label]}"] = -forces
+        for name, values in wrenches.items():
+            topic = f"/contacts/{re.sub(r'[^A-Za-z0-9_]', '_', name)}"
+            for stamp, (x, y, z) in zip(stamps, values.tolist(), strict=True):
+                wrench = bag.make("geometry_msgs/msg/Wrench", force=bag.make(vector, x=x, y=y, z=z), torque=nothing)
+                message = bag.make(kind, header=bag.header(stamp, f"contact_{label}"), wrench=wrench)
+                messages.append((stamp, topic, kind, message))
     return messages

@@ -422,7 +422,8 @@ def contacts(scenario: Scenario, described: Robot | None = None) -> list[Contact
         law = _law(options, ContactPoint(body=""))
         # Objects touch surfaces with their solids, not with their origins.
         beside = {link.name for name, body in scenario.config.objects.items() for link in body.links(name)}
-        own = (entry for entry in candidates(options.candidates, described, known, result) if entry.body not in beside)
+        fixed = {name: surface for name, surface in known.items() if surface.carrier is None}
+        own = (entry for entry in candidates(options.candidates, described, fixed, result) if entry.body not in beside)
         result += [replace(contact, **law) for contact in own]
     error = scenario.config.surface_error
     return result if error is None else [_scaled_friction(contact, error.friction_factor) for contact in result]
@@ -571,7 +572,7 @@ def check_start(
             off.append((contact, declared, keys, gap))
     if off:
         contact, declared, keys, gap = off[0]
-        if contact.surface_name == contact.surface.carrier:
+        if contact.is_between_bodies:
             raise _overlap(scenario, contact, gap)
         position = model.point_position(contact.body, contact.point, q)
         remedy = "start from another posture, change the surface"
@@ -608,7 +609,7 @@ def _overlap(scenario: Scenario, contact: Contact, gap: float) -> ModelError:
 def _keys_of(scenario: Scenario, contact: Contact) -> tuple[bool, tuple[str, ...]]:
     """Return whether the contact is a declared contact point, and the keys that define it."""
     declared = contact.name in scenario.config.contacts.points
-    if contact.surface_name == contact.surface.carrier:
+    if contact.is_between_bodies:
         return declared, ("contacts", "between")
     return declared, ("contacts", "points", contact.name) if declared else ("contacts", "candidates")
 

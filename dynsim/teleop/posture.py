@@ -15,7 +15,7 @@ from dynsim.compile.model import Model
 from dynsim.compile.posture import HAND, Rest, holding_torques, load_forces, load_torques, on_surfaces, static_margin
 from dynsim.compile.protocols import BuildContext
 from dynsim.compile.scene import drawn_surface, snake_scene
-from dynsim.compile.touching import gap_at
+from dynsim.compile.touching import gap_at, touch
 from dynsim.engine import check, named
 from dynsim.engine.recording import drawn_scene, pictured_parts, provenance
 from dynsim.errors import DynsimError, ModelError, ScenarioError
@@ -332,9 +332,14 @@ class ArmPosture(StartPosture):
         super()._apply(q, scenario)
 
     def _is_own(self, scenario: Scenario, contact: Contact) -> bool:
-        """Return whether a contact is on the robot, and not on an object; raise ModelError for an unknown body."""
+        """Return whether a contact point is on the robot, and its surface not on an object.
+
+        Raises ModelError for an unknown body. Contacts between bodies are not points that the user can move.
+        """
         build.check_body(scenario, self._whole, contact)
-        return self._whole.attach(contact.body, contact.point)[0] < len(self.robot.links)
+        ends = [contact.body] if contact.surface.carrier is None else [contact.body, contact.surface.carrier]
+        indices = [self._whole.attach(end, contact.point)[0] for end in ends]
+        return not contact.is_between_bodies and max(indices) < len(self.robot.links)
 
     def _all_sliders(self) -> list[Slider]:
         sliders: list[Slider] = []
@@ -580,7 +585,7 @@ class ArmPosture(StartPosture):
                     "friction": contact.friction_at_rest,
                     "gap": round(gaps[name], 9),
                     "at": np.round(at, 6).tolist(),
-                    "normal": np.round(contact.surface.normal(at), 5).tolist(),
+                    "normal": np.round(touch(self.model, contact, self.q).normal, 5).tolist(),
                     "force": None if force is None else round(force, 4),
                     "enabled": name not in self._disabled,
                     "snaps": contact.tip is None and not contact.left_out,

@@ -164,3 +164,46 @@ def test_snake_pull() -> None:
     strong = {"loads.shove.force_N": [[0, 0, 0], [0, 15, 0], [0, 15, 0], [0, 0, 0]]}
     with pytest.raises(SimulationStopped, match="overturned"):
         dynsim.simulate(dynsim.load_scenario("snake_pull", "shoved", strong))
+
+
+def test_push_box() -> None:
+    """The table turns μ m g times the distance into heat; after the shove the box slides on by v²/(2 μ g)."""
+    weight, moved = 2.0 * 9.81, {"pushes": 0.130, "shoves": 0.191}
+    for variant, distance in moved.items():
+        record = run("push_box", variant)
+        x = column(record, "q", "box.x")
+        assert x[-1] - x[0] == pytest.approx(distance, **ROUNDED)
+        assert record.summary["friction_heat_J"] == pytest.approx(0.3 * weight * (x[-1] - x[0]), rel=1e-5)
+    # From rest to rest, hand and friction have the same impulse.
+    pushes = run("push_box", "pushes")
+    times = {event.kind: event.time for event in pushes.events if event.name == "box1.table"}
+    start, end = times["slip_start"], times["slip_stop"]
+    impulse = np.diff(np.interp([start - 0.01, end], pushes.time, column(pushes, "contact_impulse", "link_3-box")))
+    assert impulse == pytest.approx([0.3 * weight * (end - start)], rel=2e-3)
+    shoves = run("push_box", "shoves")
+    leaves = next(event.time for event in shoves.events if (event.kind, event.name) == ("lift_off", "link_3-box"))
+    at, speed = (np.interp(leaves, shoves.time, column(shoves, kind, "box.x")) for kind in ("q", "v"))
+    alone = column(shoves, "q", "box.x")[-1] - at
+    assert alone == pytest.approx(speed**2 / (2.0 * 0.3 * 9.81), rel=0.01)
+    assert alone == pytest.approx(0.107, **ROUNDED)
+
+
+def test_brace_on_itself() -> None:
+    energies = {"braced": 128.0, "all_links": 128.0, "free": 213.0}
+    assert {each: energy("brace_on_itself", each) for each in energies} == pytest.approx(energies, **ROUNDED)
+    (elbow,) = run("brace_on_itself", "braced").summary["contacts"]
+    links = run("brace_on_itself", "all_links").summary["contacts"]
+    assert elbow["normal_force_mean_N"] == pytest.approx(4.8, **ROUNDED)
+    assert sum(contact["normal_force_mean_N"] for contact in links) == pytest.approx(4.8, **ROUNDED)
+    assert [contact["name"] for contact in links if contact["closed_fraction"]] == ["link_2-link_4", "link_2-link_5"]
+
+
+def test_box_on_brace() -> None:
+    elbows = {
+        each: next(c for c in run("box_on_brace", each).summary["contacts"] if c["name"] == "elbow")
+        for each in ("light", "heavy", "too_heavy")
+    }
+    assert [elbow["lift_offs"] for elbow in elbows.values()] == [0, 0, 1]
+    assert [1e3 * elbows[each]["slip_distance_m"] for each in ("light", "heavy")] == pytest.approx([1.0, 3.0], rel=0.1)
+    assert [energy("box_on_brace", each) for each in elbows] == pytest.approx([105.0, 1100.0, 4400.0], **ROUNDED)
+    assert column(run("box_on_brace", "too_heavy"), "q", "box.z")[-1] == pytest.approx(0.015, abs=1e-4)

@@ -241,6 +241,8 @@ def test_steps_that_are_too_long_are_told():
     check_message(scheme, "0.05 J", "5 %", "integrator.step_s", "0.0002")
     check_message(blurred, "0.04 J", "4 %", "integrator.step_s", "0.0005")
     check_message(depth, "3 mm", "integrator.step_s", "0.0003")
+    contacts = [{"name": "box-link_3", "penetration_max_m": 3e-3}, {"name": "tip", "penetration_max_m": 1e-3}]
+    check_message(coarse(stepping, 1.0, contacts)[2], "3 mm", "box-link_3")
     stepping |= {
         "scheme_loss_worst_J": 0.5 * SCHEME_LIMIT,
         "half_step_energy_J": 0.5 * HALF_STEP_LIMIT,

@@ -30,6 +30,11 @@ USES: list[dict[str, Any]] = [
     {"contacts.slip_smoothing_m_s": 0.002},
     {"contacts.restitution": 0.2},
     {"contacts.candidates": "joints"},
+    {
+        "contacts.between": [{"bodies": ["link_1", "block"]}],
+        "objects": {"block": BLOCK},
+        "plant.chain.0.radius_m": 0.02,
+    },
     {"contacts.points.tip.grip": {"axis": [1, 0, 0], "ratio": 0.5}},
     {"contacts.stiffness_N_per_m": 1e4},
     {"ties": {"spring": TIE}, "objects": {"block": BLOCK}},

@@ -48,6 +48,8 @@ NAMED = 4
 MAX_LETTERS = 16
 # Height of a legend entry [pixel]; entries that do not fit are omitted.
 LEGEND_ROW = 14
+# Relative range of a signal below which it counts as constant.
+CONSTANT = 1e-6
 
 
 class Strip:
@@ -116,6 +118,7 @@ class Strip:
         axes.set_title(title, fontsize=7.5, loc="left", pad=3)
         axes.set_xlabel("time [s]", fontsize=7, labelpad=0)
         axes.tick_params(labelsize=7)
+        axes.ticklabel_format(axis="y", useOffset=False)
         start = min(float(record.time[0]) for record in records.values())
         end = max(float(record.time[-1]) for record in records.values())
         axes.set_xlim(start, end if end > start else start + 1.0)
@@ -156,7 +159,10 @@ def chosen(records: Mapping[str, Record], signal: str | None) -> str | None:
 
 
 def _limits(values: list[style.Array]) -> tuple[float, float]:
-    """Return the range of the axis; a spike that would compress the rest of the curve is cut off."""
+    """Return the range of the axis; a spike that would compress the rest of the curve is cut off.
+
+    A constant signal has a range around it that hides its rounding errors.
+    """
     pooled = np.concatenate([array.ravel() for array in values])
     pooled = pooled[np.isfinite(pooled)]
     if not len(pooled):
@@ -165,7 +171,8 @@ def _limits(values: list[style.Array]) -> tuple[float, float]:
     a, b = np.percentile(pooled, (1.0, 99.0)).tolist()
     if b > a and high - low > 4.0 * (b - a):
         low, high = max(low, a - 0.6 * (b - a)), min(high, b + 0.6 * (b - a))
-    room = 0.06 * (high - low) or max(0.05 * abs(high), 1e-9)
+    constant = max(abs(low), abs(high))
+    room = 0.06 * (high - low) if high - low > CONSTANT * constant else max(0.05 * constant, 1e-9)
     return low - room, high + room
 
 

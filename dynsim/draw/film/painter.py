@@ -200,6 +200,8 @@ BEHIND = 1e6
 SMALL_HEIGHT = 200
 # Number of contact points whose forces are written (the largest by rms); all have arrows.
 LABELLED = 5
+# Forces below this fraction of the largest force are rounding errors.
+ROUNDING = 1e-9
 # Maximum number of points of a path.
 PATH_POINTS = 600
 
@@ -286,8 +288,10 @@ class Painter:
         self._contacts = contacts(robot)
         self._sunk = penetrations(record, robot.scene)
         self._full = largest_force(self._contacts)
-        forces = np.stack([np.zeros(len(record)), *(contact.force for contact in self._contacts)], axis=1)
-        self._labelled = {k - 1 for k in largest(forces, LABELLED)}
+        # A reaction has the same force as its action, which is labelled.
+        own = [k for k, contact in enumerate(self._contacts) if contact.point.body != contact.point.carrier]
+        forces = np.stack([np.zeros(len(record)), *(self._contacts[k].force for k in own)], axis=1)
+        self._labelled = {own[k - 1] for k in largest(forces, LABELLED) if k}
         self._paths = dict(paths(record, robot.scene))
         self._supports = supports(robot.scene, self._wheels)
         self._pressure = cop_of(record)
@@ -511,7 +515,7 @@ class Painter:
         x, y, _ = self.camera.project(at)
         colour = PULLING if force < 0.0 else BLUE
         dot = colour if mode is None else MODES.get(mode, GREY)
-        if np.isfinite(force) and force != 0.0 and mode != 0:
+        if np.isfinite(force) and abs(force) > ROUNDING * self._full and mode != 0:
             normal = force * contact.normal[row]
             friction = None if contact.tangent is None else _between(contact.tangent, row, share)
             if friction is not None and np.linalg.norm(friction) > MIN_FRICTION_SHARE * self._full:

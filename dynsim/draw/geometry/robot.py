@@ -305,9 +305,14 @@ def contacts(robot: DrawnRobot, rows: NDArray[np.intp] | slice = slice(None)) ->
         shaped = carried or (TOUCHING in record and point.name in record.labels[TOUCHING])
         result.append(DrawnContact(point, normal, force, tangent, mode, at if shaped else None))
         if carried:  # the reaction on the other body
-            other = replace(point, name=f"{point.name} on {scene.bodies[point.carrier].name}", body=point.carrier)
+            other = replace(point, name=reaction_name(scene, point), body=point.carrier)
             result.append(DrawnContact(other, -normal, force, None if tangent is None else -tangent, mode, at))
     return result
+
+
+def reaction_name(scene: Scene, point: Point) -> str:
+    """Return the name of the opposite force of a contact, on the body that carries the surface."""
+    return f"{point.name} on {scene.bodies[point.carrier].name}"
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from dynsim.draw.geometry.robot import reaction_name
 from dynsim.draw.page import page
 from dynsim.errors import DynsimError, SimulationStopped
 from dynsim.record import Record
-from dynsim.record.quaternion import rotated
 from dynsim.record.scene import WORLD
 from dynsim.snake.description import NO_REQUEST
 from dynsim.system import interruption
@@ -261,25 +261,28 @@ class LiveDrive:
         }
 
     def _contacts(self, frame: LiveFrame) -> dict[str, Any]:
-        """Return the contact forces for the page: normal force, normal vector, tangential force and contact mode."""
+        """Return the contact forces for the page: normal force, normal vector, tangential force and contact mode.
+
+        If a body carries the surface, there is also the force on this body, and the place of both.
+        """
         scene, forces = self.session.still.scene, dict[str, Any]()
         if scene is None:
             return forces
         for point in scene.contacts:
-            touch, surface = frame.touching.get(point.name), scene.surface(point.surface)
-            if touch is None or surface is None:
+            touch = frame.touching.get(point.name)
+            if touch is None:
                 continue
-            at = np.array(point.position)
-            if point.body != WORLD:
-                pose = frame.poses[point.body]
-                at = pose[:3] + rotated(pose[3:], at)
-            normal = surface.normal(at)
-            forces[point.name] = {
-                "force": round(touch.force, 3),
-                "normal": np.round(normal, 5).tolist(),
-                "tangent": np.round(touch.vector - touch.force * normal, 3).tolist(),
-                "mode": touch.mode,
-            }
+            signs = {point.name: 1.0}
+            if point.carrier != WORLD:
+                signs[reaction_name(scene, point)] = -1.0
+            for name, sign in signs.items():
+                forces[name] = {
+                    "force": round(touch.force, 3),
+                    "normal": np.round(sign * touch.normal, 5).tolist(),
+                    "tangent": np.round(sign * (touch.vector - touch.force * touch.normal), 3).tolist(),
+                    "mode": touch.mode,
+                    **({} if point.carrier == WORLD else {"at": np.round(touch.position, 5).tolist()}),
+                }
         return forces
 
     def _page(self, socket: str) -> str:

@@ -33,6 +33,16 @@ contacts:
       point_m: [0, 0, 0.3]
       surface: floor
 """
+TOUCHING = """\
+duration_s: 0.05
+plant: {type: serial_arm, chain: [{axis: y, count: 3, length_m: 0.2, radius_m: 0.02}, {axis: y, length_m: 0.1}]}
+objects:
+  box: {mass_kg: 1, size_m: [0.1, 0.1, 0.1], position_m: [0.5, 0, 0.1]}
+  crate: {mass_kg: 1, size_m: [0.1, 0.1, 0.1], position_m: [0.5, 0, 0.3]}
+contacts: {law: unilateral, between: [{bodies: [links, box]}]}
+integrator: {method: time_stepping}
+metrics: {settle_s: 0.01}
+"""
 CHECK = 'dynsim.check(dynsim.load_scenario("arm.yaml"))'
 THING = "{type: plane, point_m: [0, 0, -5]}"
 HEIGHTS = "0,0,0\n0,0,0\n0,0,0\n"
@@ -178,6 +188,36 @@ TABLES = [
                 "{axis: y, count: 3, length_m: 0.2, initial_deg: 30, motor: {type: wang_minami, voltage_limit_V: 1}}",
                 "integrator: {method: auto}",
                 "initial: {equilibrium: true}",
+            ),
+        ],
+    ),
+    Edits(
+        CHECK,
+        {"arm.yaml": TOUCHING},
+        [
+            ("pair with a body that does not exist", "[links, box]", "[links, bocks]"),
+            ("pair of one body", "[links, box]", "[box]"),
+            ("ignored pair of one body", "{bodies: [links, box]}", "{bodies: [links, box], ignore: [[link_1]]}"),
+            ("bodies that overlap at the start", "[0.5, 0, 0.1]", "[0.05, 0, 0.1]"),
+            (
+                "links that overlap at the start",
+                "[links, box]",
+                "[links, links]",
+                "count: 3,",
+                "count: 3, initial_deg: 170,",
+            ),
+            (
+                "bodies that touch under the bilateral law",
+                "law: unilateral",
+                "law: bilateral",
+                "time_stepping",
+                "dopri5",
+            ),
+            ("too many contacts for events", "[links, box]", "[crate, box]", "time_stepping", "dopri5"),
+            (
+                "surface on a body that does not exist",
+                "contacts:",
+                "surfaces: {top: {type: plane, on: link_9}}\ncontacts:",
             ),
         ],
     ),
