@@ -7,6 +7,7 @@ import dataclasses
 import itertools
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from support.messages import lines_with, mentions, raises, says
 
 import dynsim
 from dynsim.draw import figures
-from dynsim.draw.figures import arm, contacts, energy, posture, style
+from dynsim.draw.figures import arm, contacts, energy, overlap, posture, style
 from dynsim.draw.geometry import robot
 from dynsim.engine import recording as metrics
 from dynsim.errors import RecordError
@@ -277,7 +278,7 @@ def test_every_variant_has_its_colour_everywhere(braced: Record, free: Record) -
     for figure in (energy.error_comparison(records), energy.energy_comparison(records)):
         colours = [line.get_color() for line in drawn(figure).axes[0].get_lines()[:2]]
         assert colours == [styles[name]["color"] for name in records]
-    assert style.PULLING not in style.VARIANT_COLOURS
+    assert not {style.PULLING, style.BLACK} & {*style.VARIANT_COLOURS}
 
 
 def test_many_motors_are_an_envelope_and_the_largest(braced: Record) -> None:
@@ -546,12 +547,53 @@ def test_friction_of_joints_has_names_apart_from_contacts(real: Record) -> None:
 
 def test_comparisons_name_curves_that_coincide_and_mark_no_events(real: Record, braced: Record) -> None:
     records = {"glued": braced, "real": real, "same": real}
-    draws = (energy.error_comparison, energy.energy_comparison, energy.path_comparison, contacts.forces_comparison)
-    for draw in draws:
-        figure = drawn(draw(records))
+    for name in ("compare_tracking_error", "compare_energy", "compare_hand_path", "compare_contact_forces"):
+        figure = dynsim.figure(records, name)
         assert not any(map(event_lines, figure.axes))
         assert mentions(figure.caption, "real and same")
-        assert not mentions(drawn(draw({"glued": braced, "moved": shifted(real)})).caption, "coincide")
+        assert not mentions(dynsim.figure({"glued": braced, "moved": shifted(real)}, name).caption, "coincide")
+
+
+TIME = np.linspace(0.0, 10.0, 400)
+WAVE = np.sin(TIME)
+
+
+@pytest.mark.parametrize(
+    ("other", "note"),
+    [
+        (WAVE + 1e-3, "Curves that coincide: a2 and b."),
+        (WAVE + 0.3 * (np.abs(TIME - 5.0) < 0.5), "Curves that nearly coincide: a2 and b except 4.5–5.5 s."),
+        (WAVE + 0.3 * (TIME < 3.0), ""),
+        (WAVE + 0.3, ""),
+    ],
+)
+def test_notes_measure_the_distance_of_curves_in_the_picture(other: Any, note: str) -> None:
+    figure = style.new_figure(2.0, "")
+    axes = figure.subplots()
+    for name, values in {"a2": WAVE, "b": other, "c": 2.0 + WAVE}.items():
+        axes.plot(TIME, values, label=f"{name}: 3 mm", linewidth=1.0)
+    axes.set(xlabel="time [s]", ylabel="error [mm]", xlim=(0.0, 10.0), ylim=(-1.2, 3.2))
+    list(style.with_panels([("", figure)]))
+    assert figure.notes == note
+    lower, upper, apart = (line.get_linewidth() for line in axes.get_lines())
+    assert (lower > 1.0) == bool(note)
+    assert upper == apart == 1.0
+
+
+def test_curves_that_fill_an_area_are_below_the_others() -> None:
+    figure = style.new_figure(2.0, "")
+    axes = figure.subplots()
+    axes.plot(TIME, WAVE, label="smooth")
+    axes.plot(TIME, WAVE * (-1.0) ** np.arange(400), label="vibrates")
+    axes.set_ylabel("error [mm]")
+    list(style.with_panels([("", figure)]))
+    smooth, vibrates = axes.get_lines()
+    assert smooth.get_zorder() > vibrates.get_zorder()
+
+
+def test_notes_shorten_numbered_names() -> None:
+    names = ["wheel1L", "wheel2L", "wheel3L", "joint_1", "joint_2", "tip"]
+    assert overlap.listed(names) == "wheel1L–wheel3L, joint_1, joint_2 and tip"
 
 
 def shifted(record: Record) -> Record:

@@ -187,7 +187,7 @@ def figure(
         drawn: Figure | None = makers[name](records)
         if drawn is None:
             raise RecordError(f"the record has no data for the figure {name!r}")
-        shared.with_panels([(name, drawn)])
+        list(shared.with_panels([(name, drawn)]))
         shared.literal(drawn)
         if wanted.height is not None:
             drawn.draw_without_rendering()  # raises if the height leaves no space for the axes

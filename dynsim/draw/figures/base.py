@@ -51,7 +51,7 @@ def overturning(record: Record) -> Figure | None:
         _lines(axes, record, LOADS, "min {} N", np.nanmin)
         style.shade_below_zero(axes, "wheel pulls on the ground")
     for axes in rows[1]:
-        style.line(axes, record.time, margin, color=style.BLACK, label=_margin_label("margin", record))
+        style.line(axes, record.time, margin, color=style.BLUE, label=_margin_label("margin", record))
         _frame_margin(axes)
     for axes in rows[2]:
         _lines(axes, record, TRACTION, "max {}", np.nanmax)
@@ -89,7 +89,6 @@ def margin_comparison(records: Mapping[str, Record]) -> Figure | None:
             style.line(axes, record.time, record[MARGIN], label=_margin_label(name, record), **styles[name])
         _frame_margin(axes)
     style.label_row(panels, "tip margin")
-    style.note_coinciding(figure, [(panels[-1], dict(zip(shown, series, strict=True)))])
     style.legend_below(figure, panels[-1:], 1)
     figure.note(_MINIMUM.format(max(record.settle_time for record in some)))
     return figure
@@ -117,12 +116,12 @@ def tracking(record: Record) -> Figure | None:
         # One of the lines is dashed, because x and y may coincide.
         x = _pair(target[:, 0], pose[:, 0], "x", style.AXIS_COLOURS["x"], "-")
         curves["position [m]"] = x + _pair(target[:, 1], pose[:, 1], "y", style.AXIS_COLOURS["y"], (0, (5, 4)))
-        curves["heading [°]"] = _pair(heading[:, 0], heading[:, 1], "heading", style.BLACK, "-")
+        curves["heading [°]"] = _pair(heading[:, 0], heading[:, 1], "heading", style.PURPLE, "-")
     curves["error [mm]"] = [
         (away[:, 0], {"color": style.BLUE, "label": f"ahead: rms {rms[0]} mm"}),
         (away[:, 1], {"color": style.GREEN, "linestyle": style.DASHES[1], "label": f"to the left: rms {rms[1]} mm"}),
     ]
-    curves["heading error [°]"] = [(turned, {"color": style.BLACK, "label": f"rms {rms[2]}°"})]
+    curves["heading error [°]"] = [(turned, {"color": style.PURPLE, "label": f"rms {rms[2]}°"})]
     subject = "stationary base: actual − reference" if is_stationary else "base, reference and actual"
     figure = style.new_figure(0.6 + 1.5 * len(curves), style.title(record, subject))
     series = [[(record.time, values) for values, _ in drawn] for drawn in curves.values()]

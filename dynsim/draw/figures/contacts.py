@@ -144,10 +144,7 @@ def _forces(records: Mapping[str, Record], title: str) -> Figure | None:
         style.legend_below(figure, [panels[-1] for panels in rows], 5)
     bands = {str(bar.get_label())[1:]: bar for panels in rows for bar in panels[-1].collections}
     figure.put_below({text: bands[text] for text in BANDS if text in bands}, 4)
-    if not alone:
-        curves = [{v: (r.time, _force(r, name)) for v, r in having[name].items()} for name in chosen]
-        style.note_coinciding(figure, [(panels[-1], row) for panels, row in zip(rows, curves, strict=True)])
-    else:
+    if alone:
         explain(figure, marked(runs[0], chosen), runs[0])
     return figure
 

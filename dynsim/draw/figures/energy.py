@@ -110,9 +110,6 @@ def energy_comparison(records: Mapping[str, Record]) -> Figure | None:
     work.set_xlabel("time [s]")
     _totals(total, list(shown), finals, [str(styles[name]["color"]) for name in shown], logarithmic)
     style.legend_below(figure, [over_time], 5)
-    signals = ((over_time, "energy_electrical"), (work, "work_mechanical"))
-    curves = [(axes, {name: (r.time, r[signal]) for name, r in shown.items()}) for axes, signal in signals]
-    style.note_coinciding(figure, curves)
     if logarithmic:
         figure.note("Fractions: relative to the largest energy.")
     return figure
@@ -504,7 +501,6 @@ def _paths(records: Mapping[str, Record], title: str) -> Figure | None:
         style.legend_below(figure, panels[:1], 4)
     if note:
         figure.note(note)
-    style.note_coinciding(figure, [(panels[0], {name: (r.time, r["hand_position"]) for name, r in shown.items()})])
     return figure
 
 
@@ -523,7 +519,7 @@ def error(record: Record) -> Figure | None:
         for k, name in enumerate("xyz"):
             style.line(axes, record.time, deviation[:, k], label=f"${name}$", **looks[name])
     for axes in rows[1]:
-        style.line(axes, record.time, norm, label=_error_label("distance", record), color=style.BLACK)
+        style.line(axes, record.time, norm, label=_error_label("distance", record), color=style.PURPLE)
         axes.set_ylim(bottom=0.0)
     style.label_row(rows[0], f"hand − {target_name(record)}\n[mm]")
     style.label_row(rows[1], f"distance from\n{target_name(record)} [mm]")
@@ -558,8 +554,6 @@ def error_comparison(records: Mapping[str, Record]) -> Figure | None:
     _scale_distances(figure, rows[0], [norms[name][record.time >= settle] for name, record in shown.items()])
     style.label_row(rows[0], "distance from\ntarget [mm]")
     style.label_row(rows[1], "vertical\nerror [mm]")
-    curves = [dict(zip(shown, row, strict=True)) for row in series]
-    style.note_coinciding(figure, [(panels[-1], row) for panels, row in zip(rows, curves, strict=True)])
     style.legend_below(figure, [rows[0][-1], rows[1][-1]], 5)
     return figure
 

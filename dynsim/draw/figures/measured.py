@@ -131,7 +131,7 @@ def servos(record: Record) -> Figure | None:
 
 def _cycles(axes: Axes, record: Record) -> None:
     """Draw the lateness of the cycles, and mark cycles in which a servo did not answer."""
-    style.line(axes, record.time, MILLI * record["lateness"], color=style.BLACK, lw=0.9, label="cycle late by")
+    style.line(axes, record.time, MILLI * record["lateness"], color=style.BLUE, lw=0.9, label="cycle late by")
     if "exchange" in record:
         style.line(axes, record.time, MILLI * record["exchange"], color=style.SKY, lw=0.9, label="exchange on the bus")
     axes.set_ylabel("duration\n[ms]")

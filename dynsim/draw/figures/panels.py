@@ -23,7 +23,7 @@ def named(figure: Figure) -> dict[str, list[Axes]]:
     panels: dict[str, list[Axes]] = {}
     row: dict[int, str] = {}
     for axes in figure.axes:
-        first = _cell(axes).rowspan.start
+        first = row_of(axes)
         if name := _name(axes) or (row.get(first, "") if axes.axison else ""):
             panels.setdefault(name, []).append(axes)
             row[first] = name
@@ -90,6 +90,11 @@ def regrid(figure: Figure, kept: Sequence[Axes]) -> None:
         for group in aligned._align_label_groups.values():
             group.remove(axes)  # matplotlib would use the removed axes when it aligns labels
         axes.remove()
+
+
+def row_of(axes: Axes) -> int:
+    """Return the first row of axes in the grid of its figure."""
+    return _cell(axes).rowspan.start
 
 
 def _cell(axes: Axes) -> SubplotSpec:

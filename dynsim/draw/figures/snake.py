@@ -7,7 +7,6 @@ variables and their targets; joint angles and limits; and cost, smallest singula
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 
 from dynsim.draw import film
 from dynsim.draw.figures import snake_tasks, style, tanaka2019
+from dynsim.draw.figures.overlap import listed
 from dynsim.draw.figures.snake_view import (
     BODY,
     COORDINATE_NAMES,
@@ -25,9 +25,9 @@ from dynsim.draw.figures.snake_view import (
     GROUND,
     HEAD,
     NUMBERED,
+    STILL,
     View,
     above_edge,
-    curve_styles,
     error_axis,
     greek,
     interval_starts,
@@ -100,18 +100,13 @@ def comparison(records: Mapping[str, Record]) -> Figure:
         for name, record in records.items()
     }
     if len(records) <= len(style.DASHES):
-        looks = curve_styles(list(records))
-        # Earlier curves are wider, so that equal curves remain visible.
-        for k, look in enumerate(looks.values()):
-            look["linewidth"] = 1.0 + 0.35 * (len(looks) - 1 - k)
+        looks = style.variant_styles(list(records))
         overlay_margins(axes[:3], records, looks)
         for name, record in records.items():
             axes[3].plot(record.time, errors[name], **looks[name])
         axes[-1].set_xlabel("time [s]")
         axes[-1].set_xlim(0.0, max(record.time[-1] for record in records.values()) or None)
         style.legend_below(figure, axes[:1], 6)
-        same = [" and ".join(pair) for pair in combinations(curves, 2) if _coincide(*(curves[name] for name in pair))]
-        figure.note(*([f"Curves that coincide: {', '.join(same)}."] if same else []))
     else:
         _bars(figure, axes, curves)
         margin_axes(axes[:3])
@@ -124,17 +119,11 @@ def comparison(records: Mapping[str, Record]) -> Figure:
     return figure
 
 
-def _coincide(first: Sequence[NDArray[np.float64]], second: Sequence[NDArray[np.float64]]) -> bool:
-    """Return whether all curves of two runs differ by less than a hundredth of their range."""
-    pairs = list(zip(first, second, strict=True))
-    return all(len(a) == len(b) and np.abs(a - b).max() <= 0.01 * max(np.ptp(a), np.ptp(b)) for a, b in pairs)
-
-
 def _bars(figure: style.Drawing, axes: Sequence[Axes], curves: Mapping[str, Sequence[NDArray[np.float64]]]) -> None:
     """Draw the range of each quantity of each variant; variants with the same stem are next to each other."""
     parts = style.families(list(curves))
     stems, endings = (list(dict.fromkeys(part)) for part in zip(*parts.values(), strict=True))
-    looks, entries = curve_styles(endings), {}
+    looks, entries = style.variant_styles(endings), {}
     for name, (stem, ending) in parts.items():
         k, colour = endings.index(ending), looks[ending]["color"]
         x = stems.index(stem) + 0.8 * ((k + 0.5) / len(endings) - 0.5)
@@ -210,7 +199,10 @@ def tracking(record: Record) -> Figure:
 
 
 def joints(record: Record) -> Figure:
-    """Draw the joint angles of the head and base part with their limits; dots mark joints excluded from allocation."""
+    """Draw the joint angles of the head and base part with their limits; dots mark joints excluded from allocation.
+
+    Constant angles are in a note.
+    """
     geometry = snake_geometry(record)
     n_h, pitch, upper, lower = geometry.head_joints, geometry.pitch, geometry.upper, geometry.lower
     phi, labels = DEGREES * record["phi"], record.labels["phi"]
@@ -219,11 +211,12 @@ def joints(record: Record) -> Figure:
         ("pitch of the head", np.flatnonzero(pitch[:n_h])),
         ("yaw of the base", np.arange(n_h, len(labels))),
     ]
-    parts = [(title, group) for title, group in parts if len(group)]
+    moves = (np.ptp(phi, axis=0) > STILL[1]) | record["at_limit"].any(axis=0)
+    parts = [(title, shown) for title, group in parts if len(shown := group[moves[group] | ~moves.any()])]
     figure = style.new_figure(2.0 * len(parts) + 0.4, style.title(record, "joint angles and limits"))
     axes = figure.subplots(len(parts), 1, sharex=True, squeeze=False)[:, 0]
     for axis, (title, group) in zip(axes, parts, strict=True):
-        looks = curve_styles(group.tolist())
+        looks = style.variant_styles(group.tolist())
         for j in group.tolist():
             axis.plot(record.time, phi[:, j], label=greek(labels[j]), **looks[j])
             out = record["at_limit"][:, j] > 0
@@ -234,6 +227,13 @@ def joints(record: Record) -> Figure:
         style.legend_beside(axis, 3)
     axes[-1].set_xlabel("time [s]")
     axes[-1].set_xlim(record.time[0], record.time[-1] or None)
+    if moves.any() and not moves.all():
+        still: dict[str, list[str]] = {}
+        for k in np.flatnonzero(~moves):
+            still.setdefault(style.number(round(phi[0, k], 1) + 0.0, 3), []).append(greek(labels[k]))
+        figure.note(
+            f"Constant, not drawn: {'; '.join(f'{listed(names)} at {angle}°' for angle, names in still.items())}."
+        )
     if record["at_limit"].any():
         figure.note("Dots: the joint is excluded from allocation because it is at its limit.")
     return figure

@@ -17,7 +17,6 @@ from dynsim.draw.figures.snake_view import (
     LIMIT,
     TARGET,
     above_edge,
-    curve_styles,
     greek,
     interval_starts,
     object_bodies,
@@ -91,7 +90,7 @@ def servos(record: Record) -> Figure:
     starts, far = interval_starts(len(record)), list[str]()
     for axis, ((stall, nominal, friction), motors) in zip(axes, kinds.items(), strict=True):
         order = sorted(motors, key=lambda motor: -motor["torque_rms_N_m"])
-        looks = curve_styles([motor["joint"] for motor in order[:LOADED]])
+        looks = style.variant_styles([motor["joint"] for motor in order[:LOADED]])
         columns = [record.labels["torque"].index(motor["joint"]) for motor in order]
         torques = record["torque"][:, columns]
         time, low, high = record.time[starts], *(_each(f, torques, starts) for f in (np.minimum, np.maximum))
@@ -219,7 +218,7 @@ def wheels(record: Record) -> Figure:
     slip = 1e3 * np.linalg.norm(record["contact_slip_velocity"], axis=2)
     loads = record["contact_normal_force"]
     # Pairs that are in the air during the whole run have no curves.
-    looks = curve_styles([pair for pair, columns in pairs.items() if loads[:, columns].any()])
+    looks = style.variant_styles([pair for pair, columns in pairs.items() if loads[:, columns].any()])
     for k, (pair, columns) in enumerate(pairs.items()):
         touching = loads[:, columns] > 0.0
         bare = grounded[:, k] & ~touching.all(axis=1)
@@ -277,7 +276,7 @@ def gripper(record: Record) -> Figure:
         bounds = (None, None) if grip is None else (grip.force, grip.torque)
         parts = (("force [N]", "N", bounds[0], ""), ("torque [N m]", "N m", bounds[1], "about "))
         for axis, values, (label, unit, bound, about) in zip(axes[1:], np.split(forces, 2, axis=1), parts, strict=True):
-            for (name, look), column in zip(curve_styles("xyz").items(), values.T, strict=True):
+            for (name, look), column in zip(style.variant_styles("xyz").items(), values.T, strict=True):
                 axis.plot(record.time, column, label=f"{about}{name}", **look)
             style.at_least(axis, 1e-3)
             if bound is not None and bound <= NEAR * np.abs(values).max():
@@ -390,7 +389,7 @@ def _height(axis: Axes, record: Record, name: str, body: int) -> None:
     axis.plot(record.time, 1e3 * record["w_target"][:, 2], "--", color=TARGET, lw=1.0, label="target of the snake")
     axis.plot(record.time, 1e3 * record["w"][:, 2], color=style.BLUE, lw=1.0, label="controlled point")
     rise = style.number(round(float(height[-1] - height[0]), 1) + 0.0)
-    axis.plot(record.time, height, color="black", lw=1.2, label=f"{name}: rises by {rise} mm")
+    axis.plot(record.time, height, color=style.ORANGE, lw=1.2, label=f"{name}: rises by {rise} mm")
     axis.set_ylabel("height [mm]")
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from dynsim.draw.figures import style
 from dynsim.draw.figures.posture import add_outlines, draw_cuts
-from dynsim.draw.figures.style import Array, T
+from dynsim.draw.figures.style import Array
 from dynsim.draw.geometry.projection import ABOVE, UP, Projection
 from dynsim.draw.geometry.shapes import corners_of, wheel_groups
 from dynsim.errors import RecordError
@@ -134,7 +134,10 @@ Box = tuple[float, float, float, float]
 
 
 def _top_box(clouds: list[Array]) -> Box:
-    return _not_flat(limits(clouds, 0.06))
+    """Return limits around points; a strip that is too thin for ticks becomes higher."""
+    x0, x1, y0, y1 = limits(clouds, 0.06)
+    more = max(0.0, MIN_HEIGHT * (x1 - x0) - (y1 - y0)) / 2
+    return x0, x1, y0 - more, y1 + more
 
 
 def _side_box(clouds: list[Array]) -> Box:
@@ -492,22 +495,6 @@ def limits(clouds: list[NDArray[np.float64]], margin: float) -> tuple[float, flo
     points = np.vstack(clouds)
     (x0, y0), (x1, y1) = points.min(axis=0) - margin, points.max(axis=0) + margin
     return float(x0), float(x1), float(y0), float(y1)
-
-
-def _not_flat(box: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
-    """Increase the height of limits if they form a strip that is too thin for ticks."""
-    x0, x1, y0, y1 = box
-    more = max(0.0, MIN_HEIGHT * (x1 - x0) - (y1 - y0)) / 2
-    return x0, x1, y0 - more, y1 + more
-
-
-def curve_styles(names: Sequence[T]) -> dict[T, dict[str, Any]]:
-    """Return the look of each curve of a panel: colours and line styles both differ, so that grey prints are clear."""
-    colours, dashes = style.VARIANT_COLOURS, style.DASHES
-    return {
-        name: {"color": colours[k % len(colours)], "linestyle": dashes[k % len(dashes)], "linewidth": 1.1}
-        for k, name in enumerate(names)
-    }
 
 
 def greek(name: str) -> str:

@@ -36,6 +36,7 @@ from matplotlib.ticker import AutoLocator, FuncFormatter, LogFormatter, LogLocat
 from numpy.typing import NDArray
 
 from dynsim.draw.figures.look import Look
+from dynsim.draw.figures.overlap import separate
 from dynsim.draw.figures.panels import chosen, explained, named, regrid
 from dynsim.errors import RecordError
 from dynsim.record import Record
@@ -57,13 +58,14 @@ GREY = "#7F7F7F"
 NOTE = "#555555"
 # Colour of parts of links that are below a surface because they have no contact point.
 DEEP = "#882255"
-VARIANT_COLOURS = (BLUE, GREEN, ORANGE, PURPLE, SKY, BLACK, "#8C6D31", "#9E9AC8")
+# Black is reserved for targets and limits.
+VARIANT_COLOURS = (BLUE, GREEN, ORANGE, PURPLE, SKY, "#8C6D31", "#9E9AC8", "#332288")
 # Line styles of variants, in addition to colours, or of variants that share a colour.
 DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (5, 1, 1, 1)), (0, (1, 1)), (0, (8, 3)), (0, (3, 1, 1, 1, 1, 1)))
 # Names of colours, line styles and markers in captions.
 _COLOUR_NAMES = {
     BLUE: "blue", ORANGE: "orange", GREEN: "green", PURPLE: "pink", SKY: "light blue", BLACK: "black",
-    "#8c6d31": "brown", GREY: "grey", PULLING: "red", DEEP: "dark red",
+    "#8c6d31": "brown", "#9e9ac8": "lavender", "#332288": "indigo", GREY: "grey", PULLING: "red", DEEP: "dark red",
 }  # fmt: skip
 _DASH_NAMES = ("solid", "dashed", "dash-dotted", "dotted", "long dashes", "dash-dot-dotted")
 _MARKER_NAMES = {"o": "circle", "s": "square", "D": "diamond", "^": "triangle", "v": "triangle down", "x": "cross"}
@@ -126,8 +128,6 @@ LINE_POINTS = 4000
 TRANSIENT_ROOM, TRANSIENT_MAX_SHARE = 1.2, 0.8
 # Curves whose range is below this fraction of their largest value are drawn with zero.
 FLAT = 0.1
-# Curves coincide if they differ by less than this fraction of their axis in this share of the samples.
-NEAR, MOSTLY = 0.01, 0.9
 # Values below this fraction of the scale of a quantity are rounding errors.
 NOTHING = 1e-9
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -616,15 +616,19 @@ def wanted_panels() -> tuple[str, ...]:
 
 
 def with_panels(drawn: Iterable[tuple[str, Figure]]) -> Iterable[tuple[str, Figure]]:
-    """Reduce figures to the panels of the look, if it names any; figures without such a panel are omitted."""
-    if not (wanted := wanted_panels()):
-        return drawn
-    figures = dict(drawn)
-    kept = chosen(figures, wanted)
-    for name, axes in kept.items():
-        figure: Any = figures[name]
-        figure.keep(axes)
-    return [(name, figures[name]) for name in kept]
+    """Reduce figures to the panels of the look, if it names any; figures without such a panel are omitted.
+
+    Notes on curves that coincide are added.
+    """
+    if wanted := wanted_panels():
+        figures: dict[str, Any] = dict(drawn)
+        for name, axes in (kept := chosen(figures, wanted)).items():
+            figures[name].keep(axes)
+        drawn = [(name, figures[name]) for name in kept]
+    for name, figure in drawn:
+        if isinstance(figure, Drawing) and (notes := separate(figure)):
+            figure.note(*notes)
+        yield name, figure
 
 
 def title(record: Record, subject: str) -> str:
@@ -719,38 +723,6 @@ def label_row(panels: Sequence[Axes], label: str) -> None:
     for axes in panels:
         if axes is panels[0] or axes.get_ylim() != panels[0].get_ylim():
             axes.set_ylabel(label)
-
-
-def note_coinciding(figure: Drawing, rows: Sequence[tuple[Axes, Mapping[str, Series]]]) -> None:
-    """Add a note on the variants whose curves, in each of the axes, cannot be distinguished."""
-    groups: dict[str, list[str]] = {}
-    for axes, curves in rows:
-        others = list(curves)
-        while others:
-            first, *others = others
-            same = [name for name in others if _coincide(axes, curves[first], curves[name])]
-            others = [name for name in others if name not in same]
-            if same:
-                text = f"{', '.join([first, *same[:-1]])} and {same[-1]}"
-                groups.setdefault(text, []).append(_quantity(axes.get_ylabel()))
-    texts = [text + f" ({', '.join(where)})" * (len(where) < len(rows)) for text, where in groups.items()]
-    if texts:
-        figure.note(f"Curves that coincide: {'; '.join(texts)}.")
-
-
-def _coincide(axes: Axes, first: Series, second: Series) -> bool:
-    """Return whether two curves over time, (T,) or (T, k), differ by less than a line is wide."""
-    (time, values), (times, others) = first, second
-    if abs(time[-1] - times[-1]) > NEAR * time[-1]:
-        return False
-    low, high = axes.get_ylim()
-    columns = values.reshape(len(time), -1), others.reshape(len(times), -1)
-    resampled = np.stack([np.interp(time, times, column) for column in columns[1].T], axis=1)
-    both = [columns[0], resampled]
-    if axes.get_yscale() == "log":
-        both, low, high = [np.log(np.maximum(part, low)) for part in both], math.log(low), math.log(high)
-    near = (np.abs(both[0] - both[1]) < NEAR * (high - low)).all(axis=1)
-    return bool(near.mean() > MOSTLY)
 
 
 def at_least(axes: Axes, span: float) -> None:

@@ -23,7 +23,6 @@ from dynsim.draw.figures.snake_view import (
     SYMBOLS,
     View,
     above_edge,
-    curve_styles,
     greek,
     mode_chart,
     moving,
@@ -109,7 +108,7 @@ def _deviations(records: Mapping[str, Record], sources: Mapping[str, str]) -> Fi
         off = [1e3 * (p.mean[i] - p.target[i]) for p in published]
         spread = [2e3 * p.deviation[i] for p in published]
         axis.bar(places, off, width=0.8, color=VARIANT_COLOURS[2], alpha=0.5, label="measured: mean")
-        look: dict[str, Any] = {"ls": "", "color": VARIANT_COLOURS[6], "lw": 1.2, "capsize": 2.5}
+        look: dict[str, Any] = {"ls": "", "color": VARIANT_COLOURS[5], "lw": 1.2, "capsize": 2.5}
         axis.errorbar(places - 0.28, off, yerr=spread, label="measured: ± 2 SD", **look)
         for shift, (source, ending) in zip((-0.08, 0.12, 0.3), sources.items(), strict=False):
             text, mark = MARKS[source]
@@ -163,7 +162,7 @@ def wheel_loads(records: Mapping[str, Record]) -> Figure:
     columns = 2
     rows = -(-len(moved) // columns)
     loads = {name: pair_loads(records[name]) for name in moved}
-    looks = curve_styles([pair for pair in loads[moved[0]] if any(load[pair].any() for load in loads.values())])
+    looks = style.variant_styles([pair for pair in loads[moved[0]] if any(load[pair].any() for load in loads.values())])
     figure = style.new_figure(1.3 * rows + 1.3, "loads of the wheel pairs by the coordinate that was moved")
     axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
     for axis, name in zip(axes.ravel(), moved, strict=False):
