@@ -10,12 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from support.messages import mentions, says
 
 import dynsim
 from dynsim.draw import figures
-from dynsim.draw.figures import arm, base, energy, posture, style
+from dynsim.draw.figures import arm, base, contacts, energy, posture, style
 from dynsim.record import Event, Record, measures
 from dynsim.record.joint_motion import export_record, joint_motion
 from dynsim.record.measures import percent
@@ -157,18 +156,16 @@ def test_outside_of_the_triangle_is_where_the_margin_is_negative(tipped: Record)
     assert says(texts(drawn(base.top_view(tipped))), "outside")
 
 
-def is_mark(line: Line2D) -> bool:
-    return bool(line.get_color() == style.PULLING and line.get_linestyle() == "--")
-
-
 def test_tipping_is_marked_in_every_panel_that_shows_its_time(tipped: Record, turning: Record) -> None:
     figure = drawn(base.overturning(tipped))
     times = {event.time for event in tipped.events if event.kind == base.TIP_OVER}
     assert times
     for axes in figure.axes:
-        marked = {line.get_xdata()[0] for line in axes.get_lines() if is_mark(line)}
+        lines = [part for part in axes.collections if part.get_label() == f"{style.UNLISTED}event"]
         low, high = axes.get_xlim()
-        assert marked == {time for time in times if low <= time <= high}
+        assert {path.vertices[0, 0] for part in lines for path in part.get_paths()} <= times
+        assert bool(lines) == any(low <= time <= high for time in times)
+    assert mentions(figure.caption, "base tips over")
     assert mentions(texts(figure), f"{min(times):.3g} s")
     assert mentions(texts(drawn(base.margin_comparison({"a": tipped, "b": turning}))), f"{min(times):.3g} s")
 
@@ -180,7 +177,7 @@ def test_marks_of_later_times_take_no_room_beside_the_transient() -> None:
     record = Record(time)
     record.events.extend(Event(at, base.TIP_OVER, "") for at in (0.05, 4.5))
     for axes in panels:
-        base._mark_tipping(axes, record, None)
+        contacts.mark(axes, contacts.marked(record))
     figure.draw_without_rendering()
     left, right = (axes.get_position() for axes in panels)
     assert right.x0 - left.x1 < 0.1

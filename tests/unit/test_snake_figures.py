@@ -407,7 +407,7 @@ def test_wheels_that_lift_off_are_marked_on_their_pair(simulated):
     forces = record["contact_normal_force"]
     columns = [record.labels["contact_normal_force"].index(f"wheel2{side}") for side in "LR"]
     np.testing.assert_allclose(load, means(forces[:, columns].sum(axis=1)))
-    lifted = [band for band in ground.collections if band.get_label() == "a wheel lifts off"]
+    lifted = [band for band in ground.collections if band.get_label() == "a wheel without load"]
     rows = sorted(round(float(np.mean(band.get_paths()[0].get_extents().intervaly))) for band in lifted)
     pairs = [
         k

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import pytest
+from support.random_bodies import faults, result_of
 
 from dynsim.integrators.stepping import tables as kt
-from support.random_bodies import faults, result_of
 
 # Seeds of the default tests: two scenes of each kind, and scenes that were wrong once.
 FEW = {

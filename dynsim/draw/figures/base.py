@@ -29,8 +29,8 @@ TRACTION_TOP, MARGIN_LOW = 2.5, -2.0
 # Tracking: minimum ranges of the axes, so that rounding errors are not magnified.
 MIN_RANGES = {"position [m]": 1e-3, "heading [°]": 0.1, "error [mm]": 5e-3, "heading error [°]": 5e-3}
 MILLI = 1e3
-EDGE = 0.01
-_MINIMUM = "Minimum of the tip margin: from {:g} s on."
+# Fraction of the time axis above which a band is visible.
+VISIBLE = 2e-3
 # Values over time, and how they are drawn.
 Curve = tuple[Array, dict[str, Any]]
 
@@ -55,21 +55,18 @@ def overturning(record: Record) -> Figure | None:
         _frame_margin(axes)
     for axes in rows[2]:
         _lines(axes, record, TRACTION, "max {}", np.nanmax)
-        style.shade(axes, record.time, bare, "#EFEFEF", f"{style.UNLISTED}no load")
+        none = f"a wheel has no load: {percent(float(bare.mean()))}"
+        style.shade(axes, record.time, bare & (bare.mean() > VISIBLE), "#EFEFEF", none)
         axes.axhline(1.0, color=style.PULLING, linewidth=0.8, label="slips above 1")
         axes.set_ylim(0.0, min(max(axes.get_ylim()[1], 1.15), TRACTION_TOP))
+    contacts.mark_all(figure, rows, record)
     for panels, label in zip(rows, ("load [N]", "tip margin", "traction demand\n/ friction limit"), strict=True):
-        for axes in panels:
-            _mark_tipping(axes, record, "tips over" if panels is rows[1] else None)
         style.label_row(panels, label)
         style.legend_above(panels[-1], columns=4)
-    note = [_MINIMUM.format(record.settle_time) + " Other extremes: whole run."]
-    if np.nanmax(traction, initial=0.0) > TRACTION_TOP:
+    note = ["Extremes in the legends: whole run, if no time is given."]
+    if np.nanmax(traction, initial=0.0) > TRACTION_TOP <= max(axes.get_ylim()[1] for axes in rows[2]):
         note.append(f"Traction demand: not drawn above {TRACTION_TOP:g}, which a wheel with almost no load exceeds.")
-    if bare.any():
-        note.append(f"Grey, without demand: a wheel carries no load ({percent(float(bare.mean()))} of the samples).")
     figure.note(*note)
-    contacts.mark_all(figure, rows, record)
     return figure
 
 
@@ -90,7 +87,6 @@ def margin_comparison(records: Mapping[str, Record]) -> Figure | None:
         _frame_margin(axes)
     style.label_row(panels, "tip margin")
     style.legend_below(figure, panels[-1:], 1)
-    figure.note(_MINIMUM.format(max(record.settle_time for record in some)))
     return figure
 
 
@@ -135,8 +131,9 @@ def tracking(record: Record) -> Figure | None:
             if "error" in name:
                 axes.axhline(0.0, color=style.GREY, linewidth=0.6)
         style.label_row(panels, name)
-        style.legend_above(panels[-1], columns=4)
     contacts.mark_all(figure, rows, record)
+    for panels in rows:
+        style.legend_above(panels[-1], columns=4)
     figure.align_ylabels([panels[0] for panels in rows])
     return figure
 
@@ -178,11 +175,22 @@ def _verdict(record: Record) -> str:
 
 
 def _margin_label(name: str, record: Record) -> str:
-    """Return a label with the minimum margin after the start, and whether the base tips."""
+    """Return a label with the minimum margin of the whole run and after the start, and whether the base tips."""
     settle = record.settle_time
-    late = record[MARGIN][record.time >= settle]
-    least = f" min {style.number(float(np.nanmin(late)), 3)};" if np.isfinite(late).any() else ""
-    return f"{name}:{least} {_verdict(record)}"
+    whole, late = (_least(record[MARGIN][record.time >= begin]) for begin in (-np.inf, settle))
+    # Between samples, the margin may be lower.
+    texts = [] if whole > 0.0 and tipping_times(record) else [_limited(whole)]
+    if record.time[-1] > settle and (not texts or late > whole):
+        texts.append(f"from {settle:g} s on {_limited(late)}")
+    return f"{name}: {'min ' * bool(texts)}{', '.join(texts)}{'; ' * bool(texts)}{_verdict(record)}"
+
+
+def _least(margin: Array) -> float:
+    return float(np.nanmin(margin, initial=1.0))
+
+
+def _limited(margin: float) -> str:
+    return style.number(margin, 3) if margin >= MARGIN_LOW else f"below {style.number(MARGIN_LOW)}"
 
 
 def _lines(axes: Axes, record: Record, signal: str, note: str, extreme: Callable[[Array], Any]) -> None:
@@ -206,15 +214,6 @@ def _frame_margin(axes: Axes) -> None:
     low, high = axes.get_ylim()
     axes.set_ylim(max(min(low, -0.05), MARGIN_LOW), max(high, 0.1))
     style.shade_below_zero(axes, "outside the support triangle")
-
-
-def _mark_tipping(axes: Axes, record: Record, label: str | None) -> None:
-    """Draw lines at the tipping times within the axes."""
-    low, high = axes.get_xlim()
-    for time in (time for time in tipping_times(record) if low <= time <= high):
-        # On the edge of the axes, the line is not visible.
-        seen = label if low + EDGE * (high - low) < time else None
-        axes.axvline(time, color=style.PULLING, linestyle=(0, (4, 2)), linewidth=0.9, label=seen)
 
 
 def _rms(values: Array) -> float:

@@ -6,7 +6,6 @@ show the mode of each contact: open, sliding or sticking.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -18,22 +17,26 @@ from dynsim.draw.figures import style
 from dynsim.draw.figures.style import Array
 from dynsim.record import Record
 from dynsim.record.content import Event
-from dynsim.record.measures import percent
+from dynsim.record.measures import TIP_OVER, percent
 
 # Kinds of events that are marked, as events of contacts and of joints. Other kinds have separate figures.
 MARKS = {
     "landing": ("landing",),
     "lift_off": ("lift-off",),
     "bounce": ("bounce",),
-    "slip_start": ("contact slips", "joint leaves dry friction"),
-    "slip_stop": ("contact sticks", "dry friction stops joint"),
+    "slip_start": ("contact starts to slide", "joint starts to slide"),
+    "slip_stop": ("contact starts to stick", "joint starts to stick"),
     "stop_hit": ("joint stop hit",),
     "stop_left": ("joint stop left",),
     "chatter": ("chatter",),
+    TIP_OVER: ("base tips over",),
 }
+_SHAPES = dict(zip((text for texts in MARKS.values() for text in texts), "v^o>Ds|PX*p", strict=True))
 COLOUR = "#A6A6A6"
-# Events that are closer than this fraction of the axis share a line.
+# Events that are closer than this fraction of the axis share a line or a mark; in a narrow figure, twice as much.
 APART = 0.01
+# Maximum number of lines in a panel; fraction of the axis that a line or band needs to be visible, and its group then.
+LINES, VISIBLE, SEEN = 12, 8e-3, "seen"
 
 
 def marked(record: Record, names: Iterable[str] | None = None) -> list[Event]:
@@ -43,44 +46,62 @@ def marked(record: Record, names: Iterable[str] | None = None) -> list[Event]:
 
 
 def mark(axes: Axes, events: Sequence[Event]) -> None:
-    """Draw a thin line behind the curves at the time of each event within the axes."""
+    """Draw a thin line behind the curves at the time of each event within the axes, unless there are many."""
     low, high = axes.get_xlim()
-    times: list[float] = []
-    for time in sorted(event.time for event in events if low <= event.time <= high):
-        if not times or time - times[-1] >= APART * (high - low):
-            times.append(time)
+    times = _merged((event.time for event in events), (low, high))
     look: dict[str, Any] = {"colors": COLOUR, "linewidth": 0.6, "zorder": 0.5, "label": f"{style.UNLISTED}event"}
-    if times:
-        axes.vlines(times, 0.0, 1.0, transform=axes.get_xaxis_transform(), **look)
+    if 0 < len(times) <= LINES:
+        seen = SEEN if times[-1] > low + VISIBLE * (high - low) else None
+        axes.vlines(times, 0.0, 1.0, transform=axes.get_xaxis_transform(), gid=seen, **look)
         axes.set_xlim(low, high)
 
 
+def _merged(times: Iterable[float], limits: tuple[float, float]) -> list[float]:
+    """Return the times within an axis, without those that cannot be distinguished from the one before."""
+    (low, high), kept = limits, list[float]()
+    for time in sorted(time for time in times if low <= time <= high):
+        if not kept or time - kept[-1] >= APART * (1 + style.narrow()) * (high - low):
+            kept.append(time)
+    return kept
+
+
 def mark_all(figure: style.Drawing, rows: Sequence[Sequence[Axes]], record: Record) -> None:
-    """Mark all events of a run in every panel, with a note."""
-    events = marked(record)
+    """Mark the events of a run in every panel, and above the first one by kind, with a legend."""
+    touching, kinds = set(contact_names([record])), dict[str, list[float]]()
+    for event in marked(record):
+        kinds.setdefault(MARKS[event.kind][0 if event.name in touching else -1], []).append(event.time)
+    kinds = {text: kinds[text] for text in _SHAPES if text in kinds}
     for axes in (axes for panels in rows for axes in panels):
-        mark(axes, events)
-    explain(figure, events, record)
+        mark(axes, marked(record))
+    for axes in rows[0]:
+        style.rug(axes, {_SHAPES[text]: _merged(times, axes.get_xlim()) for text, times in kinds.items()})
+    entries: dict[str, Any] = {}
+    for (text, times), marks in zip(kinds.items(), style.rug_rows(rows[0][-1]), strict=True):
+        drawn = np.size(marks.get_xdata())
+        fewer = f" in {drawn} mark{'s' * (drawn > 1)}" if drawn < len(times) else ""
+        entries[f"{text} ({len(times)}{fewer})"] = marks
+    figure.put_below({**entries, **_seen(rows)}, 4, last=True)
 
 
-def explain(figure: style.Drawing, events: Sequence[Event], record: Record) -> None:
-    """Add a note with the number of events of each kind."""
-    touching = set(contact_names([record]))
-    count = Counter(MARKS[event.kind][0 if event.name in touching else -1] for event in events)
-    if count:
-        kinds = (text for texts in MARKS.values() for text in dict.fromkeys(texts) if count[text])
-        figure.note(f"Vertical grey lines: {', '.join(f'{text} ({count[text]})' for text in kinds)}.")
+def _seen(rows: Sequence[Sequence[Axes]]) -> dict[str, Any]:
+    """Return legend entries for the bands and lines that are visible."""
+    parts = [part for panels in rows for axes in panels for part in axes.collections if part.get_gid() == SEEN]
+    return {str(part.get_label()).removeprefix(style.UNLISTED): part for part in parts}
 
 
-# Maximum number of rows on a page; height of a row [inch].
-ROWS, ROW = 8, 1.75
+# Maximum number of rows on a page; height of a row, and of a figure [inch].
+ROWS, ROW, PAGE = 4, 1.75, 7.8
 # Maximum number of variants whose legend entries have numbers.
 NUMBERED = 4
 # Maximum number of samples that are drawn as dots.
 DOTS = 150
 # Colours of the bands for the modes, by number.
 MODE = "contact_mode"
-BANDS = {"open": "#EFEFEF", "slides": "#FCE3B0", "sticks": "#BFE6D8"}
+BANDS: dict[str, dict[str, Any]] = {
+    "contact open": {"facecolor": "#F2F2F2"},
+    "contact slides": {"facecolor": "#FDEBC8", "edgecolor": "#E8C98A", "hatch": "///"},
+    "contact sticks": {"facecolor": "#A9DCCB"},
+}
 
 
 def forces(record: Record) -> Figure | None:
@@ -113,7 +134,8 @@ def _forces(records: Mapping[str, Record], title: str) -> Figure | None:
     many = max(map(len, having.values())) > NUMBERED
     texts = [[*(text for (own, _), text in labels.items() if own == name), "surface pulls"] for name in chosen]
     more = 0 if many else sum(style.fitted_legend(text, 2)[2] - 1 for text in texts)
-    figure = style.new_figure(1.0 + ROW * len(chosen) + more * style.legend_row() / 72.0, title + note)
+    above = 1.0 + more * style.legend_row() / 72.0
+    figure = style.new_figure(min(above + ROW * len(chosen), PAGE), title + note)
     series = [[values for r in having[name].values() for values in _series(r, name)] for name in chosen]
     styles = style.variant_styles(list(records))
     rows = style.time_rows(figure, series, max(run.settle_time for run in runs), zero=alone)
@@ -142,10 +164,8 @@ def _forces(records: Mapping[str, Record], title: str) -> Figure | None:
         figure.note(f"Legend: share of the run; range over all integration steps, with peaks between samples{also}.")
     if many:
         style.legend_below(figure, [panels[-1] for panels in rows], 5)
-    bands = {str(bar.get_label())[1:]: bar for panels in rows for bar in panels[-1].collections}
-    figure.put_below({text: bands[text] for text in BANDS if text in bands}, 4)
-    if alone:
-        explain(figure, marked(runs[0], chosen), runs[0])
+    seen = _seen(rows)
+    figure.put_below({text: seen[text] for text in (*BANDS, "event") if text in seen}, 4)
     return figure
 
 
@@ -262,8 +282,10 @@ def _draw_modes(axes: Axes, record: Record, name: str) -> None:
     """Draw bands behind the curve for open, sliding and sticking."""
     bands, limits = mode_bands(record, name), axes.get_xlim()
     look: dict[str, Any] = {"transform": axes.get_xaxis_transform(), "linewidth": 0, "zorder": 0.2}
-    for mode, (text, colour) in enumerate(BANDS.items()):
+    for mode, (text, shading) in enumerate(BANDS.items()):
         spans = [(begin, end - begin) for begin, end, which in bands if which == mode]
+        widths = [min(begin + width, limits[1]) - begin for begin, width in spans]
+        look["gid"] = SEEN if max(widths, default=0.0) > VISIBLE * (limits[1] - limits[0]) else None
         if spans:
-            axes.broken_barh(spans, (0.0, 1.0), color=colour, label=f"{style.UNLISTED}{text}", **look)
+            axes.broken_barh(spans, (0.0, 1.0), label=f"{style.UNLISTED}{text}", **shading, **look)
     axes.set_xlim(limits)

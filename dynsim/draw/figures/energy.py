@@ -39,6 +39,7 @@ DOMINANT = 0.8
 DIFFER = 0.01
 # A residual below this fraction of its limit is only printed, not drawn.
 SMALL_RESIDUAL = 0.1
+AT_END = "Energies in the legend: at the end of the run."
 
 
 def has_motors(record: Record) -> bool:
@@ -70,6 +71,7 @@ def energy(record: Record) -> Figure | None:
     contacts.mark_all(figure, [(top,), (bottom,)], record)
     for axes in (top, bottom):
         style.legend_above(axes, columns=2)
+    figure.note(AT_END)
     return figure
 
 
@@ -150,7 +152,6 @@ def ledger(record: Record) -> Figure | None:
         _stack(main, record.time, others, largest)
         less = supplied - terms["heat_joule"]
         _draw_supplied(main, record.time, less, f"{source} − Joule heat", largest, linestyle=style.DASHES[1])
-        main.set_title("without Joule heat", loc="left")
         main.set_ylabel("energy since start [J]")
     panels = [main, figure.add_subplot(grid[-1, 0], sharex=main)] if near else [main]
     if near:
@@ -161,6 +162,9 @@ def ledger(record: Record) -> Figure | None:
         whole.tick_params(labelbottom=not near)
     (panels[-1] if near or not below else whole).set_xlabel("time [s]")
     contacts.mark_all(figure, [(axes,) for axes in panels], record)
+    if dominant:
+        main.set_title("without Joule heat", loc="left", pad=6.0 + style.rug_height(main))
+    figure.note(AT_END)
     if not near:
         figure.note(_residual_note(record, turnover))
     style.legend_below(figure, [whole, main], 3)
@@ -247,7 +251,7 @@ def _totals(axes: Axes, names: Sequence[str], values: Array, colours: Sequence[s
     axes.set_yticks(level, [style.broken(name, 0.9) for name in names])
     axes.set_ylim(len(names) - 0.4, -0.6)
     axes.grid(axis="y", visible=False)
-    axes.set_xlabel("net electrical energy [J]")
+    axes.set_xlabel("net energy at the end [J]")
     axes.set_label("total energy")
 
 
@@ -265,8 +269,6 @@ TORQUES = {
 }
 # A limit above this multiple of the largest value is in the notes, because its line would compress the curves.
 FAR = 3.0
-# A bar that is shorter than this fraction of the axis has its value next to it.
-SHORT = 0.02
 LIMIT: dict[str, Any] = {"linestyle": "--", "linewidth": 0.9, "color": style.PULLING}
 RATING: dict[str, Any] = {"linestyle": (0, (1, 1.5)), "linewidth": 1.3, "color": style.BLACK}
 
@@ -277,29 +279,29 @@ def motors(record: Record) -> Figure | None:
         return None
     loads = {motor["joint"]: motor for motor in _loads(record)}
     volts = None if record.scene is None else record.scene.voltage_limit
-    units = [unit for unit in TORQUES if any(f"{TORQUES[unit][0]}_rms_{unit}" in motor for motor in loads.values())]
-    label = " or ".join(f"{TORQUES[unit][0]} [{TORQUES[unit][1]}]" for unit in units) or "torque [N m]"
-    # Label, limits by joint, and their keys.
-    signals: dict[str, tuple[str, Mapping[str, Any], Sequence[str]]] = {
-        "torque": (label, loads, TORQUES[units[0]][2:] if len(units) == 1 else ()),
-        "current": ("current [A]", loads, ("peak_current_A", "nominal_current_A")),
-        "voltage": ("voltage [V]", {name: {"limit": volts} for name in record.labels["current"]}, ("limit",)),
-    }
-    signals = {name: signal for name, signal in signals.items() if name in record}
-    columns = {name: [record.labels[name].index(joint) for joint in record.labels["current"]] for name in signals}
-    shown = _most_loaded(record, [record[name][:, columns[name]] for name in signals])
-    figure = style.new_figure(
-        1.2 + 1.55 * len(signals), style.title(record, "torques, currents and voltages of the motors")
-    )
+    joints = record.labels["current"]
+    slides = [k for k, joint in enumerate(joints) if f"{TORQUES['N'][0]}_rms_N" in loads.get(joint, {})]
+    every = range(len(joints))
+    motors = {"N_m": [k for k in every if k not in slides], "N": slides}
+    # Signal, label, motors, limits by joint, and their keys.
+    signals: list[tuple[str, str, Sequence[int], Mapping[str, Any], Sequence[str]]] = [
+        *(("torque", f"{name} [{unit}]", motors[key], loads, keys) for key, (name, unit, *keys) in TORQUES.items()),
+        ("current", "current [A]", every, loads, ("peak_current_A", "nominal_current_A")),
+        ("voltage", "voltage [V]", every, {name: {"limit": volts} for name in joints}, ("limit",)),
+    ]
+    signals = [signal for signal in signals if signal[0] in record and len(signal[2])]
+    values = [record[name][:, [record.labels[name].index(joints[k]) for k in own]] for name, _, own, *_ in signals]
+    shown = _most_loaded(record, [(signal[2], part) for signal, part in zip(signals, values, strict=True)])
+    title = style.title(record, "torques, currents and voltages of the motors")
+    figure = style.new_figure(1.2 + min(1.55 * len(signals), 5.0), title)
     looks = style.variant_styles(list(shown))
-    series = [[(record.time, record[name][:, columns[name]])] for name in signals]
-    rows = style.time_rows(figure, series, record.settle_time, compress=True)
-    for (name, (label, entries, keys)), panels in zip(signals.items(), rows, strict=True):
+    rows = style.time_rows(figure, [[(record.time, part)] for part in values], record.settle_time, compress=True)
+    for (_, label, own, entries, keys), part, panels in zip(signals, values, rows, strict=True):
         for axes in panels:
-            _draw(axes, record, name, columns[name], shown)
-        limits = {looks[k]["color"]: entries.get(record.labels["current"][k], {}) for k in shown}
+            _draw(axes, record, part, own, shown)
+        limits = {looks[k]["color"]: entries.get(joints[k], {}) for k in shown if k in own}
         draw_limits(figure, panels[-1], limits, keys, label)
-        style.label_row(panels, label.replace(" or ", "\nor ") if " or " in label else label.replace(" [", "\n["))
+        style.label_row(panels, label.replace(" [", "\n["))
     style.legend_below(figure, [panels[-1] for panels in rows], 4)
     contacts.mark_all(figure, rows, record)
     if len(shown) < record["current"].shape[1]:
@@ -332,10 +334,11 @@ def torques(record: Record) -> Figure | None:
                 limit_mark(axes, k, value, text, **look)
         axes.set_xlabel(f"{name} [{symbol}]")
         axes.set_xlim(0.0, 1.05 * axes.get_xlim()[1])
-        for k, value in enumerate(most):
-            if value < SHORT * axes.get_xlim()[1]:
-                look = {"textcoords": "offset points", "va": "center", "fontsize": style.letters(7.0)}
-                axes.annotate(style.number(value, 2), (value, k), xytext=(3, 0), **look)
+        # The numbers of short bars cannot be read from the axis; a column next to the axes never hides a limit.
+        look = {"transform": axes.get_yaxis_transform(), "va": "center", "fontsize": style.letters(7.0)}
+        axes.text(1.02, -1.0, f"max, rms [{symbol}]", **look)
+        for k, pair in enumerate(zip(most, rms, strict=True)):
+            axes.text(1.02, k, ", ".join(style.number(value, 2) for value in pair), **look)
     style.legend_below(figure, list(panels), 4)
     if not limits:
         figure.note("The scenario has neither torque limits nor torque ratings of motors.")
@@ -365,8 +368,8 @@ def limit_mark(axes: Axes, level: int, value: float, label: str, **look: Any) ->
     axes.plot([value, value], [level - 0.45, level + 0.45], label=label, **(look or LIMIT))
 
 
-def _most_loaded(record: Record, signals: Sequence[Array]) -> list[int]:
-    """Return the positions of ``LARGEST`` motors in order: with the largest values of signals, (T, k), and currents.
+def _most_loaded(record: Record, signals: Sequence[tuple[Sequence[int], Array]]) -> list[int]:
+    """Return the positions of ``LARGEST`` motors in order: with the largest values, (T, k), of motors, and currents.
 
     Values are those after the start; of the currents the rms counts.
     """
@@ -374,7 +377,7 @@ def _most_loaded(record: Record, signals: Sequence[Array]) -> list[int]:
     settled = record.time >= record.settle_time
     rows = settled if settled.any() else slice(None)
     effort = np.sqrt((record["current"][rows] ** 2).mean(axis=0))
-    peaks = [int(np.nan_to_num(np.abs(values[rows])).max(axis=0).argmax()) for values in signals]
+    peaks = [own[int(np.nan_to_num(np.abs(values[rows])).max(axis=0).argmax())] for own, values in signals]
     return sorted(list(dict.fromkeys([*peaks, *np.argsort(-effort, kind="stable").tolist()]))[:LARGEST])
 
 
@@ -383,15 +386,18 @@ def _names(record: Record) -> Mapping[str, str]:
     return {} if record.scene is None else record.scene.wheel_names
 
 
-def _draw(axes: Axes, record: Record, name: str, columns: Sequence[int], shown: Sequence[int]) -> None:
-    """Draw a signal of the ``shown`` motors as lines, and the envelope of all motors if there are more."""
-    values, labels = record[name][:, columns], [record.labels[name][k] for k in columns]
+def _draw(axes: Axes, record: Record, values: Array, own: Sequence[int], shown: Sequence[int]) -> None:
+    """Draw a signal of the ``own`` motors: the ``shown`` ones as lines, the envelope of all if there are more."""
     called, looks = _names(record), style.variant_styles(list(shown))
-    if len(shown) < len(labels):
-        low, high = values.min(axis=1), values.max(axis=1)
-        axes.fill_between(record.time, low, high, color="#CFCFCF", linewidth=0, label=f"all {len(labels)} motors")
-    for k in shown:
-        style.line(axes, record.time, values[:, k], label=called.get(labels[k], labels[k]), **looks[k])
+    if not set(own) <= set(shown):
+        label = f"all {record['current'].shape[1]} motors"
+        axes.fill_between(
+            record.time, values.min(axis=1), values.max(axis=1), color="#CFCFCF", linewidth=0, label=label
+        )
+    for column, k in zip(values.T, own, strict=True):
+        if k in shown:
+            joint = record.labels["current"][k]
+            style.line(axes, record.time, column, label=called.get(joint, joint), **looks[k])
     axes.axhline(0.0, color=style.GREY, linewidth=0.6)
 
 

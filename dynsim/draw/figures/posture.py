@@ -396,7 +396,7 @@ def posture_comparison(records: Mapping[str, Record]) -> Figure | None:
     low, high = extent_of(plane, everything, some)
     size = high - low
     # Upright arms are drawn next to each other.
-    most = (2 if style.narrow() else 4) if size[1] > size[0] else (1 + (len(shown) > 4) if style.narrow() else 2)
+    most = (2 if style.narrow() else 4) if size[1] > size[0] else 1 + (len(shown) > 4) + (not style.narrow())
     columns = min(len(shown), most)
     lines = -(-len(shown) // columns)
     across = style.width() - FULL if columns == 1 else (style.width() - 0.65) / columns - 0.15
@@ -421,9 +421,10 @@ def posture_comparison(records: Mapping[str, Record]) -> Figure | None:
         if k + columns >= len(shown):
             axes.tick_params(labelbottom=True)
             axes.set_xlabel(label)
-    # The axis labels of narrow panels would overlap, so only one panel has a label.
+    # The axis labels of narrow panels would overlap, so only one panel has a label, and a panel alone in its row.
     for axes in grid[:, [k for k in range(columns) if columns > 2 and k != columns // 2]].ravel():
-        axes.set_xlabel("")
+        if axes is not grid[-1, 0] or len(shown) % columns != 1:
+            axes.set_xlabel("")
     style.legend_below(figure, list(grid.ravel()), 5)
     dashed = any(any(body.bases()) for body in shown.values())
     figure.note("Faint: earlier postures." + " Dashed: base and objects at the start." * dashed)

@@ -38,6 +38,7 @@ from dynsim.draw.figures.snake_view import (
     mode_starts,
     mode_steps,
     moments,
+    most_columns,
     moving,
     overlaid,
     overlay_margins,
@@ -49,6 +50,8 @@ from dynsim.snake.published import used_limit, write_tables
 
 # Number of postures in an animation, in a row, and overlaid in one picture.
 FRAMES, IN_A_ROW, IN_A_PICTURE = 50, 6, 7
+# Maximum number of rows of variants on a page.
+PAGE_ROWS = 4
 
 
 def draw(record: Record, folder: Path, kind: str = "png") -> list[Path]:
@@ -142,13 +145,14 @@ def _bars(figure: style.Drawing, axes: Sequence[Axes], curves: Mapping[str, Sequ
 
 
 def strips(records: Mapping[str, Record]) -> Figure:
-    """Draw the postures of every variant over time, overlaid."""
-    runs = {}
-    for name, record in records.items():
+    """Draw the postures of the variants over time, overlaid; only the first variants if a page has no more space."""
+    runs, some = {}, list(records.items())[: PAGE_ROWS * most_columns()]
+    part = f", {len(some)} of {len(records)} variants" * (len(some) < len(records))
+    for name, record in some:
         waiting = record.summary["waiting_s"]
         label = f"{name}, {record.time[-1]:.3g} s" + (f", {waiting:.0f} s of it waiting" if waiting >= 0.5 else "")
         runs[label] = (record, [View(record, row) for row in moments(record, IN_A_PICTURE)])
-    return overlaid(style.comparison_title(list(records.values()), "postures over time"), runs)
+    return overlaid(style.comparison_title(list(records.values()), f"postures over time{part}"), runs)
 
 
 def postures(record: Record) -> Figure:
@@ -171,7 +175,7 @@ def tracking(record: Record) -> Figure:
     shown, note = moving([record])
     columns = 1 if style.narrow() or len(shown) % 2 else 2
     rows = (len(shown) + 2) // columns
-    figure = style.new_figure(min(1.5 * rows + 0.8, 8.4), style.title(record, "tracking of the target"))
+    figure = style.new_figure(min(1.5 * rows + 0.8, 7.9), style.title(record, "tracking of the target"))
     axes = figure.subplots(rows, columns, sharex=True, squeeze=False)
     panels, time = list(axes.T.ravel()), record.time
     for i, axis in zip(shown, panels, strict=False):

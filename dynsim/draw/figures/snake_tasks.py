@@ -34,7 +34,8 @@ FAINT = "#C4C4C4"
 # A limit is drawn if it is at most this multiple of the largest value; otherwise it is in a note.
 NEAR = 3.0
 # Colours of the bands for the states of the gripper.
-STATES = dict(zip(GRIPPER_STATES, ("#FFFFFF", "#FDEFD3", "#E1F3EC", "#FAE6F0"), strict=True))
+STATES = dict(zip(GRIPPER_STATES, ("#FFFFFF", "#FDEFD3", "#C9E8DC", "#FAE6F0"), strict=True))
+HATCHES = {"hardening": "///", "softening": "\\\\\\"}
 # Line styles of the events of the gripper.
 EVENTS = {"captures": (0, (5, 2)), "slips": (0, (1, 1)), "loses": "-", "releases": (0, (5, 2, 1, 2))}
 # Smallest distance on the logarithmic axis [mm].
@@ -224,7 +225,7 @@ def wheels(record: Record) -> Figure:
         bare = grounded[:, k] & ~touching.all(axis=1)
         for where, colour, label in (
             (grounded[:, k], FAINT, "on the ground"),
-            (bare, style.DEEP, "a wheel lifts off"),
+            (bare, style.DEEP, "a wheel without load"),
         ):
             if where.any():
                 axes[1].fill_between(
@@ -430,7 +431,9 @@ def _finish(axes: Array, record: Record) -> None:
         axis.set_xlim(record.time[0], record.time[-1])
         for state, (name, colour) in enumerate(STATES.items()):
             if state > 0 and "gripper_state" in record:
-                style.shade(axis, record.time, record["gripper_state"] == state, colour, f"{style.UNLISTED}{name}")
+                hatched = {"hatch": HATCHES.get(name), "edgecolor": "#D9B98A"}
+                reached = record["gripper_state"] == state
+                style.shade(axis, record.time, reached, colour, f"{style.UNLISTED}{name}", **hatched)
         for kind, times in happened.items():
             for time in times:
                 axis.axvline(time, color="#555555", ls=EVENTS[kind], lw=0.8, label=f"{style.UNLISTED}{kind}")

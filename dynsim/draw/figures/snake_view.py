@@ -26,6 +26,8 @@ from dynsim.snake.published import used_limit
 
 BODY, HEAD, GROUND, LIFT, TARGET, SUPPORT = "#444444", style.PULLING, style.BLUE, "#FFFFFF", style.GREEN, style.SKY
 OBJECT, EDGE = "#E9CFA6", "#00283F"
+# Edge of objects; thin objects consist of little else.
+RIM = "#A8793A"
 SYMBOLS = {"alpha": "α", "beta": "β", "gamma": "γ"}
 COORDINATE_NAMES = {
     "x": "$x$",
@@ -107,7 +109,7 @@ class View:
         The support polygon and the centre of mass are drawn only from above.
         """
         objects = (self.project(corners, above) for corners in self.objects)
-        add_outlines(axes, objects, fc=OBJECT, ec=BODY, lw=0.5, zorder=1.5)
+        add_outlines(axes, objects, fc=OBJECT, ec=RIM, lw=0.8, zorder=1.5)
         if above:
             stands = [corners.mean(axis=0)[:2] for k in np.flatnonzero(self.grounded) for corners in self.wheels[k]]
             add_outlines(axes, [np.array(stands)], color=SUPPORT, alpha=0.25, lw=0, zorder=1)
@@ -147,8 +149,12 @@ def _side_box(clouds: list[Array]) -> Box:
 
 def _columns(count: int) -> int:
     """Return how many of ``count`` panels are next to each other, so that rows are equally long."""
-    most = max(int(style.width() / CELL), 1)
-    return -(-count // -(-count // most))
+    return -(-count // -(-count // most_columns()))
+
+
+def most_columns() -> int:
+    """Return how many panels have space next to each other."""
+    return max(int(style.width() / CELL), 1)
 
 
 def _grid(
@@ -516,5 +522,5 @@ def _explain(figure: style.Drawing, views: Sequence[View], more: Mapping[str, An
     if any(len(view.surfaces) > 1 for view in views):
         entries["surface"] = Patch(facecolor="#ECECEC", edgecolor=style.GREY, lw=0.8)
     if any(view.objects for view in views):
-        entries["object"] = Patch(facecolor=OBJECT, edgecolor=BODY, lw=0.5)
+        entries["object"] = Patch(facecolor=OBJECT, edgecolor=RIM, lw=0.8)
     figure.put_below(entries, 5)

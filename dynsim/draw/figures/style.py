@@ -33,6 +33,7 @@ from matplotlib.patches import Patch
 from matplotlib.text import Text
 from matplotlib.textpath import text_to_path
 from matplotlib.ticker import AutoLocator, FuncFormatter, LogFormatter, LogLocator, NullFormatter, NullLocator
+from matplotlib.transforms import ScaledTranslation, Transform, blended_transform_factory
 from numpy.typing import NDArray
 
 from dynsim.draw.figures.look import Look
@@ -112,6 +113,7 @@ _LOOK: Any = {
     "axes.grid": True,
     "axes.axisbelow": True,
     "axes.xmargin": 0.0,
+    "hatch.linewidth": 0.5,
     "axes.prop_cycle": cycler(color=VARIANT_COLOURS),
     "grid.color": "#E3E3E3",
     "grid.linewidth": 0.5,
@@ -131,6 +133,8 @@ FLAT = 0.1
 # Values below this fraction of the scale of a quantity are rounding errors.
 NOTHING = 1e-9
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+# Group of the marks above axes, and the height of a row of them [point].
+RUG, RUG_ROW = "rug", 5.5
 # Height of a legend row as a multiple of the size of its letters.
 LEGEND_ROW = 1.67
 
@@ -742,11 +746,11 @@ def shade_below_zero(axes: Axes, label: str) -> None:
         axes.set_ylim(low, high)
 
 
-def shade(axes: Axes, time: Array, where: NDArray[np.bool_], colour: str, label: str) -> None:
+def shade(axes: Axes, time: Array, where: NDArray[np.bool_], colour: str, label: str, **hatched: Any) -> None:
     """Shade the times at which ``where`` is True, each up to the next sample, with one legend entry."""
     if where.any():
         until = where | np.append(False, where[:-1])
-        look: dict[str, Any] = {"color": colour, "linewidth": 0, "zorder": 0.2, "label": label}
+        look: dict[str, Any] = {"facecolor": colour, "linewidth": 0, "zorder": 0.2, "label": label, **hatched}
         axes.fill_between(time, 0.0, 1.0, where=until, transform=axes.get_xaxis_transform(), **look)
 
 
@@ -785,11 +789,40 @@ def legend_above(axes: Axes, columns: int = 3) -> None:
     """Place the legend above the axes, where it hides no curves, with space for all of its rows."""
     unique = legend_entries([axes])
     labels, columns, rows = fitted_legend(list(unique), columns)
-    look: dict[str, Any] = {"ncols": columns, "borderaxespad": 0.0}
+    lift = rug_height(axes)
+    look: dict[str, Any] = {"ncols": columns, "borderaxespad": 0.0, "bbox_transform": _raised(axes, lift)}
     legend = axes.legend(unique.values(), labels, loc="lower right", bbox_to_anchor=(1.0, 1.0), **look)
     # The legend may extend over the panel to its left; a blank title reserves the space above.
     legend.set_in_layout(False)
-    axes.set_title(" ", y=1.0, pad=6.0 + legend_row() * max(rows - 1, 0))
+    axes.set_title(" ", y=1.0, pad=6.0 + lift + legend_row() * max(rows - 1, 0))
+
+
+def rug(axes: Axes, rows: Mapping[str, Sequence[float]]) -> None:
+    """Draw marks above the axes at times on the horizontal axis, one row per shape."""
+    for shape, times in rows.items():
+        across = blended_transform_factory(axes.transData, _raised(axes, rug_height(axes) + 0.5 * RUG_ROW))
+        look: dict[str, Any] = {"linestyle": "none", "color": "#333333", "markersize": 3.2, "markeredgewidth": 0.7}
+        marks = Line2D(times, [1.0] * len(times), marker=shape, gid=RUG, clip_on=False, **look)
+        marks.set_transform(across)
+        marks.set_in_layout(bool(times))  # without data, its box would be at the corner of the figure
+        axes.add_artist(marks)
+
+
+def rug_height(axes: Axes) -> float:
+    """Return the height of the marks above axes [point]."""
+    return RUG_ROW * len(rug_rows(axes))
+
+
+def rug_rows(axes: Axes) -> list[Line2D]:
+    """Return the rows of marks above axes, from bottom to top."""
+    return [part for part in axes.lines if part.get_gid() == RUG]
+
+
+def _raised(axes: Axes, points: float) -> Transform:
+    """Return the coordinates of axes, moved up [point]."""
+    figure = axes.get_figure(root=True)
+    assert figure is not None
+    return axes.transAxes + ScaledTranslation(0.0, points / 72.0, figure.dpi_scale_trans)
 
 
 def legend_below(figure: Drawing, panels: Sequence[Axes], columns: int) -> None:
