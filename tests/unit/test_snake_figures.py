@@ -514,7 +514,7 @@ def test_many_variants_are_bars_with_marks_at_the_end(record):
     records = {f"{posture}_{axis}": late if axis == "y" else record for posture in ("i", "ii", "iii") for axis in "xyz"}
     figure = drawn(figures.comparison, records)
     assert [text.get_text() for text in figure.legends[0].texts] == ["…_x", "…_y", "…_z"]
-    assert [text.get_text() for text in figure.axes[3].get_xticklabels()] == ["i", "ii", "iii"]
+    assert [text.get_text() for text in figure.axes[-1].get_xticklabels()] == ["i", "ii", "iii"]
     ends = [line.get_ydata()[0] for line in figure.axes[0].lines]
     assert ends == [run["cost"][-1] for run in records.values()]
     (bars,) = {tuple(bar.get_segments()[0][:, 1]) for bar in figure.axes[0].collections[1::3]}

@@ -224,7 +224,7 @@ def _rms(values: Array) -> float:
 Rows = NDArray[np.intp]
 
 # Height of the base-frame panel if it is placed below the world panel [inch].
-BELOW = 2.9
+BELOW = 2.6
 
 # Maximum number of support triangles, evenly spaced along the path, and minimum distance between them, relative to
 # their size.
@@ -242,28 +242,24 @@ def top_view(record: Record) -> Figure | None:
     rows = np.flatnonzero(np.isfinite(record["base_pose"]).all(axis=1))
     if not len(rows):
         return None
-    low, high = _extent(body, rows)
-    size = high - low
-    stacked = size[0] > 1.8 * size[1] or style.narrow()
-    # If the world panel has a separate row, its height follows from its width, with 0.6 inch for labels.
-    above = 0.6 + (style.width() - 0.9) * float(size[1] / size[0])
-    height = 0.8 + above + BELOW if stacked else 0.9 + float(np.clip(3.9 * size[1] / size[0], 3.3, 6.0))
-    figure = style.new_figure(height, style.title(record, "base from above"))
-    if stacked:
-        world, own = figure.subplots(2, 1, height_ratios=[above, BELOW])
-    else:
-        world, own = figure.subplots(1, 2, width_ratios=[1.25, 1.0])
+    figure, (low, high) = style.new_figure(0.9, style.title(record, "base from above")), _extent(body, rows)
+    world, own = figure.subplots(*((2, 1) if style.narrow() else (1, 2)))
     _draw_world(world, body, rows)
     world.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     _draw_base_frame(own, body, rows)
     for axes in (world, own):
         axes.set_aspect("equal", adjustable="box", anchor="N")
-    if stacked and not style.narrow():
-        own.set_anchor("NW")
-        entries = style.legend_entries([world, own])
-        own.legend(entries.values(), entries, loc="center left", bbox_to_anchor=(1.3, 0.5), ncols=2)
+    # Panels of different scales have the same height if they are next to each other.
+    shapes = [float(np.ptp(axes.get_ylim()) / np.ptp(axes.get_xlim())) for axes in (world, own)]
+    grid: Any = world.get_gridspec()
+    if style.narrow():
+        heights = [0.6 + (style.width() - 0.9) * shapes[0], BELOW]
+        grid.set_height_ratios(heights)
+        figure.grow(72.0 * sum(heights))
     else:
-        style.legend_below(figure, [world, own], 4)
+        grid.set_width_ratios([1.0 / shape for shape in shapes])
+        figure.grow(72.0 * (0.6 + (style.width() - 2.0) / sum(1.0 / shape for shape in shapes)))
+    style.legend_below(figure, [world, own], 4)
     figure.note("Circles: centre of pressure at the start (white) and at the end (black).")
     return figure
 

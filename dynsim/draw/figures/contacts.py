@@ -95,6 +95,8 @@ ROWS, ROW, PAGE = 4, 1.75, 7.8
 NUMBERED = 4
 # Maximum number of samples that are drawn as dots.
 DOTS = 150
+# Share of the run below which a contact is closed only for an instant, and maximum number of such contacts in the note.
+BRIEF, LISTED = 0.005, 5
 # Colours of the bands for the modes, by number.
 MODE = "contact_mode"
 BANDS: dict[str, dict[str, Any]] = {
@@ -118,13 +120,16 @@ def _forces(records: Mapping[str, Record], title: str) -> Figure | None:
     """Draw rows of forces; for a single run (named ""), also contact modes, or the time during which surfaces pull."""
     runs, alone = list(records.values()), "" in records
     # Under the unilateral law most candidates never touch.
-    names = [name for name in contact_names(runs) if any(_touched(record, name) for record in runs)]
+    touching = {(v, name): _touched(r, name) for v, r in records.items() for name in contact_names(runs)}
+    # Contacts that are closed for an instant are in a note, unless all are.
+    least = BRIEF if max(touching.values(), default=0.0) > BRIEF else 0.0
+    names = [name for name in contact_names(runs) if any(touching[v, name] > least for v in records)]
     if not names:
         return None
     chosen = _most_interesting(names, runs)
     kind = "highest" if any(map(is_unilateral, runs)) else "lowest"
     note = "" if len(chosen) == len(names) else f", {len(chosen)} of {len(names)} contacts ({kind} forces)"
-    having = {name: {v: r for v, r in records.items() if _touched(r, name)} for name in chosen}
+    having = {name: {v: r for v, r in records.items() if touching[v, name] > least} for name in chosen}
     labels = {
         (name, v): f"{v or name}: {_share(r, name)}{_modes(r, name) * alone}{_within(r, name)}"
         for name in chosen
@@ -159,6 +164,10 @@ def _forces(records: Mapping[str, Record], title: str) -> Figure | None:
         if not many:
             style.legend_above(panels[-1], columns=2)
     _note_sampling(figure, rows, runs)
+    brief = [_brief(records[v], name, v) for (v, name), share in touching.items() if 0.0 < share <= least]
+    if brief:
+        others = f" and {len(brief) - LISTED} more" if len(brief) > LISTED else ""
+        figure.note(f"Closed for an instant, not drawn: {'; '.join(brief[:LISTED])}{others}.")
     if not many:
         also = ", also as dashed lines within the axes" if alone else ""
         figure.note(f"Legend: share of the run; range over all integration steps, with peaks between samples{also}.")
@@ -177,8 +186,15 @@ def contact_names(records: Sequence[Record]) -> list[str]:
     return list(names)
 
 
-def _touched(record: Record, name: str) -> bool:
-    return name in contact_names([record]) and _summary(record, name).get("closed_fraction", 1.0) > 0.0
+def _touched(record: Record, name: str) -> float:
+    """Return the share of the run during which a contact is closed, 1 under the bilateral law."""
+    return float(_summary(record, name).get("closed_fraction", 1.0)) if name in contact_names([record]) else 0.0
+
+
+def _brief(record: Record, name: str, variant: str) -> str:
+    """Describe a contact that was closed for an instant."""
+    lasts, of = 1e3 * _touched(record, name) * float(record.time[-1]), f" of {variant}" if variant else ""
+    return f"{name}{of} ({style.number(lasts, 2)} ms, up to {style.number(float(_extremes(record, name).max()), 3)} N)"
 
 
 def is_unilateral(record: Record) -> bool:

@@ -441,9 +441,11 @@ def draw_limits(
 
 # Hand and target: paths in three planes, and tracking error over time ([WM] Figs 4–6).
 PLANES = ((0, 1), (0, 2), (1, 2))
-# A path whose extent along an axis is below this fraction of the largest extent is drawn in the other plane only.
-EDGE_ON = 2e-3
+# A path whose extent along an axis is below this fraction of the largest extent, about the width of a line, is drawn in
+# the other plane only; if the ratio is above UNEQUAL, the axes of a plane have different scales.
+EDGE_ON, UNEQUAL = 0.0125, 8.0
 MILLI = 1e3
+SIDES = np.array([-1.0, 1.0])
 # A target that moves by less than this counts as fixed [m].
 HELD = 1e-6
 # Maximum number of legend entries in the free corner of a narrow figure.
@@ -477,16 +479,20 @@ def _paths(records: Mapping[str, Record], title: str) -> Figure | None:
         return None
     low, high = _box(list(shown.values()))
     planes, note = _planes(low, high)
-    wide = not style.narrow()
+    wide, alone = not style.narrow(), len(planes) == 1
     corner = len(planes) == 3 and not wide
-    figure = style.new_figure(2.5 if wide else 3.6 if corner else 1.1 + 2.0 * len(planes), title)
+    height = 3.6 if corner else 2.5 if wide else 1.1 + 2.0 * len(planes)
+    if alone:
+        across, up = (high - low)[list(planes[0])]
+        height = 1.0 + float(np.clip((style.width() - 0.9) * up / max(across, style.NOTHING), 1.6, 3.0))
+    figure = style.new_figure(height, title)
     if corner:
         # As in a technical drawing: xz is below xy, and yz beside it.
         grid = figure.add_gridspec(2, 2)
         panels = [figure.add_subplot(grid[cell]) for cell in ((0, 0), (1, 0), (1, 1))]
     else:
         panels = list(figure.subplots(*((1, len(planes)) if wide else (len(planes), 1)), squeeze=False).ravel())
-    _frame(panels, planes, low, high)
+    note += _frame(panels, planes, low, high)
     if corner:
         panels[0].set_anchor("S")
     styles = style.variant_styles(list(records))
@@ -506,7 +512,7 @@ def _paths(records: Mapping[str, Record], title: str) -> Figure | None:
     else:
         style.legend_below(figure, panels[:1], 4)
     if note:
-        figure.note(note)
+        figure.note(note.strip())
     return figure
 
 
@@ -577,6 +583,8 @@ def _scale_distances(figure: style.Drawing, panels: Sequence[Axes], settled: Seq
     figure.note(f"Distance: logarithmic, not drawn below {style.number(low, 2)} mm.")
     for axes in panels:
         axes.autoscale(axis="y")
+        for text in [*axes.texts]:
+            text.remove()  # the maximum is no longer cut
         axes.set_ylim(low, axes.get_ylim()[1])
         style.log_axis(axes)
     if len(panels) > 1:
@@ -603,20 +611,23 @@ def _planes(low: Array, high: Array) -> tuple[Sequence[tuple[int, int]], str]:
     return [plane for plane in PLANES if k not in plane], f"Coordinate {'xyz'[k]}: {constant}{within}."
 
 
-def _frame(panels: Sequence[Axes], planes: Sequence[tuple[int, int]], low: Array, high: Array) -> None:
-    """Set limits of square panels with equal scale, and label their axes."""
-    span = float((high - low).max())
-    half = 0.56 * span if span > 0.0 else 0.05
-    middle = 0.5 * (low + high)
-    for axes, (i, j) in zip(panels, planes, strict=True):
-        axes.set_aspect("equal", anchor="N")  # put unused space above the legend
-        axes.set_xlim(middle[i] - half, middle[i] + half)
-        axes.set_ylim(middle[j] - half, middle[j] + half)
-        axes.set_xlabel(f"${'xyz'[i]}$ [m]")
-        axes.set_ylabel(f"${'xyz'[j]}$ [m]")
-        # Use fewer ticks along x, because labels such as "−0.050" are wide.
-        axes.locator_params(axis="x", nbins=4 if len(planes) == 1 or not style.narrow() else 3)
-        axes.locator_params(axis="y", nbins=5)
+def _frame(panels: Sequence[Axes], planes: Sequence[tuple[int, int]], low: Array, high: Array) -> str:
+    """Set limits of panels, with equal scale if the extents are comparable; label their axes; return a note."""
+    size, apart = high - low, []
+    margin = 0.06 * float(size.max()) or 0.05
+    for axes, plane in zip(panels, planes, strict=True):
+        across, up = size[list(plane)].tolist()
+        half = 0.5 * np.array([across, up]) + margin
+        if UNEQUAL * min(across, up) < size.max():
+            half = 0.56 * np.array([across or margin, up or margin])
+            apart.append(" and ".join("xyz"[k] for k in plane))
+        else:
+            axes.set_aspect("equal", anchor="N")  # put unused space above the legend
+            half = half if len(planes) == 1 else np.full(2, 0.5 * float(size.max()) + margin)
+        middle = 0.5 * (low + high)[list(plane)]
+        axes.set(xlim=middle[0] + SIDES * half[0], ylim=middle[1] + SIDES * half[1])
+        axes.set(**{f"{name}label": f"${'xyz'[k]}$ [m]" for name, k in zip("xy", plane, strict=True)})
+    return f" Axes have different scales: {', '.join(apart)}." if apart else ""
 
 
 def _draw_target(axes: Axes, record: Record, plane: tuple[int, int]) -> None:

@@ -43,6 +43,7 @@ from dynsim.draw.figures.snake_view import (
     overlaid,
     overlay_margins,
     posture_grid,
+    rounding,
 )
 from dynsim.record import Record
 from dynsim.snake.lifting import snake_geometry
@@ -95,29 +96,33 @@ def comparison(records: Mapping[str, Record]) -> Figure:
     Up to six variants have curves over time. More variants have one bar each, from the smallest to the largest value.
     """
     title = style.comparison_title(list(records.values()), "cost, angles, margin and error")
-    figure = style.new_figure(6.6, title)
-    axes = figure.subplots(4, 1, sharex=True)
     errors = {name: 1e3 * record["position_error"] for name, record in records.items()}
+    exact = rounding("position error", "mm", *errors.values())
+    count = 4 - bool(exact)
+    figure = style.new_figure(0.6 + 1.5 * count, title)
+    axes = figure.subplots(count, 1, sharex=True)
     curves = {
-        name: (record["cost"], used_limit(record), 1e3 * record["support_margin"], errors[name])
+        name: (record["cost"], used_limit(record), 1e3 * record["support_margin"], errors[name])[:count]
         for name, record in records.items()
     }
     if len(records) <= len(style.DASHES):
         looks = style.variant_styles(list(records))
         overlay_margins(axes[:3], records, looks)
         for name, record in records.items():
-            axes[3].plot(record.time, errors[name], **looks[name])
+            for axis in axes[3:]:
+                axis.plot(record.time, errors[name], **looks[name])
         axes[-1].set_xlabel("time [s]")
         axes[-1].set_xlim(0.0, max(record.time[-1] for record in records.values()) or None)
         style.legend_below(figure, axes[:1], 6)
     else:
         _bars(figure, axes, curves)
         margin_axes(axes[:3])
-    error_axis(axes[3], "position error", "mm", *errors.values())
-    if len(records) > len(style.DASHES):
-        for mark in axes[3].lines:
+    for axis in axes[3:]:
+        error_axis(axis, "position error", "mm", *errors.values())
+        for mark in axis.lines if len(records) > len(style.DASHES) else ():
             # Marks on the lower edge would be cut.
-            mark.set_visible(float(mark.get_ydata()[0]) > 1.1 * axes[3].get_ylim()[0])
+            mark.set_visible(float(mark.get_ydata()[0]) > 1.1 * axis.get_ylim()[0])
+    figure.note(*filter(None, [exact]))
     figure.align_ylabels(axes)
     return figure
 
@@ -173,8 +178,15 @@ def overview(record: Record) -> Figure:
 def tracking(record: Record) -> Figure:
     """Draw the coordinates of the controlled point that vary, with their targets, and the errors."""
     shown, note = moving([record])
-    columns = 1 if style.narrow() or len(shown) % 2 else 2
-    rows = (len(shown) + 2) // columns
+    parts = (
+        ("position error", "mm", 1e3 * record["position_error"]),
+        ("attitude error", "°", DEGREES * record["attitude_error"]),
+    )
+    exact = [rounding(*part) if shown else "" for part in parts]
+    drawn = [part for part, text in zip(parts, exact, strict=True) if not text]
+    count = len(shown) + len(drawn)
+    columns = 1 if style.narrow() or count % 2 else 2
+    rows = count // columns
     figure = style.new_figure(min(1.5 * rows + 0.8, 7.9), style.title(record, "tracking of the target"))
     axes = figure.subplots(rows, columns, sharex=True, squeeze=False)
     panels, time = list(axes.T.ravel()), record.time
@@ -186,19 +198,16 @@ def tracking(record: Record) -> Figure:
         axis.plot(time, scale * values, color=GROUND, label="controlled point")
         axis.plot(time, scale * target, "--", color=HEAD, lw=0.9, label="target")
         axis.set_ylabel(f"{COORDINATE_NAMES.get(record.labels['w'][i], record.labels['w'][i])} [{unit}]")
-    for axis, part, scale, unit in zip(
-        panels[len(shown) :], ("position", "attitude"), (1e3, DEGREES), ("mm", "°"), strict=False
-    ):
-        error = scale * record[f"{part}_error"]
+    for axis, (part, unit, error) in zip(panels[len(shown) :], drawn, strict=True):
         axis.plot(time, error, color=BODY, label="error")
-        error_axis(axis, f"{part} error", unit, error)
+        error_axis(axis, part, unit, error)
     for axis in panels:
         style.shade(axis, time, record["gripper"] > 0, "#EEEEEE", "gripper closed")
     for axis in axes[-1]:
         axis.set_xlabel("time [s]")
     figure.align_ylabels(axes)
     style.legend_below(figure, panels, 4)
-    figure.note(*filter(None, [note]))
+    figure.note(*filter(None, [note, *exact]))
     return figure
 
 

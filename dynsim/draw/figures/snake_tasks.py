@@ -203,7 +203,6 @@ def power(record: Record) -> Figure:
         axis.stairs(steps, record.time, color=colour, lw=1.0, baseline=None, label=label)
         axis.axhline(0.0, color=style.GREY, lw=0.6)
         axis.set_ylabel(f"{text}\npower [W]")
-        axis.locator_params(axis="y", nbins=4)
         style.legend_above(axis)
     axes[-1].set(xlabel="time [s]", xlim=(record.time[0], record.time[-1] or None))
     figure.align_ylabels(axes)

@@ -189,8 +189,6 @@ def _grid(
     axes = figure.subplots(len(heights), columns, squeeze=False, height_ratios=heights)
     for panel in axes.ravel():
         panel.set_aspect("equal", adjustable="box")
-        panel.locator_params(axis="x", nbins=int(np.clip((cell - 0.3) / style.letters(0.4), 1, 4)))
-        panel.locator_params(axis="y", nbins=3)
         panel.tick_params(labelsize=style.letters(SMALL))
     return figure, axes.reshape(len(rows), -1, columns)
 
@@ -444,6 +442,13 @@ def _shares(axis: Axes, record: Record, holds: NDArray[Any], places: NDArray[np.
     for position, share in zip(places, shares.T, strict=True):
         bar = [position - 0.4, position + 0.4]
         axis.pcolormesh(edges, bar, share[None], cmap=SHARES, vmin=0.0, vmax=1.0)
+
+
+def rounding(name: str, unit: str, *errors: NDArray[np.float64]) -> str:
+    """Return a note on errors [mm or °] that are rounding errors and need no panel, or ""."""
+    high = max(float(error.max(initial=0.0)) for error in errors)
+    limit = f"{style.number(ROUNDING)} {unit}".replace(" °", "°")
+    return "" if high > ROUNDING else f"{name.capitalize()}: below {limit}, not drawn."
 
 
 def error_axis(axis: Axes, name: str, unit: str, *errors: NDArray[np.float64]) -> None:

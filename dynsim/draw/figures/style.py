@@ -11,6 +11,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
+from itertools import product
+from operator import itemgetter
 from pathlib import Path
 from threading import RLock
 from typing import Any, TypeVar
@@ -128,10 +130,16 @@ _LOOK: Any = {
 LINE_POINTS = 4000
 # A transient panel shows TRANSIENT_ROOM times the transient, unless this exceeds TRANSIENT_MAX_SHARE of the run.
 TRANSIENT_ROOM, TRANSIENT_MAX_SHARE = 1.2, 0.8
+# Space beyond the settled range of a row that is cut, as a fraction of the range.
+HEADROOM = 0.3
 # Curves whose range is below this fraction of their largest value are drawn with zero.
 FLAT = 0.1
 # Values below this fraction of the scale of a quantity are rounding errors.
 NOTHING = 1e-9
+# Minimum number of labelled ticks of an axis, and minimum share of the data's range between the first and the last.
+LABELS, COVERED = 3, 0.6
+# Steps between ticks, as multiples of a power of ten: those of matplotlib, and more if they have too few labels.
+STEPS = ((1, 2, 2.5, 5, 10), (1, 2, 2.5, 3, 4, 5, 6, 8, 10))
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 # Group of the marks above axes, and the height of a row of them [point].
 RUG, RUG_ROW = "rug", 5.5
@@ -329,6 +337,7 @@ class Drawing(Figure):
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
         self._entries: dict[str, Any] = {}
+        self._automatic: set[AutoLocator] = set()
 
     @property
     def caption(self) -> str:
@@ -473,21 +482,21 @@ class Drawing(Figure):
         if isinstance(engine, ConstrainedLayoutEngine):
             share = min(used / self.bbox.height, 0.8)
             engine.set(rect=(0.0, share, 1.0, 1.0 - share))
-        # With ticks that depend on the size of the axes, the layout may alternate between two sizes, and cut labels.
-        # The width of axes with a fixed aspect follows from their height.
-        both = [axes.yaxis for axes in self.axes] + [axes.xaxis for axes in self.axes if axes.get_aspect() == "auto"]
-        automatic = [(axis, ticks) for axis in both if isinstance(ticks := axis.get_major_locator(), AutoLocator)]
+        # With ticks that depend on the size of the axes, the layout may alternate between two sizes, and cut labels. So
+        # the ticks are chosen once, after a first layout; a second one has space for their labels.
+        both = [axis for axes in self.axes[::-1] if axes.axison for axis in (axes.yaxis, axes.xaxis)]
+        automatic = {ticks: axis for axis in both if isinstance(ticks := axis.get_major_locator(), AutoLocator)}
         # Others have a number of ticks that was set.
-        automatic = [(axis, ticks) for axis, ticks in automatic if vars(ticks)["_nbins"] == "auto"]
-        for axis, locator in automatic:
-            locator.set_params(nbins=int(np.clip(0.85 * axis.get_tick_space(), 1, 9)))
+        self._automatic |= {ticks for ticks in automatic if vars(ticks)["_nbins"] == "auto"}
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
+            if engine is not None:
+                engine.execute(self)
+            for ticks in automatic.keys() & self._automatic:
+                _choose_ticks(automatic[ticks], ticks)
             if engine is not None and any(axes.get_aspect() != "auto" for axes in self.axes):
                 engine.execute(self)  # the space for labels of axes with a fixed aspect is only known afterwards
             super().draw(renderer)
-        for _, locator in automatic:
-            locator.set_params(nbins="auto")
         for warning in caught:
             if "collapsed" in str(warning.message) and not self.grows:
                 size = f"size {self.get_figwidth():.3g}x{self.get_figheight():.3g}"
@@ -502,6 +511,33 @@ def _room(axes: Axes) -> tuple[float, float]:
     assert cell is not None
     assert figure is not None
     return box.width * figure.get_figwidth(), box.height * figure.get_figheight() / len(cell.rowspan)
+
+
+def _choose_ticks(axis: Axis, locator: AutoLocator) -> None:
+    """Set the number of ticks: at least ``LABELS`` if they fit, which bracket the share ``COVERED`` of the data."""
+    # The sizes in ``rcParams`` may have changed since the figure was made.
+    axes: Any = axis.axes
+    which, size = int(axis is axis.axes.yaxis), float(axis.get_major_ticks(1)[0].label1.get_fontsize())
+    axes.apply_aspect()
+    low, high = sorted(axis.get_view_interval())
+    first, last = np.clip(axis.get_data_interval(), low, high)
+    first, last = (first, last) if first < last else (low, high)
+    # Points per unit.
+    scale = 72.0 * float(axes.bbox.size[which]) / axes.figure.dpi / max(high - low, 1e-300)
+    usual = int(np.clip(0.85 * axis.get_tick_space(), 1, 9))
+    best: tuple[float, int, tuple[float, ...]] = (-1.0, 1, STEPS[0])
+    for steps, count in product(STEPS, [*range(usual, 10), *range(usual - 1, 0, -1)]):
+        locator.set_params(nbins=count, steps=steps)
+        at = [float(tick) for tick in axis.get_majorticklocs() if low <= tick <= high]
+        texts = axis.get_major_formatter().format_ticks(at)
+        wide = 1.3 * size if which else max((text_width(text, size) for text in texts), default=0.0) + 0.7 * size
+        if len(at) > 1 and scale * (at[1] - at[0]) < wide:
+            continue
+        covered = (min(at[-1], last) - max(at[0], first)) / (last - first) if at else 0.0
+        best = max(best, (min(len(at), LABELS) + min(covered, COVERED), count, steps), key=itemgetter(0))
+        if best[0] == LABELS + COVERED:
+            return
+    locator.set_params(nbins=best[1], steps=best[2])
 
 
 def _words(label: str) -> str:
@@ -904,24 +940,26 @@ def time_rows(
             axes[-1].set_ylim(transient.low, transient.high)
         if transient is not None and split and compress:
             _compress(axes[0], transient)
+        if transient is not None and not split:
+            _state_peaks(axes[-1], transient)
     for axis in grid[-1]:
         axis.set_xlabel("time [s]")
     if split:
         grid[-1, 0].set_xlabel("time [s]: initial transient")
         grid[-1, 1].set_xlabel("time [s]: whole run, axes cut to the settled range")
     elif window > 0.0:
-        figure.note("Axes are cut to the settled range; the initial transient exceeds it.")
+        figure.note("Axes are cut to the settled range; the initial transient exceeds it (max, min: extremes).")
     return [tuple(axes) for axes in grid]
 
 
 @dataclass(frozen=True)
 class Transient:
-    """End of a row's transient [s], range of the row's axis afterwards, and absolute value of the peak."""
+    """End of a row's transient [s], range of the row's axis afterwards, and extremes of the whole run."""
 
     end: float
     low: float
     high: float
-    largest: float
+    peaks: tuple[float, float]
 
 
 def _transient(row: Sequence[Series], settle: float, zero: bool) -> Transient | None:
@@ -932,28 +970,41 @@ def _transient(row: Sequence[Series], settle: float, zero: bool) -> Transient | 
     if settled.size < 2:
         return None
     low, high = float(settled.min()), float(settled.max())
-    if zero or high - low < FLAT * max(-low, high):
+    if high - low < (FLAT if zero else 0.2 * FLAT) * max(-low, high) or zero:
         low, high = min(low, 0.0), max(high, 0.0)
     span = high - low
     if span <= 0.0 or np.ptp(np.append(everything, [low, high])) < 1.5 * span:
         return None
-    low, high = low - 0.12 * span, high + 0.12 * span
+    # A part that is cut leaves space, so that the settled range is not at the edge.
+    within = (float(everything.min()) - 0.05 * span, float(everything.max()) + 0.05 * span)
+    low, high = min(low, max(low - HEADROOM * span, within[0])), max(high, min(high + HEADROOM * span, within[1]))
     end = 0.0
     for time, values in row:
         beyond = ((values < low) | (values > high)).reshape(len(time), -1).any(axis=1)
         if beyond.any():
             end = max(end, float(time[beyond][-1]))
     # The panel also shows a little of the settled range.
-    return Transient(max(1.5 * end, 0.02 * settle), low, high, float(np.abs(everything).max()))
+    return Transient(max(1.5 * end, 0.02 * settle), low, high, (float(everything.min()), float(everything.max())))
+
+
+def _state_peaks(axes: Axes, transient: Transient) -> None:
+    """Write the extremes that are cut at the edges of the axes."""
+    low, high = transient.peaks
+    look: dict[str, Any] = {"color": NOTE, "fontsize": letters(6.5), "backgroundcolor": (1.0, 1.0, 1.0, 0.7)}
+    ends = (("max", high > transient.high, high, 0.98, "top"), ("min", low < transient.low, low, 0.02, "bottom"))
+    for name, is_cut, peak, y, side in ends:
+        if is_cut:
+            axes.text(0.03, y, f"{name} {number(peak, 3)}", transform=axes.transAxes, va=side, **look)
 
 
 def _compress(axes: Axes, transient: Transient) -> None:
     """Make the axis linear within the settled range and logarithmic beyond it, so that a peak hides no details."""
     settled = max(abs(transient.low), abs(transient.high))
-    if transient.largest > 3.0 * settled:
+    largest = max(map(abs, transient.peaks))
+    if largest > 3.0 * settled:
         axes.set_yscale("symlog", linthresh=settled)
         steps = [m * 10.0**k for k in range(-9, 10) for m in (1, 3)]
-        ticks = [step for step in steps if 0.5 * settled <= step <= transient.largest]
+        ticks = [step for step in steps if 0.5 * settled <= step <= largest]
         axes.set_yticks([-tick for tick in ticks[::-1]] + [0.0, *ticks])
         axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: number(value)))
         axes.yaxis.set_minor_locator(NullLocator())

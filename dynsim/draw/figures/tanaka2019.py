@@ -17,6 +17,7 @@ from dynsim.draw.figures import style
 from dynsim.draw.figures.snake_view import (
     COORDINATE_NAMES,
     COST,
+    DEGREES,
     GROUND,
     HEAD,
     LIMIT,
@@ -144,12 +145,13 @@ def sag_and_feedback(records: Mapping[str, Record]) -> Figure:
     for column, (name, title) in zip(axes.T, shown.items(), strict=True):
         record = records[name]
         for i, axis in zip(drawn, column, strict=True):
-            axis.plot(record.time, 1e3 * record["w"][:, i], color=GROUND, label="simulated")
-            axis.plot(record.time, 1e3 * record["w_target"][:, i], "--", color=HEAD, lw=1.0, label="target")
+            scale = 1e3 if i < 3 else DEGREES
+            axis.plot(record.time, scale * record["w"][:, i], color=GROUND, label="simulated")
+            axis.plot(record.time, scale * record["w_target"][:, i], "--", color=HEAD, lw=1.0, label="target")
         column[0].set_title(title, fontsize=style.letters(8.0))
         column[-1].set_xlabel("time [s]")
     for i, axis in zip(drawn, axes[:, 0], strict=True):
-        axis.set_ylabel(f"{_name(i)} [{'mm' if i < 3 else 'mrad'}]")
+        axis.set_ylabel(f"{_name(i)} [{'mm' if i < 3 else '°'}]")
     figure.align_ylabels(axes[:, 0])
     style.legend_below(figure, [axes[0, 0]], 2)
     figure.note(*filter(None, [note]))

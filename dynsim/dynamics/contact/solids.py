@@ -34,7 +34,7 @@ EDGES, OTHERS, BORDERS, FEATURES = 8, 20, 28, 52
 FLAT = 0.98
 # Difference of gaps below which the nearest place of an edge is where the edge begins or ends to be above a face [m].
 SAME = 1e-12
-# A feature of the last step keeps its slot unless another one is deeper by this distance [m], or further by this factor.
+# A feature of the last step keeps its slot unless another one is deeper by this distance [m], or farther by this.
 STAYS, STAYS_FACTOR = 1e-6, 1.02
 # Places within this distance behind the deepest one can touch as well [m].
 BAND = 2e-3
@@ -250,7 +250,7 @@ def find_contacts(pose_a, core_a, pose_b, core_b, known, slots, places, chosen):
 
 @internal_kernel
 def note_borders(places, known, R, p, h, Q, q, box, own, other, sign):
-    """Write the places where edges of a solid (R, p, h) begin and end to be above the nearest face of a box (Q, q, box).
+    """Write the places where edges of a solid (R, p, h) enter and leave the space above the nearest face of a box.
 
     The corners of the area in which two faces touch are corners of the faces, or such places.
     """
@@ -383,10 +383,10 @@ def deepest_place(places, known):
 @internal_kernel
 def is_known(known, f):
     """Return whether feature f had a slot in the last step."""
+    same = False
     for j in range(SLOTS):
-        if known[j] == f:
-            return True
-    return False
+        same = same or known[j] == f
+    return same
 
 
 @internal_kernel
