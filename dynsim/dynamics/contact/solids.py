@@ -34,7 +34,7 @@ EDGES, OTHERS, BORDERS, FEATURES = 8, 20, 28, 52
 FLAT = 0.98
 # Difference of gaps below which the nearest place of an edge is where the edge begins or ends to be above a face [m].
 SAME = 1e-12
-# A feature of the last step keeps its slot unless another one is deeper by this distance [m], or farther by this.
+# A feature of the last step keeps its slot unless another one is this much deeper [m], or farther by this factor.
 STAYS, STAYS_FACTOR = 1e-6, 1.02
 # Places within this distance behind the deepest one can touch as well [m].
 BAND = 2e-3
