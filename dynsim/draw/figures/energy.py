@@ -320,7 +320,7 @@ def torques(record: Record) -> Figure | None:
         return None
     limits = {key for unit, motors in loads.items() for motor in motors for key in TORQUES[unit][2:] if key in motor}
     subject = "load of each motor, with limit and rating" if limits else "load of each motor"
-    heights = [0.55 + 0.17 * len(motors) for motors in loads.values()]
+    heights = [0.7 + 0.17 * len(motors) for motors in loads.values()]
     figure = style.new_figure(0.7 + sum(heights), style.title(record, subject))
     panels = figure.subplots(len(loads), 1, height_ratios=heights, squeeze=False)[:, 0]
     called = _names(record)
@@ -336,7 +336,7 @@ def torques(record: Record) -> Figure | None:
         axes.set_xlim(0.0, 1.05 * axes.get_xlim()[1])
         # The numbers of short bars cannot be read from the axis; a column next to the axes never hides a limit.
         look = {"transform": axes.get_yaxis_transform(), "va": "center", "fontsize": style.letters(7.0)}
-        axes.text(1.02, -1.0, f"max, rms [{symbol}]", **look)
+        axes.text(1.02, 1.0, f"max, rms [{symbol}]", **{**look, "transform": axes.transAxes, "va": "bottom"})
         for k, pair in enumerate(zip(most, rms, strict=True)):
             axes.text(1.02, k, ", ".join(style.number(value, 2) for value in pair), **look)
     style.legend_below(figure, list(panels), 4)

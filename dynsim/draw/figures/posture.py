@@ -379,7 +379,7 @@ def posture(record: Record) -> Figure | None:
     style.legend_below(figure, [side], 5)
     if before := ", ".join(style.number(float(record.time[row]), 2) for row in body.rows_shown[:-1]):
         solids = f" Dashed: base and objects at {style.number(float(record.time[body.rows_shown[0]]), 2)} s."
-        figure.note(f"Faint: at {before} s.{solids if any(body.bases()) else ''}")
+        figure.note(f"Faint: posture at {before} s.{solids if any(body.bases()) else ''}")
     return figure
 
 

@@ -715,7 +715,7 @@ def _colours() -> Sequence[str]:
 
 
 # Legend entry of variants without an ending.
-ALONE = "without ending"
+ALONE = "without suffix"
 
 
 def families(names: Sequence[str]) -> dict[str, tuple[str, str]]:
