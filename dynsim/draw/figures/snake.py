@@ -101,10 +101,6 @@ def comparison(records: Mapping[str, Record]) -> Figure:
     count = 4 - bool(exact)
     figure = style.new_figure(0.6 + 1.5 * count, title)
     axes = figure.subplots(count, 1, sharex=True)
-    curves = {
-        name: (record["cost"], used_limit(record), 1e3 * record["support_margin"], errors[name])[:count]
-        for name, record in records.items()
-    }
     if len(records) <= len(style.DASHES):
         looks = style.variant_styles(list(records))
         overlay_margins(axes[:3], records, looks)
@@ -115,7 +111,7 @@ def comparison(records: Mapping[str, Record]) -> Figure:
         axes[-1].set_xlim(0.0, max(record.time[-1] for record in records.values()) or None)
         style.legend_below(figure, axes[:1], 6)
     else:
-        _bars(figure, axes, curves)
+        _bars(figure, axes, records)
         margin_axes(axes[:3])
     for axis in axes[3:]:
         error_axis(axis, "position error", "mm", *errors.values())
@@ -127,15 +123,17 @@ def comparison(records: Mapping[str, Record]) -> Figure:
     return figure
 
 
-def _bars(figure: style.Drawing, axes: Sequence[Axes], curves: Mapping[str, Sequence[NDArray[np.float64]]]) -> None:
+def _bars(figure: style.Drawing, axes: Sequence[Axes], records: Mapping[str, Record]) -> None:
     """Draw the range of each quantity of each variant; variants with the same stem are next to each other."""
-    parts = style.families(list(curves))
+    parts = style.families(list(records))
     stems, endings = (list(dict.fromkeys(part)) for part in zip(*parts.values(), strict=True))
     looks, entries = style.variant_styles(endings), {}
     for name, (stem, ending) in parts.items():
         k, colour = endings.index(ending), looks[ending]["color"]
         x = stems.index(stem) + 0.8 * ((k + 0.5) / len(endings) - 0.5)
-        for axis, values in zip(axes, curves[name], strict=True):
+        run = records[name]
+        quantities = run["cost"], used_limit(run), 1e3 * run["support_margin"], 1e3 * run["position_error"]
+        for axis, values in zip(axes, quantities, strict=False):
             axis.vlines(x, values.min(), values.max(), color=colour, lw=1.5)
             (mark,) = axis.plot(x, values[-1], "osD^v<>"[k % 7], color=colour, ms=3.5, mec="white", mew=0.3)
         entries[f"…_{ending}" if ending else style.ALONE] = mark

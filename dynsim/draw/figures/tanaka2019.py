@@ -57,11 +57,11 @@ def figures(scenario: str, records: Mapping[str, Record]) -> dict[str, Maker]:
     """Return the drawing functions of comparisons with [T] by file name, for the variants that were run."""
     makers: dict[str, Maker] = {}
     if scenario == "snake_positioning" and set(records) & set(TABLE_III):
-        makers["table_iii"] = positioning
+        makers["table_iii"] = lambda r: _deviations(r, {"kinematic": ""})
     if scenario == "snake_positioning_dynamic":
         moved = [name for name in TABLE_III if name in records]
         if moved:
-            makers |= {"table_iii": dynamic_positioning, "wheel_loads": wheel_loads}
+            makers |= {"table_iii": lambda r: _deviations(r, SOURCES), "wheel_loads": wheel_loads}
         if {"beta", "beta_measured"} <= set(records):
             makers["fig_7"] = sag_and_feedback
     if scenario == "snake_joint_limits":
@@ -89,18 +89,11 @@ MARKS: dict[str, tuple[str, dict[str, Any]]] = {
 }
 
 
-def positioning(records: Mapping[str, Record]) -> Figure:
-    """Draw Table III of [T]: deviation from the target displacement, measured in [T] and simulated here."""
-    return _deviations(records, {"kinematic": ""})
-
-
-def dynamic_positioning(records: Mapping[str, Record]) -> Figure:
-    """Draw Table III of [T]: deviation from the target displacement, measured in [T] and simulated in three ways."""
-    return _deviations(records, SOURCES)
-
-
 def _deviations(records: Mapping[str, Record], sources: Mapping[str, str]) -> Figure:
-    """Draw the deviations of six displacements, with the endings of the names of variants by their source."""
+    """Draw Table III of [T]: deviations from six target displacements, measured in [T] and simulated here.
+
+    ``sources`` contains the endings of the names of variants by the source of their displacement.
+    """
     moved = [name for name in TABLE_III if name in records]
     places, published = np.arange(len(moved)), [TABLE_III[name] for name in moved]
     figure = style.new_figure(7.0, "displacement of the head minus its target, Table III of Tanaka et al. 2019")
