@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Text
-from matplotlib.ticker import FixedFormatter
+from matplotlib.ticker import FixedLocator
 from matplotlib.transforms import Bbox
 
 import dynsim
@@ -123,13 +123,13 @@ def _name(text: Text) -> str:
     return repr(" ".join(text.get_text().split())[:60])
 
 
-# Minimum number of labelled ticks of an axis, and of an axis shorter than LOW [inch]; minimum share of the data's range
+# Minimum number of labelled ticks of an axis, and of an x or y axis shorter than LOW [inch]; minimum share of the axis
 # between the first and the last label.
-LABELS, FEW, LOW, COVERED = 3, 2, 0.5, 0.6
+LABELS, FEW, LOW, COVERED = 3, 2, (1.1, 0.5), 0.55
 
 
 def tick_faults(figure: Figure) -> list[str]:
-    """Return linear axes of a drawn figure with few labels, or with labels that cover only a part of the data."""
+    """Return linear axes of a drawn figure with few labels, or with labels that cover a small part of the axis."""
     faults = []
     for axes in (axes for axes in figure.axes if axes.axison and axes.get_visible() and axes.name == "rectilinear"):
         for which, axis in enumerate((axes.xaxis, axes.yaxis)):
@@ -137,14 +137,11 @@ def tick_faults(figure: Figure) -> list[str]:
             texts = [text for text in axis.get_majorticklabels() if text.get_text()]
             labelled = texts and axis.get_tick_params()[f"label{('bottom', 'left')[which]}"]
             at = [float(tick) for tick in axis.get_majorticklocs() if low <= tick <= high]
-            if axis.get_scale() != "linear" or not labelled or isinstance(axis.get_major_formatter(), FixedFormatter):
+            if axis.get_scale() != "linear" or not labelled or isinstance(axis.get_major_locator(), FixedLocator):
                 continue
             length = axes.bbox.size[which] / figure.dpi
             name = f"{axis.get_label_text() or which!r} of {_name(axes.yaxis.label)}"
-            if len(at) < (LABELS if length >= LOW else FEW):
-                faults.append(f"{name} ({length:.2f} in): labels only {at} in {low:.4g} … {high:.4g}")
-            first, last = np.clip([axes.dataLim.min[which], axes.dataLim.max[which]], low, high)
-            covered = min(max(at, default=low), last) - max(min(at, default=low), first)
-            if len(at) >= FEW and covered < COVERED * (last - first):
-                faults.append(f"{name} ({length:.2f} in): labels {at} for {first:.4g} … {last:.4g}")
+            long = length >= LOW[which]
+            if len(at) < (LABELS if long else FEW) or (long and at[-1] - at[0] < COVERED * (high - low)):
+                faults.append(f"{name} ({length:.2f} in): labels {at} in {low:.4g} … {high:.4g}")
     return faults

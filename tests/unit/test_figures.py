@@ -16,7 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
-from support.layout import layout_faults
+from support.layout import layout_faults, tick_faults
 from support.messages import lines_with, mentions, raises, says
 
 import dynsim
@@ -301,6 +301,42 @@ def test_transient_has_a_panel_and_the_rest_its_own_range() -> None:
     assert panels[1].get_ylim()[1] < 1.5
     (whole,) = style.time_rows(style.new_figure(3.0, ""), [[(time, np.sin(time))]], settle=2.0)
     assert len(whole) == 1
+
+
+def test_short_peak_is_cut_and_stated() -> None:
+    time = np.linspace(0.0, 10.0, 1001)
+    values = np.sin(time)
+    values[500] = 80.0
+    (panels,) = style.time_rows(figure := style.new_figure(3.0, ""), [[(time, values)]], settle=2.0)
+    assert 1.2 < panels[-1].get_ylim()[1] < 3.0
+    assert [text.get_text() for text in panels[-1].texts] == ["max 80"]
+    assert mentions(figure.caption, "Short peaks")
+
+
+@pytest.mark.parametrize(("low", "high"), [(-0.005, 0.0045), (247.0, 286.0), (0.0, 92.0), (-1.0, 0.9)])
+@pytest.mark.parametrize("height", [0.9, 1.2, 2.5])
+def test_labels_of_ticks_span_the_axis(low: float, high: float, height: float) -> None:
+    figure = style.new_figure(height, "")
+    figure.subplots().plot([low, high], [low, high])
+    figure.draw_without_rendering()
+    assert tick_faults(figure) == []
+
+
+def test_planes_of_a_flat_path_have_different_scales() -> None:
+    panels = list(style.new_figure(3.0, "").subplots(1, 3))
+    note = energy._frame(panels, energy.PLANES, np.zeros(3), np.array([0.4, 0.3, 0.02]))
+    assert [axes.get_aspect() for axes in panels] == [1.0, "auto", "auto"]
+    assert mentions(note, "x and z, y and z")
+
+
+def test_contact_of_an_instant_is_in_the_note(real: Record) -> None:
+    short = copy.deepcopy(real)
+    for contact in short.summary["contacts"]:
+        contact["closed_fraction"] = 1e-3
+    figure = drawn(contacts.forces_comparison({"real": real, "short": short}))
+    assert mentions(figure.caption, "Closed for an instant", "elbow_7 of short")
+    assert not lines_with(texts(figure).splitlines(), "short:")
+    assert mentions(drawn(contacts.forces(short)).caption, "Sampled")
 
 
 @pytest.mark.parametrize("settle", [9.0, 9.9, 20.0])

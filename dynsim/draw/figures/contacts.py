@@ -166,7 +166,7 @@ def _forces(records: Mapping[str, Record], title: str) -> Figure | None:
     _note_sampling(figure, rows, runs)
     brief = [_brief(records[v], name, v) for (v, name), share in touching.items() if 0.0 < share <= least]
     if brief:
-        others = f" and {len(brief) - LISTED} more" if len(brief) > LISTED else ""
+        others = f" and {len(brief) - LISTED} more" * (len(brief) > LISTED)
         figure.note(f"Closed for an instant, not drawn: {'; '.join(brief[:LISTED])}{others}.")
     if not many:
         also = ", also as dashed lines within the axes" if alone else ""

@@ -627,6 +627,7 @@ def _frame(panels: Sequence[Axes], planes: Sequence[tuple[int, int]], low: Array
         middle = 0.5 * (low + high)[list(plane)]
         axes.set(xlim=middle[0] + SIDES * half[0], ylim=middle[1] + SIDES * half[1])
         axes.set(**{f"{name}label": f"${'xyz'[k]}$ [m]" for name, k in zip("xy", plane, strict=True)})
+        axes.tick_params(labelsize=style.letters(6.5 if style.narrow() else 7.5))
     return f" Axes have different scales: {', '.join(apart)}." if apart else ""
 
 

@@ -446,9 +446,8 @@ def _shares(axis: Axes, record: Record, holds: NDArray[Any], places: NDArray[np.
 
 def rounding(name: str, unit: str, *errors: NDArray[np.float64]) -> str:
     """Return a note on errors [mm or °] that are rounding errors and need no panel, or ""."""
-    high = max(float(error.max(initial=0.0)) for error in errors)
-    limit = f"{style.number(ROUNDING)} {unit}".replace(" °", "°")
-    return "" if high > ROUNDING else f"{name.capitalize()}: below {limit}, not drawn."
+    text = f"{name.capitalize()}: below {ROUNDING:g} {unit}, not drawn.".replace(" °", "°")
+    return text if all(error.max(initial=0.0) <= ROUNDING for error in errors) else ""
 
 
 def error_axis(axis: Axes, name: str, unit: str, *errors: NDArray[np.float64]) -> None:

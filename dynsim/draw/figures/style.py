@@ -12,7 +12,6 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 from itertools import product
-from operator import itemgetter
 from pathlib import Path
 from threading import RLock
 from typing import Any, TypeVar
@@ -130,16 +129,18 @@ _LOOK: Any = {
 LINE_POINTS = 4000
 # A transient panel shows TRANSIENT_ROOM times the transient, unless this exceeds TRANSIENT_MAX_SHARE of the run.
 TRANSIENT_ROOM, TRANSIENT_MAX_SHARE = 1.2, 0.8
+# Peaks in less than this share of the samples [%] are cut if the range with them is SPIKE times the range without them.
+SHORT, SPIKE = 2.0, 5.0
 # Space beyond the settled range of a row that is cut, as a fraction of the range.
 HEADROOM = 0.3
 # Curves whose range is below this fraction of their largest value are drawn with zero.
 FLAT = 0.1
 # Values below this fraction of the scale of a quantity are rounding errors.
 NOTHING = 1e-9
-# Minimum number of labelled ticks of an axis, and minimum share of the data's range between the first and the last.
+# Minimum number of labelled ticks of an axis, and minimum share of its range between the first and the last.
 LABELS, COVERED = 3, 0.6
 # Steps between ticks, as multiples of a power of ten: those of matplotlib, and more if they have too few labels.
-STEPS = ((1, 2, 2.5, 5, 10), (1, 2, 2.5, 3, 4, 5, 6, 8, 10))
+STEPS = ((1, 2, 2.5, 5, 10), (1, 1.5, 2, 2.5, 3, 4, 5, 6, 8, 10))
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 # Group of the marks above axes, and the height of a row of them [point].
 RUG, RUG_ROW = "rug", 5.5
@@ -514,28 +515,27 @@ def _room(axes: Axes) -> tuple[float, float]:
 
 
 def _choose_ticks(axis: Axis, locator: AutoLocator) -> None:
-    """Set the number of ticks: at least ``LABELS`` if they fit, which bracket the share ``COVERED`` of the data."""
+    """Set the number of ticks: at least ``LABELS`` if they fit, which span the share ``COVERED`` of the axis."""
     # The sizes in ``rcParams`` may have changed since the figure was made.
     axes: Any = axis.axes
     which, size = int(axis is axis.axes.yaxis), float(axis.get_major_ticks(1)[0].label1.get_fontsize())
     axes.apply_aspect()
     low, high = sorted(axis.get_view_interval())
-    first, last = np.clip(axis.get_data_interval(), low, high)
-    first, last = (first, last) if first < last else (low, high)
-    # Points per unit.
-    scale = 72.0 * float(axes.bbox.size[which]) / axes.figure.dpi / max(high - low, 1e-300)
+    # Length of the axis [point].
+    length = 72.0 * float(axes.bbox.size[which]) / axes.figure.dpi
     usual = int(np.clip(0.85 * axis.get_tick_space(), 1, 9))
     best: tuple[float, int, tuple[float, ...]] = (-1.0, 1, STEPS[0])
     for steps, count in product(STEPS, [*range(usual, 10), *range(usual - 1, 0, -1)]):
         locator.set_params(nbins=count, steps=steps)
         at = [float(tick) for tick in axis.get_majorticklocs() if low <= tick <= high]
         texts = axis.get_major_formatter().format_ticks(at)
-        wide = 1.3 * size if which else max((text_width(text, size) for text in texts), default=0.0) + 0.7 * size
-        if len(at) > 1 and scale * (at[1] - at[0]) < wide:
+        wide = 1.3 * size if which else max((text_width(text, size) for text in texts), default=0.0) + 0.5 * size
+        if len(at) > 1 and length * (at[1] - at[0]) < wide * (high - low):
             continue
-        covered = (min(at[-1], last) - max(at[0], first)) / (last - first) if at else 0.0
-        best = max(best, (min(len(at), LABELS) + min(covered, COVERED), count, steps), key=itemgetter(0))
-        if best[0] == LABELS + COVERED:
+        covered = (at[-1] - at[0]) / (high - low) if at else 0.0
+        if (score := min(len(at), LABELS) + min(covered, COVERED)) > best[0]:
+            best = (score, count, steps)
+        if score == LABELS + COVERED:
             return
     locator.set_params(nbins=best[1], steps=best[2])
 
@@ -923,9 +923,7 @@ def time_rows(
     """
     end = max(time[-1] for row in rows for time, _ in row)
     longest = TRANSIENT_MAX_SHARE * end / TRANSIENT_ROOM
-    transients = [
-        t if t is not None and t.end < longest else None for t in (_transient(row, settle, zero) for row in rows)
-    ]
+    transients = [_transient(row, settle, zero, longest) or _spike(row) for row in rows]
     window = max((transient.end for transient in transients if transient is not None), default=0.0)
     split = window > 0.0 and not narrow()
     grid = figure.subplots(
@@ -940,7 +938,7 @@ def time_rows(
             axes[-1].set_ylim(transient.low, transient.high)
         if transient is not None and split and compress:
             _compress(axes[0], transient)
-        if transient is not None and not split:
+        if transient is not None and not (split and transient.end):
             _state_peaks(axes[-1], transient)
     for axis in grid[-1]:
         axis.set_xlabel("time [s]")
@@ -949,6 +947,8 @@ def time_rows(
         grid[-1, 1].set_xlabel("time [s]: whole run, axes cut to the settled range")
     elif window > 0.0:
         figure.note("Axes are cut to the settled range; the initial transient exceeds it (max, min: extremes).")
+    if any(transient is not None and not transient.end for transient in transients):
+        figure.note("Short peaks exceed the axes (max, min: extremes).")
     return [tuple(axes) for axes in grid]
 
 
@@ -962,8 +962,8 @@ class Transient:
     peaks: tuple[float, float]
 
 
-def _transient(row: Sequence[Series], settle: float, zero: bool) -> Transient | None:
-    """Return the transient of a row, or None if the axis of the row need not be limited."""
+def _transient(row: Sequence[Series], settle: float, zero: bool, longest: float) -> Transient | None:
+    """Return the transient of a row, or None if it is too long or the axis of the row need not be limited."""
     settled = np.concatenate([values[time >= settle].ravel() for time, values in row])
     everything = np.concatenate([values.ravel() for _, values in row])
     settled, everything = settled[np.isfinite(settled)], everything[np.isfinite(everything)]
@@ -984,16 +984,27 @@ def _transient(row: Sequence[Series], settle: float, zero: bool) -> Transient | 
         if beyond.any():
             end = max(end, float(time[beyond][-1]))
     # The panel also shows a little of the settled range.
-    return Transient(max(1.5 * end, 0.02 * settle), low, high, (float(everything.min()), float(everything.max())))
+    end, peaks = max(1.5 * end, 0.02 * settle), (float(everything.min()), float(everything.max()))
+    return Transient(end, low, high, peaks) if end < longest else None
+
+
+def _spike(row: Sequence[Series]) -> Transient | None:
+    """Return the range of a row without peaks that last for an instant, if they would flatten the rest, or None."""
+    values = np.concatenate([values.ravel() for _, values in row])
+    values = np.append(values[np.isfinite(values)], 0.0)
+    peaks, (low, high) = (float(values.min()), float(values.max())), np.percentile(values, [SHORT, 100.0 - SHORT])
+    if not 0.0 < SPIKE * (high - low) < peaks[1] - peaks[0]:
+        return None
+    room = HEADROOM * (high - low)
+    return Transient(0.0, max(peaks[0], low - room), min(peaks[1], high + room), peaks)
 
 
 def _state_peaks(axes: Axes, transient: Transient) -> None:
     """Write the extremes that are cut at the edges of the axes."""
     low, high = transient.peaks
-    look: dict[str, Any] = {"color": NOTE, "fontsize": letters(6.5), "backgroundcolor": (1.0, 1.0, 1.0, 0.7)}
-    ends = (("max", high > transient.high, high, 0.98, "top"), ("min", low < transient.low, low, 0.02, "bottom"))
-    for name, is_cut, peak, y, side in ends:
-        if is_cut:
+    look: dict[str, Any] = {"color": NOTE, "fontsize": letters(6.5), "backgroundcolor": "#FFFFFFB0"}
+    for name, peak, y, side in (("max", high, 0.98, "top"), ("min", low, 0.02, "bottom")):
+        if not transient.low <= peak <= transient.high:
             axes.text(0.03, y, f"{name} {number(peak, 3)}", transform=axes.transAxes, va=side, **look)
 
 
