@@ -122,6 +122,8 @@ def _export_urdf(scenario: Scenario, target: Path) -> None:
     from dynsim.system.files import write_text
 
     robot = build_model(scenario).robot
+    if omitted := [text for link in robot.links for text in link.omitted if not link.radius]:
+        print_warning(f"{first_few(omitted)}: not exported")
     files = _addresses(pictured_parts(Scene(), scenario), _shapes(robot), target.parent)
     links = tuple(replace(link, shapes=_renamed(link.shapes, files)) for link in robot.links)
     write_text(target, Model(replace(robot, links=links, fixed_shapes=_renamed(robot.fixed_shapes, files))).to_urdf())

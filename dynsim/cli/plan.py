@@ -57,7 +57,9 @@ def plan(
     weight: Annotated[
         list[str] | None, option("peak=VALUE", "Extra cost of the largest torque of revolute joints [W/(N m)].")
     ] = None,
-    clearance: Annotated[float, option("M", "Minimum distance of unbraced joints from surfaces [m].", min=0.0)] = 0.01,
+    clearance: Annotated[
+        float, option("M", "Minimum distance of unbraced joints from surfaces, of links from objects [m].", min=0.0)
+    ] = 0.01,
     min_force: Annotated[float, option("N", "Minimum normal force on each brace [N].", min=0.0)] = 0.5,
     verify: Annotated[
         bool, typer.Option("--verify/--no-verify", help="Re-simulate plans with errors in friction and surface height.")

@@ -438,7 +438,7 @@ def plan_braces(
         Additional cost of the maximum torque of revolute joints [W/(N m)]; forces of prismatic joints have no such
         cost.
     clearance_m : float, optional
-        Minimum distance of unbraced joints from surfaces [m].
+        Minimum distance of unbraced joints from surfaces, and of links from objects [m].
     min_N : float, optional
         Minimum normal force of each brace [N].
     verify : bool, optional

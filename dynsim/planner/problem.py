@@ -141,7 +141,8 @@ class Options:
     peak : float
         Cost of the maximum torque of revolute joints [W/(N m)].
     clearance_m : float
-        Minimum distance of unbraced joints from surfaces [m]; links between joints must not touch.
+        Minimum distance of unbraced joints from surfaces and of links from objects [m]; links between joints must not
+        touch.
     min_N : float
         Minimum normal force of a brace [N].
     starts, seed : int
@@ -228,8 +229,12 @@ class Task:
     @property
     def self_contact(self) -> bool:
         """Whether there are pairs of links that must stay clear of each other."""
-        links = {link.name for link in self.arm.model.robot.links}
-        return any(links.issuperset(pair) for pair in self.arm.pairs)
+        return any(self._own.issuperset(pair) for pair in self.arm.pairs)
+
+    @cached_property
+    def _own(self) -> set[str]:
+        """Names of the robot's links; other bodies are objects."""
+        return {link.name for link in self.arm.model.robot.links}
 
     @cached_property
     def clear(self) -> dict[Key, Clear]:
@@ -295,8 +300,9 @@ class Task:
             for b, s in zip(braces, on, strict=True)
         }
         rows = [*braced.values(), *self.free(braces).values()]
-        apart = range(len(self.arm.pairs))
-        rows += [Clear(0, np.zeros(3), 0.0, LINK_CLEARANCE, "", -1 - m) for m in apart]
+        for m, pair in enumerate(self.arm.pairs):
+            least = LINK_CLEARANCE if self._own.issuperset(pair) else self.options.clearance_m
+            rows.append(Clear(0, np.zeros(3), 0.0, least, "", -1 - m))
         return Points(
             body=integers([row.joint for row in rows]),
             point=reals([row.point for row in rows]).reshape(-1, 3),

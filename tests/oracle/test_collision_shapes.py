@@ -65,7 +65,7 @@ def inside(cylinder: coal.Cylinder) -> tuple[coal.CollisionGeometry, float]:
     return coal.Box(edge, edge, 1e-12), half
 
 
-def test_gaps_of_a_coiled_urdf_arm_are_those_of_pinocchio(tmp_path):
+def test_a_coiled_urdf_arm_has_the_gaps_of_pinocchio(tmp_path):
     scenario = loaded(tmp_path, {"file": str(ARM), "initial_deg": COILED})
     q = build_model(scenario).robot.initial
     peer = pinocchio.buildModelFromUrdf(str(ARM))
@@ -86,9 +86,9 @@ def test_gaps_of_a_coiled_urdf_arm_are_those_of_pinocchio(tmp_path):
             a, b = (shapes.geometryObjects[k] for k in (i, j))
             pair = frozenset(bodies[names[solid.parentJoint]] for solid in (a, b))
             if i < j and len(pair) == 2:
-                (one, left), (other, right) = inside(a.geometry), inside(b.geometry)
+                (first, left), (second, right) = inside(a.geometry), inside(b.geometry)
                 at = [coal.Transform3s(geometry.oMg[k].rotation, geometry.oMg[k].translation) for k in (i, j)]
-                far = coal.distance(one, at[0], other, at[1], request, coal.DistanceResult()) - left - right
+                far = coal.distance(first, at[0], second, at[1], request, coal.DistanceResult()) - left - right
                 expected[pair] = min(far, expected.get(pair, np.inf))
     own = gaps(scenario, q)
     assert len(own) == 10
@@ -120,16 +120,18 @@ def collision(solid: str) -> str:
 @pytest.mark.parametrize("kind", SHAPES)
 def test_solids_survive_export_and_reading_back(tmp_path, kind):
     text = collision(SHAPES[kind][0])
-    first = build_model(loaded(tmp_path, {"file": robot_file(tmp_path, arm=text, tool=text)})).robot
+    original = build_model(loaded(tmp_path, {"file": robot_file(tmp_path, arm=text, tool=text)})).robot
     (tmp_path / "again.urdf").write_text(build_model(load_scenario(tmp_path / "scene.yaml")).to_urdf())
     again = build_model(loaded(tmp_path, {"file": str(tmp_path / "again.urdf")})).robot
-    before, after = solids_of(first), solids_of(again)
+    before, after = solids_of(original), solids_of(again)
     assert list(before) == list(after) == ["upper", "lower"]
     for body in before:
-        (one,), (other,) = before[body], after[body]
-        assert type(one) is type(other)
-        for key in ("centre", "axes", "edges", "edge_radius") if isinstance(one, Box) else ("start", "axis", "radius"):
-            np.testing.assert_allclose(getattr(one, key), getattr(other, key), rtol=0.0, atol=1e-15)
+        (solid,), (copy,) = before[body], after[body]
+        assert type(solid) is type(copy)
+        for key in (
+            ("centre", "axes", "edges", "edge_radius") if isinstance(solid, Box) else ("start", "axis", "radius")
+        ):
+            np.testing.assert_allclose(getattr(solid, key), getattr(copy, key), rtol=0.0, atol=1e-15)
 
 
 @pytest.mark.parametrize("kind", SHAPES)
@@ -183,6 +185,12 @@ def test_collision_meshes_are_left_out_with_a_notice(tmp_path, caplog):
     plant, contacts["between"] = {"file": robot_file(tmp_path, arm=mesh)}, [{"bodies": ["upper", "ball"]}]
     with raises(DynsimError, "between", "'upper' has no solid", "is the mesh hull.stl", "radius_m"):
         build.contacts(loaded(tmp_path, plant, objects=ball, contacts=contacts))
+    exported = CliRunner().invoke(
+        app, ["export", str(tmp_path / "scene.yaml"), "--format", "urdf", "--out", str(tmp_path / "x")]
+    )
+    assert exported.exit_code == 0
+    assert "mesh hull.stl" in exported.stderr
+    assert "not exported" in exported.stderr
     # Shapes without a valid size are reported in the same words.
     plant = {"file": robot_file(tmp_path, arm=collision('<box size="0.1 -1 0.1"/>'))}
     with raises(DynsimError, "'upper' has no solid", "has no valid geometry"):

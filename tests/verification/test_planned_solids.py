@@ -33,8 +33,8 @@ def arm(**changes: Any) -> dynsim.Scenario:
 
 
 def search(scenario: dynsim.Scenario, **options: Any) -> tuple[Search, dict[int, list]]:
-    found = Search(task(scenario, Options(**{"count": (0, 1), "starts": 1} | options)))
-    return found, found.run()
+    searched = Search(task(scenario, Options(**{"count": (0, 1), "starts": 1} | options)))
+    return searched, searched.run()
 
 
 def least(planned: Task, q: np.ndarray) -> float:
@@ -84,9 +84,9 @@ def test_self_contact_steers_the_search():
     refused, without = search(arm(**LONG), count=(0, 0), starts=2)
     assert not without[0]
     assert "touch each other" in refused.tally.refused[()]
-    found, planned = search(arm(**LONG, **SELF), count=(0, 0))
+    searched, planned = search(arm(**LONG, **SELF), count=(0, 0))
     for plans in planned.values():
-        assert least(found.task, plans[0].dense.q) > LINK_CLEARANCE - 1e-6
+        assert least(searched.task, plans[0].dense.q) > LINK_CLEARANCE - 1e-6
 
 
 @pytest.mark.long
@@ -97,12 +97,12 @@ def test_collision_shapes_keep_links_apart(tmp_path):
     data["plant"] = {"type": "urdf_arm", "file": "arm.urdf", "motor": {"type": "wang_minami"}}
     data["contacts"] = {"law": "unilateral", "friction": 0.1}
     (tmp_path / "arm.yaml").write_text(yaml.safe_dump(data | {"variants": {}}))
-    found, planned = search(dynsim.load_scenario(tmp_path / "arm.yaml"), radius_m=0.05)
-    assert found.task.self_contact
-    model, arm_of = found.task.arm.model, found.task.arm
+    searched, planned = search(dynsim.load_scenario(tmp_path / "arm.yaml"), radius_m=0.05)
+    assert searched.task.self_contact
+    model, arm_of = searched.task.arm.model, searched.task.arm
     for count in (0, 1):
         q = planned[count][0].dense.q
-        assert least(found.task, q) > LINK_CLEARANCE - 1e-6
+        assert least(searched.task, q) > LINK_CLEARANCE - 1e-6
         for link in model.robot.links[2:]:
             for point in (np.zeros(3), np.array([0.0, 0.0, 0.2])):
                 heights = [model.point_position(link.name, point, row)[2] for row in arm_of.coordinates(q)]
@@ -132,6 +132,8 @@ def test_objects_are_obstacles():
         scenario, count=(1, 1), starts=1, tolerances=Tolerances(friction=(1.0,), shift_m=(0.0,)), jobs=1
     )
     (size,) = plan.sizes
+    assert size.planned is not None
+    assert least(made, size.planned.dense.q) > made.options.clearance_m - 1e-6
     assert size.verdict is not None
     assert size.verdict.survives, size.reason
     record = plan.record(1)
