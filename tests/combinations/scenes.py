@@ -468,7 +468,8 @@ class _Touching:
         """Add bodies that touch each other: pairs of links, or a ball above an object, a link or a carried plate."""
         random, level, robot = self._random, self._levels["between"], self._robot
         # A link that moves: the hand of a file is fixed to one.
-        index, tip = self._model.robot.attach(robot.hand[0], np.array(robot.hand[1]))
+        index, at_hand = self._model.robot.attach(robot.hand[0], np.array(robot.hand[1]))
+        tip = at_hand.tolist()
         body = self._model.robot.links[index].name
         if level == "self":
             # Few pairs, which event-driven methods support.

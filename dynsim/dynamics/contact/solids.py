@@ -34,7 +34,7 @@ EDGES, OTHERS, BORDERS, FEATURES = 8, 20, 28, 52
 FLAT = 0.98
 # Difference of gaps below which the nearest place of an edge is where the edge begins or ends to be above a face [m].
 SAME = 1e-12
-# A feature of the last step keeps its slot unless another one is this much deeper [m], or farther by this factor.
+# A feature of the last step keeps its slot unless another one is deeper by this distance [m] or further by this factor.
 STAYS, STAYS_FACTOR = 1e-6, 1.02
 # Places within this distance behind the deepest one can touch as well [m].
 BAND = 2e-3
@@ -250,9 +250,10 @@ def find_contacts(pose_a, core_a, pose_b, core_b, known, slots, places, chosen):
 
 @internal_kernel
 def note_borders(places, known, R, p, h, Q, q, box, own, other, sign):
-    """Write the places where edges of a solid (R, p, h) enter and leave the space above the nearest face of a box.
+    """Write the places where edges of a solid (R, p, h) begin and end to be above the nearest face of a box.
 
-    The corners of the area in which two faces touch are corners of the faces, or such places.
+    The pose of the box is Q, q, and ``box`` contains its half edges. The corners of the area in which two faces touch
+    are corners of the faces, or such places.
     """
     deepest = deepest_place(places, known)
     n = rotate_back(Q, (places[deepest, NORMAL], places[deepest, NORMAL + 1], places[deepest, NORMAL + 2]))
@@ -268,8 +269,8 @@ def note_borders(places, known, R, p, h, Q, q, box, own, other, sign):
             if h[axis] == 0.0 or c & bit or not is_corner(h, c):
                 continue
             start = transform(p, R, corner(h, c))
-            way = along(transform(p, R, corner(h, c | bit)), start, -1.0)
-            x, d, low, high = rotate_back(Q, along(start, q, -1.0)), rotate_back(Q, way), 0.0, 1.0
+            span = along(transform(p, R, corner(h, c | bit)), start, -1.0)
+            x, d, low, high = rotate_back(Q, along(start, q, -1.0)), rotate_back(Q, span), 0.0, 1.0
             for m in range(3):
                 if m != k and d[m] != 0.0:
                     a, b = (-box[m] - x[m]) / d[m], (box[m] - x[m]) / d[m]
@@ -281,7 +282,7 @@ def note_borders(places, known, R, p, h, Q, q, box, own, other, sign):
                 u = low if end == 0 else high
                 gap = side * (x[k] + u * d[k]) - box[k] - own - other
                 if low < high and 0.0 < u < 1.0 and abs(gap - depth) <= BAND:
-                    put_place(places, BORDERS + 12 * end + f, along(start, way, u), up, gap, own, sign)
+                    put_place(places, BORDERS + 12 * end + f, along(start, span, u), up, gap, own, sign)
                     if sign > 0.0 and gap <= places[EDGES + f, GAP] + SAME:
                         places[EDGES + f, GAP] = FAR
 
@@ -383,10 +384,10 @@ def deepest_place(places, known):
 @internal_kernel
 def is_known(known, f):
     """Return whether feature f had a slot in the last step."""
-    same = False
+    result = False
     for j in range(SLOTS):
-        same = same or known[j] == f
-    return same
+        result = result or known[j] == f
+    return result
 
 
 @internal_kernel

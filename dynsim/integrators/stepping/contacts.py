@@ -787,6 +787,8 @@ def solve_problem(s: SteppingArrays, W, p, rigid):
         residual = proximal_point(W, s.right, s.kind, s.mu, p, s.f, s.room, kt.GOOD)
     if not residual <= kt.FAIR:
         residual = approach(W, s.right, s.kind, s.mu, p, s.f, s.room, kt.GOOD, kt.LAST_ROUNDS)
+    if kt.FAIR < residual <= kt.BAD:  # near a solution: W of deficient rank, b not in its range
+        residual = proximal_point(W, s.right, s.kind, s.mu, p, s.f, s.room, kt.GOOD)
     motion(W, s.right, p, s.f, s.w)
     if rigid and residual <= kt.BAD:
         select_least_norm(W, s.w, s.kind, s.mu, p, s.f, s.room)

@@ -37,7 +37,7 @@ from dynsim.jit.kernel import integers, internal_kernel, reals
 GOOD, FAIR, BAD = 1e-11, 1e-10, 1e-8
 # Number of starts in the last search, and total number of starts in all searches.
 LAST_ROUNDS = 12
-MOST_ROUNDS = 1 + kc.NEAR_STEPS + LAST_ROUNDS
+MOST_ROUNDS = 1 + 2 * kc.NEAR_STEPS + LAST_ROUNDS
 # Gap that counts as closed [m]; it is far above rounding.
 MARGIN = 1e-10
 # SteppingArrays.memory: the last accepted step, and the step being tried; columns for each candidate
