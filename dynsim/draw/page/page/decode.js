@@ -83,5 +83,5 @@ D.palette = {
     stick: "#2BC79B", open: "#9AA3AD", support: "#56B4E9", body: "#98A2B0", hub: "#67717F", wheel: "#7C8794", down: "#56B4E9",
     lifted: "#FFFFFF", ground: "#1D2126", gridline: "#3B434D", solid: "#46515E", edge: "#8593A3", fog: "#15181C", pad: "#D5DAE0", saturated: "#FF7438", sunk: "#F28AB8", tool: "#D5DAE0" },
 };
-D.variants = { light: ["#0072B2", "#009E73", "#E69F00", "#CC79A7", "#56B4E9", "#000000", "#8C6D31"],
-  dark: ["#56B4E9", "#2BC79B", "#F0B429", "#E59BC4", "#9AD4F5", "#FFFFFF", "#C9A86A"] };
+D.variants = { light: ["#0072B2", "#009E73", "#E69F00", "#CC79A7", "#56B4E9", "#332288", "#8C6D31"],
+  dark: ["#56B4E9", "#2BC79B", "#F0B429", "#E59BC4", "#9AD4F5", "#B7B1F2", "#C9A86A"] };
