@@ -50,6 +50,11 @@ def solids_of(robot: Robot) -> dict[str, list[Solid]]:
     return solids
 
 
+def fixed_solids(robot: Robot) -> list[Solid]:
+    """Return the solids of the parts of a robot that are fixed to the world."""
+    return [_solid_of(shape, None) for shape in robot.fixed_solids]
+
+
 def with_solids(robot: Robot) -> Robot:
     """Return the robot whose links have the shapes of :func:`solids_of`; a capsule replaces the shapes of its link."""
     solids = solids_of(robot)
@@ -64,7 +69,7 @@ def with_solids(robot: Robot) -> Robot:
     )
 
 
-def _solid_of(shape: Shape, body: str) -> Solid:
+def _solid_of(shape: Shape, body: str | None) -> Solid:
     """Return the solid of a shape; a cylinder is the capsule inside it, or the rounded plate if it is a flat disc."""
     R, p = rotated(np.array(shape.orientation), np.eye(3)), np.array(shape.position)
     if shape.kind == "box":

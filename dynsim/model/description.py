@@ -508,6 +508,8 @@ class Robot:
         Additional named frames to which points can be attached.
     fixed_shapes, fixed_inertia : tuple of Shape, Inertia
         Shapes and mass of the parts fixed to the world.
+    fixed_solids : tuple of Shape
+        Collision shapes of the parts fixed to the world; only plans keep clear of them.
     couplings : tuple of Coupling
         Couplings between joints.
     ties : tuple of Tie
@@ -540,6 +542,7 @@ class Robot:
     hand_frame: Array = field(default_factory=lambda: np.eye(3))
     nearest: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    fixed_solids: tuple[Shape, ...] = ()
 
     def holding(self, name: str) -> list[Tie]:
         """Return the ties by which a gripper of the robot can hold the named object; empty without a gripper."""

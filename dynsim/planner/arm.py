@@ -15,7 +15,7 @@ from dynsim.compile.solids import Solid
 from dynsim.dynamics.contact.solids import pair_arrays
 from dynsim.errors import ModelError
 from dynsim.jit.kernel import integers, reals
-from dynsim.model.description import Array, Robot
+from dynsim.model.description import WORLD, Array, Robot
 from dynsim.model.drives import Motor
 from dynsim.model.surfaces import Surface, shape_arrays
 from dynsim.planner import compiled
@@ -155,12 +155,12 @@ def with_pairs(arm: MovingArm, described: Robot, pairs: Sequence[tuple[Solid, So
     model, index, rows, names = Model(described), list[list[int]](), list[list[Array]](), list[tuple[str, str]]()
     joint = {arm.model.robot.links[i].name: k for k, i in enumerate(arm.links)}
     for pair in pairs:
-        bodies, solids = [str(solid.carrier) for solid in pair], [solid_row(solid) for solid in pair]
+        bodies, solids = [solid.carrier or WORLD for solid in pair], [solid_row(solid) for solid in pair]
         joints = [joint.get(body, -1) for body in bodies]
         if max(joints) < 0:
             continue
         for body, row, k in zip(bodies, solids, joints, strict=True):
-            if k < 0:
+            if k < 0 and body != WORLD:
                 R, p = model.body_pose(body, described.initial)
                 row[:9] = (R @ row[:9].reshape(3, 3)).ravel()
                 row[9:12] = p + R @ row[9:12]

@@ -13,10 +13,10 @@ import numpy as np
 from dynsim.compile.control import HandPath
 from dynsim.compile.model import Model
 from dynsim.compile.protocols import BuildContext
-from dynsim.compile.solids import solids_of
+from dynsim.compile.solids import fixed_solids, solids_of
 from dynsim.errors import ModelError
 from dynsim.jit.kernel import integers, reals
-from dynsim.model.description import Array, Robot
+from dynsim.model.description import WORLD, Array, Robot
 from dynsim.model.surfaces import Capsule, Quadric
 from dynsim.planner.arm import MovingArm, Problem, axis_points, moving_arm, with_pairs, workspace
 from dynsim.planner.compiled import Course, Points
@@ -229,12 +229,12 @@ class Task:
     @property
     def self_contact(self) -> bool:
         """Whether there are pairs of links that must stay clear of each other."""
-        return any(self._own.issuperset(pair) for pair in self.arm.pairs)
+        return any(WORLD not in pair and self._own.issuperset(pair) for pair in self.arm.pairs)
 
     @cached_property
     def _own(self) -> set[str]:
-        """Names of the robot's links; other bodies are objects."""
-        return {link.name for link in self.arm.model.robot.links}
+        """Names of the robot's links and of the world; other bodies are objects."""
+        return {WORLD, *(link.name for link in self.arm.model.robot.links)}
 
     @cached_property
     def clear(self) -> dict[Key, Clear]:
@@ -419,23 +419,26 @@ def _with_pairs(made: Task, described: Robot) -> Task:
     """Return the task with the pairs of ``contacts.between``.
 
     Without that key, links with collision shapes stay clear of each other, except for shapes that overlap in the
-    initial posture, and all links stay clear of the objects.
+    initial posture, and all links stay clear of the objects and of the shapes of the root link.
     """
     arm, config = made.arm, made.scenario.config
     entries, stated = list(config.contacts.between), bool(config.contacts.between)
+    moving = {arm.model.robot.links[i].name for i in arm.links}
     if not stated:
-        moving = {arm.model.robot.links[i].name for i in arm.links}
         if any(link.solids and not link.radius for link in arm.model.robot.links):
             entries.append(BodyPair(bodies="self"))
         if config.objects and moving & solids_of(described).keys():
             entries.append(BodyPair(bodies=[LINKS, OBJECTS]))
     pairs = [(a, b) for a, b, _ in solid_pairs(entries, described, config.objects)]
+    if not stated:
+        others = [s for name, own in solids_of(described).items() if name in moving for s in own]
+        pairs += list(product(others, fixed_solids(described)))
     made = replace(made, arm=with_pairs(arm, described, pairs))
     if stated or not made.arm.pairs:
         return made
     start = made.pair_gaps(arm.model.robot.initial[None, list(arm.columns)])[0]
     touching = {pair for pair, gap in zip(made.arm.pairs, start, strict=True) if gap <= 0.0}
-    pairs = [pair for pair in pairs if (pair[0].carrier, pair[1].carrier) not in touching]
+    pairs = [(a, b) for a, b in pairs if (a.carrier or WORLD, b.carrier or WORLD) not in touching]
     return replace(made, arm=with_pairs(arm, described, pairs)) if touching else made
 
 

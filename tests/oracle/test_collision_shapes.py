@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 
 from dynsim import build_model, load_scenario, simulate
 from dynsim.cli.commands import app
-from dynsim.compile.solids import solids_of
+from dynsim.compile.solids import fixed_solids, solids_of
 from dynsim.compile.touching import touch
 from dynsim.errors import DynsimError
 from dynsim.model.surfaces import Box, Capsule
@@ -97,10 +97,10 @@ def test_a_coiled_urdf_arm_has_the_gaps_of_pinocchio(tmp_path):
         assert gap == pytest.approx(expected[pair], abs=1e-9), sorted(pair)
 
 
-def robot_file(folder: Path, arm: str = "", tool: str = "") -> str:
+def robot_file(folder: Path, arm: str = "", tool: str = "", stand: str = "") -> str:
     """Three links in a row; the tool is fixed to the last one."""
     joints = [("stand", "upper"), ("upper", "lower")]
-    text = '<robot name="r"><link name="stand"/>'
+    text = '<robot name="r"><link name="stand">' + stand + "</link>"
     text += (
         f'<link name="upper">{MASS}{arm}</link><link name="lower">{MASS}</link><link name="tool">{MASS}{tool}</link>'
     )
@@ -120,11 +120,12 @@ def collision(solid: str) -> str:
 @pytest.mark.parametrize("kind", SHAPES)
 def test_solids_survive_export_and_reading_back(tmp_path, kind):
     text = collision(SHAPES[kind][0])
-    original = build_model(loaded(tmp_path, {"file": robot_file(tmp_path, arm=text, tool=text)})).robot
+    original = build_model(loaded(tmp_path, {"file": robot_file(tmp_path, arm=text, tool=text, stand=text)})).robot
     (tmp_path / "again.urdf").write_text(build_model(load_scenario(tmp_path / "scene.yaml")).to_urdf())
     again = build_model(loaded(tmp_path, {"file": str(tmp_path / "again.urdf")})).robot
     before, after = solids_of(original), solids_of(again)
     assert list(before) == list(after) == ["upper", "lower"]
+    before["stand"], after["stand"] = fixed_solids(original), fixed_solids(again)
     for body in before:
         (solid,), (copy,) = before[body], after[body]
         assert type(solid) is type(copy)

@@ -12,6 +12,7 @@ from support.messages import raises
 import dynsim
 from dynsim.compile.touching import touch
 from dynsim.errors import ModelError
+from dynsim.model.description import WORLD
 from dynsim.planner.problem import LINK_CLEARANCE, Options, Task, task
 from dynsim.planner.search import Search
 from dynsim.planner.verify import Tolerances
@@ -119,7 +120,9 @@ def test_shapes_that_overlap_at_the_start_do_not_count():
                              "plant.initial_deg.wrist_pitch": 119}), Options(count=(0, 0)))  # fmt: skip
     assert scenario.name
     assert set(coiled.arm.pairs) < set(all_pairs.arm.pairs)
-    assert len(set(all_pairs.arm.pairs)) == 10
+    # Ten pairs of links, and the links except the first against the pedestal.
+    assert len(set(all_pairs.arm.pairs)) == 15
+    assert {pair[0] for pair in all_pairs.arm.pairs if pair[1] == WORLD} == set(all_pairs.arm.model.robot.bodies[1:])
 
 
 def test_objects_are_obstacles():

@@ -171,6 +171,7 @@ def build(config: Config, context: BuildContext) -> Robot:
         motors=(*motors, *arm.motors),
         frames=tuple(_framed(frame, *mount) for frame in arm.frames if frame.name not in taken),
         fixed_shapes=(),
+        fixed_solids=(),
         fixed_inertia=Inertia(0.0),
         q0=np.concatenate([np.zeros(4), arm.initial]),
         base=MobileBase(

@@ -988,6 +988,7 @@ def read_urdf(path: Path, lock: Mapping[str, float] | None = None, corrections: 
         frames=tuple(frames),
         couplings=tuple(coupling for joint, coupling in followers if joint.kind in MOVING),
         fixed_shapes=_shapes(locked, places).get(None, ()),
+        fixed_solids=_shapes(locked, places, "solids").get(None, ()),
         fixed_inertia=_inertias(locked, places).get(None, Inertia(0.0)),
         notes=tuple(tree.findings.repairs),
     )

@@ -34,7 +34,9 @@ def write_urdf(robot: Robot) -> str:
     # The root link of the robot's original file is its first frame.
     rooted = next((f.name for f in frames if f.body is None and not f.p.any() and np.array_equal(f.R, np.eye(3))), None)
     base = rooted or next(name for name in (WORLD, "base_link", "root_link") if name not in taken)
-    add_shapes(ElementTree.SubElement(root, "link", name=base), robot.fixed_shapes)
+    stand = ElementTree.SubElement(root, "link", name=base)
+    add_shapes(stand, robot.fixed_shapes)
+    add_shapes(stand, robot.fixed_solids, "collision")
     for link in links:
         body = ElementTree.SubElement(root, "link", name=link.name)
         inertial = ElementTree.SubElement(body, "inertial")
