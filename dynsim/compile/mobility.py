@@ -93,8 +93,11 @@ def immobile(
     immobile only if no joint moves it in any direction. ``braked`` joints keep their coordinates ``at``.
     """
     configurations = random_configurations(model.robot, braked, at)
-    still = []
+    still: list[bool] = []
     for contact in contacts:
+        if contact.slot:  # the contacts of two solids move together
+            still.append(still[-1])
+            continue
         try:
             model.robot.attach(contact.body, contact.point)
         except ModelError:  # the check at the start reports an unknown or fixed body

@@ -1672,6 +1672,8 @@ def _touching(model: Model, contacts: Sequence[Contact]) -> tuple[dict[str, Arra
     """Return the positions (3,) of contact points at the start, their gaps, and the gaps of pairs of bodies [m]."""
     points, gaps, pairs, q = dict[str, Array](), dict[str, float](), dict[str, float](), model.robot.initial
     for contact in contacts:
+        if contact.slot:  # the first contact of two solids is the deepest
+            continue
         try:
             gap = gap_at(model, contact, q)
         except ModelError:  # an unknown body; the contact check reports it with its line
