@@ -186,3 +186,19 @@ def test_m_star_agrees_between_bodies(tmp_path, method, rider, share):
 def test_m_star_agrees_where_a_ball_falls_on_an_arm(tmp_path, method):
     sweeps, dense = (leaning(method, 0.0, 0.3, tmp_path, solver=solver)["q"] for solver in ("articulated", "m_star"))
     assert np.abs(sweeps - dense).max() < 1e-10
+
+
+def test_a_disc_is_flat(tmp_path):
+    """A ball rests on the face of a short cylinder, for which a capsule would be too thick."""
+    disc = {
+        "shape": "cylinder",
+        "radius_m": 0.06,
+        "length_m": 0.01,
+        "mass_kg": 1.0,
+        "position_m": [0, 0, 0],
+        "hinge": {},
+    }
+    objects = {"disc": disc, "ball": ball(0.5, 0.02, [0.01, 0, 0.025])}
+    record = run(tmp_path, objects, weight=True, friction=0.3, duration_s=0.1)
+    assert record["contact_normal_force"][-1].sum() == pytest.approx(0.5 * G, rel=1e-9)
+    assert coordinates(record, "ball")[-1, 2] == pytest.approx(0.025, abs=1e-9)
