@@ -12,7 +12,7 @@ from collections.abc import Collection, Iterable, Sequence
 import numpy as np
 
 from dynsim.compile.model import Model
-from dynsim.compile.touching import Touch, touch
+from dynsim.compile.touching import TouchPoint, touch
 from dynsim.config.problems import listed
 from dynsim.dynamics.contact.mobility import IMMOBILE
 from dynsim.dynamics.linear import RANK_TOLERANCE
@@ -108,7 +108,7 @@ def immobile(
     return still
 
 
-def immobile_at(model: Model, at: Touch, q: Array) -> bool:
+def immobile_at(model: Model, at: TouchPoint, q: Array) -> bool:
     """Return whether the motion of a contact along its normal is only a rounding error in a posture.
 
     The limit is the same as in :func:`dynsim.dynamics.contact.mobility.moves_along_normal`.

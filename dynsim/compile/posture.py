@@ -11,7 +11,7 @@ from dynsim.compile.bracing import MIN_N, BracePlanner, brace_rows
 from dynsim.compile.mobility import immobile_at
 from dynsim.compile.model import Model
 from dynsim.compile.solids import axes_inside, passes_through, tangent_planes
-from dynsim.compile.touching import Touch, gap_at, touch
+from dynsim.compile.touching import TouchPoint, gap_at, touch
 from dynsim.dynamics.contact.braces import statics as kb
 from dynsim.errors import ModelError, first_few
 from dynsim.model.description import Array, Contact, Load, Robot
@@ -316,7 +316,7 @@ def holding_torques(
 
 def touching_contacts(
     model: Model, contacts: Sequence[Contact], q: Array, real: bool, named: Container[str] | None = None
-) -> list[Touch]:
+) -> list[TouchPoint]:
     """Return the contacts that touch and can carry load, or only the ``named`` contacts, whatever their gaps."""
     nearest = [touch(model, contact, q) for contact in contacts if not contact.left_out]
     touching = [
@@ -328,7 +328,7 @@ def touching_contacts(
     return [at for at in touching if not immobile_at(model, at, q)]
 
 
-def _acting(model: Model, q: Array, at: Touch, force: Array) -> list[tuple[int, Array, Array]]:
+def _acting(model: Model, q: Array, at: TouchPoint, force: Array) -> list[tuple[int, Array, Array]]:
     """Return the forces of a contact on its link and on the link that carries the surface, as in :class:`Rest`."""
     acting = [(at.link, at.point, force)]
     if at.carrier >= 0:

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from dynsim.compile.model import Model
 from dynsim.compile.posture import BEYOND, KEYS, holding_torques, touching_contacts
-from dynsim.compile.touching import Touch, gap_at
+from dynsim.compile.touching import TouchPoint, gap_at
 from dynsim.dynamics.tree.joints import normalise, positions_along, rates_across
 from dynsim.errors import ModelError, first_few
 from dynsim.model.description import Array, Contact, Load
@@ -160,7 +160,7 @@ def _search(
     return None
 
 
-def spring_forces(touching: Sequence[Touch]) -> dict[str, float]:
+def spring_forces(touching: Sequence[TouchPoint]) -> dict[str, float]:
     """Return the normal force of each contact [N]: computed from the depth if it is compliant, NaN if it is rigid."""
     return {
         at.contact.name: max(-at.contact.stiffness * at.gap, 0.0) if at.contact.stiffness > 0.0 else np.nan
@@ -168,7 +168,7 @@ def spring_forces(touching: Sequence[Touch]) -> dict[str, float]:
     }
 
 
-def _step(model: Model, q: Array, touching: Sequence[Touch], forces: Mapping[str, float]) -> tuple[Array, float]:
+def _step(model: Model, q: Array, touching: Sequence[TouchPoint], forces: Mapping[str, float]) -> tuple[Array, float]:
     """Return the posture to which these forces press the contacts in, to first order, and the largest displacement.
 
     The step is damped until the gaps change approximately as the Jacobian predicts. A spring that can only be pressed

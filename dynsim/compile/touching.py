@@ -30,7 +30,7 @@ class Kinematics(Protocol):
 
 
 @dataclass(frozen=True)
-class Touch:
+class TouchPoint:
     """Place where a contact candidate is nearest to its surface.
 
     Attributes
@@ -81,7 +81,7 @@ class Touch:
         return own - model.point_jacobian(self.carrier, R.T @ (self.position - p), q)
 
 
-def touch(model: Kinematics, contact: Contact, q: Array, share: float | None = None) -> Touch:
+def touch(model: Kinematics, contact: Contact, q: Array, share: float | None = None) -> TouchPoint:
     """Return where a contact is nearest to its surface at a configuration, (nq,).
 
     Parameters
@@ -97,7 +97,7 @@ def touch(model: Kinematics, contact: Contact, q: Array, share: float | None = N
 
     Returns
     -------
-    Touch
+    TouchPoint
         Point and normal.
 
     Raises
@@ -119,10 +119,10 @@ def touch(model: Kinematics, contact: Contact, q: Array, share: float | None = N
     link, point = model.robot.attach(contact.body, point)
     if contact.radius > 0.0:
         point = point - contact.radius * (model.body_pose(link, q)[0].T @ normal)
-    return Touch(contact, link, point, model.point_position(link, point, q), normal, carrier, nearest)
+    return TouchPoint(contact, link, point, model.point_position(link, point, q), normal, carrier, nearest)
 
 
-def _slot(model: Kinematics, contact: Contact, carrier: int, q: Array) -> Touch:
+def _slot(model: Kinematics, contact: Contact, carrier: int, q: Array) -> TouchPoint:
     """Return one of the contacts of two solids; see :func:`dynsim.dynamics.contact.solids.find_contacts`."""
     link, rows, poses = model.body_index(contact.body), [], []
     for index, solid in ((link, contact.solid), (carrier, contact.surface)):
@@ -138,7 +138,7 @@ def _slot(model: Kinematics, contact: Contact, carrier: int, q: Array) -> Touch:
     slot = pairs.slots[0, contact.slot]
     position, normal = slot[ks.PLACE : ks.PLACE + 3].copy(), slot[ks.NORMAL : ks.NORMAL + 3].copy()
     R, p = model.body_pose(link, q)
-    return Touch(contact, link, R.T @ (position - p), position, normal, carrier, position, float(slot[ks.GAP]))
+    return TouchPoint(contact, link, R.T @ (position - p), position, normal, carrier, position, float(slot[ks.GAP]))
 
 
 def gap_at(model: Kinematics, contact: Contact, q: Array) -> float:

@@ -53,10 +53,10 @@ def test_distances_and_normals_are_those_of_coal(first: str, second: str) -> Non
     request, apart = coal.DistanceRequest(), 0
     request.gjk_tolerance = 1e-12
     for k in range(PAIRS):
-        (one, left), (other, right) = peer(a[k]), peer(b[k])
+        (first, left), (other, right) = peer(a[k]), peer(b[k])
         result = coal.DistanceResult()
         poses_of_both = (coal.Transform3s(pose[:9].reshape(3, 3), pose[9:]) for pose in (at_a[k], at_b[k]))
-        placed = [part for pair in zip((one, other), poses_of_both, strict=True) for part in pair]
+        placed = [part for pair in zip((first, other), poses_of_both, strict=True) for part in pair]
         far = coal.distance(*placed, request, result)
         if far <= 1e-6:  # coal's depth is another measure
             continue

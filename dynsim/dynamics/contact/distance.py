@@ -122,11 +122,11 @@ def nearest_to_capsule(shapes: ShapeArrays, k, x, y, z, dx, dy, dz):
     det = a * e - b * b
     if det <= 1e-12 * a * e:
         # Shares of the own axis at which the ends of the other are beside it.
-        one, two = -c / a, (b - c) / a
-        low, high = max(min(one, two), 0.0), min(max(one, two), 1.0)
+        first, second = -c / a, (b - c) / a
+        low, high = max(min(first, second), 0.0), min(max(first, second), 1.0)
         if low <= high:
             return 0.5 * (low + high)
-        return 0.0 if max(one, two) < 0.0 else 1.0
+        return 0.0 if max(first, second) < 0.0 else 1.0
     u = min(max((b * f - c * e) / det, 0.0), 1.0)
     t = (b * u + f) / e
     if t < 0.0:

@@ -162,24 +162,24 @@ def is_corner(h, k):
 
 
 @internal_kernel
-def lowest_between(h, start, way):
-    """Return u in [0, 1] at which start + u way is nearest to a core; φ is convex along a line."""
+def lowest_between(h, start, step):
+    """Return u in [0, 1] at which start + u step is nearest to a core; φ is convex along a line."""
     low, high, u = 0.0, 1.0, 0.5
     for _ in range(ALONG_STEPS):
-        x, y, z = along(start, way, u)
+        x, y, z = along(start, step, u)
         far, nx, ny, nz = core_distance(h[0], h[1], h[2], x, y, z)
-        slope = nx * way[0] + ny * way[1] + nz * way[2]
+        slope = nx * step[0] + ny * step[1] + nz * step[2]
         if slope < 0.0:
             low = u
         elif slope > 0.0:
             high = u
         else:
             return u
-        # Outside the core φ = |o|, so that φ'' = (|way_o|² − slope²)/φ with the part of way along which o is not zero.
+        # Outside the core φ = |o|, so that φ'' = (|step_o|² − slope²)/φ with the part of step where o is not zero.
         bend = 0.0
         if far > 0.0:
             for s in range(3):
-                at, half, d = (x, h[0], way[0]) if s == 0 else (y, h[1], way[1]) if s == 1 else (z, h[2], way[2])
+                at, half, d = (x, h[0], step[0]) if s == 0 else (y, h[1], step[1]) if s == 1 else (z, h[2], step[2])
                 if abs(at) > half:
                     bend += d * d
             bend = (bend - slope * slope) / far
@@ -229,16 +229,16 @@ def find_contacts(pose_a, core_a, pose_b, core_b, known, slots, places, chosen):
             if half == 0.0 or k & bit or not is_corner(hA, k):
                 continue
             start, end = transform(pA, RA, corner(hA, k)), transform(pA, RA, corner(hA, k | bit))
-            way = along(end, start, -1.0)
+            direction = along(end, start, -1.0)
             n, m = (
                 (places[k, NORMAL], places[k, NORMAL + 1], places[k, NORMAL + 2]),
                 (places[k | bit, NORMAL], places[k | bit, NORMAL + 1], places[k | bit, NORMAL + 2]),
             )
             level = LEVEL * 2.0 * half
             # φ falls towards the middle from both ends.
-            if dot_vector(n, way) < -level and dot_vector(m, way) > level:
-                x, d = rotate_back(RB, along(start, pB, -1.0)), rotate_back(RB, way)
-                at = along(start, way, lowest_between(hB, x, d))
+            if dot_vector(n, direction) < -level and dot_vector(m, direction) > level:
+                x, d = rotate_back(RB, along(start, pB, -1.0)), rotate_back(RB, direction)
+                at = along(start, direction, lowest_between(hB, x, d))
                 f = EDGES + 4 * axis + edge_number(k, axis)
                 note_place(places, f, at, RB, pB, hB, rA, rB, 1.0)
     if min(hB[0], hB[1], hB[2]) > 0.0:
@@ -332,8 +332,8 @@ def fill_slots(known, slots, places, chosen):
     first, best = vector_of(places, deepest), 1e-12
     for f in range(FEATURES):
         if places[f, GAP] <= limit:
-            way = along(vector_of(places, f), first, -1.0)
-            square = dot_vector(way, way) * (STAYS_FACTOR if is_known(known, f) else 1.0)
+            offset = along(vector_of(places, f), first, -1.0)
+            square = dot_vector(offset, offset) * (STAYS_FACTOR if is_known(known, f) else 1.0)
             if square > best:
                 best, chosen[1] = square, f
     if chosen[1] >= 0:
