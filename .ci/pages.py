@@ -90,6 +90,11 @@ def start_up() -> Any:
     return data("reference/start_up.json")
 
 
+def bodies(case: str) -> list[dict[str, Any]]:
+    """Return the numbers of every program for the case that ends with a word."""
+    return [row for row in data("reference/bodies.json")["bodies"] if row["case"].endswith(case)]
+
+
 def overturning() -> Any:
     return data("overturning/configurations.json")
 
@@ -494,6 +499,38 @@ def snake_bench() -> str:
         for row in bench()["snake"]
     ]
     return lines(["program, step", "µs a step", "times real time", "Δz off, rms mm", "Δβ off, rms mrad"], rows)
+
+
+def touching_bodies() -> str:
+    return lines(
+        ["case", "program", "µs a step", "times real time", "penetration, µm", "drift, µm"],
+        [
+            [
+                "" if k else row["case"],
+                row["program"],
+                number(row["us_per_step"], 2),
+                number(row["times_real_time"], 2),
+                number(1e6 * row["penetration_m"], 2),
+                number(1e6 * row["drift_m"], 2) if "drift_m" in row else NONE,
+            ]
+            for case in ("other", "side", "spheres", "dominoes")
+            for k, row in enumerate(bodies(case))
+        ],
+        left=2,
+    )
+
+
+def slower(case: str) -> str:
+    """Return the ratio of a step's time to that of MuJoCo with its defaults."""
+    own, peer = (next(r for r in bodies(case) if r["program"] == program) for program in ("dynsim 1 ms", "MuJoCo 1 ms"))
+    return number(own["us_per_step"] / peer["us_per_step"], 2)
+
+
+def falling_dominoes() -> str:
+    rows = bodies("dominoes")
+    heads = ["program", *(str(k + 2) for k in range(len(rows[0]["falls_s"]))), "wave, m/s"]
+    times = [[NONE if t is None else fixed(1e3 * t, 0) for t in row["falls_s"]] for row in rows]
+    return lines(heads, [[r["program"], *t, number(r["wave_m_s"], 3)] for r, t in zip(rows, times, strict=True)])
 
 
 def of_snake(key: str, k: int) -> float:
@@ -922,7 +959,8 @@ TABLES: dict[str, Callable[[], str]] = {
     for table in (
         elbows, glued_and_real, overturning_holds, overturning_drives, assumptions, ledger,
         snake_table_iii, snake_table_iv, snake_table_v, time_stepping, endings, right_hand_side, ratios, job, precision,
-        sweeps, snake_bench, combinations, comparison, faults, planned_arm, planned_gains, planned_scenes,
+        sweeps, snake_bench, touching_bodies, falling_dominoes,
+        combinations, comparison, faults, planned_arm, planned_gains, planned_scenes,
         snake_positioning, snake_limits,
         snake_ways, snake_circles, snake_order, snake_areas, snake_on_servos, snake_tasks, modules,
     )
@@ -1066,6 +1104,9 @@ NUMBERS: dict[str, Callable[[], str]] = {
     "job_held_ratio_implicit": lambda: against_mujoco(HELD_CASE, MUJOCO_IMPLICIT),
     "job_free_ratio": lambda: against_mujoco("free arm", MUJOCO_EULER),
     "job_free_ratio_implicit": lambda: against_mujoco("free arm", MUJOCO_IMPLICIT),
+    "boxes_slower": lambda: slower("other"),
+    "beside_slower": lambda: slower("side"),
+    "dominoes_slower": lambda: slower("dominoes"),
     "snake_slower": lambda: fixed(1.0 / of_snake("us_per_step", 1), 1),
     "snake_faster_stiff": lambda: fixed(of_snake("times_real_time", 2), 1),
     "snake_farther": lambda: fixed(of_snake("z_rms_m", 1), 1),

@@ -47,7 +47,10 @@ def compile_shapes(robot: Robot, contacts: Sequence[Contact]) -> kd.ShapeArrays 
             index.append((links[0], links[1]))
             solids.append([solid_row(contact.solid), solid_row(contact.surface)])
         arrays.kind[k, [kd.SURFACE, kd.FIELD, kd.COUNT]] = kd.PAIR, len(index) - 1, contact.slot
-    return arrays if not index else arrays._replace(pairs=ks.pair_arrays(np.array(index), np.array(solids)))
+    if all(contact.surface.carrier is None for contact in contacts):
+        return arrays
+    index, solids = np.reshape(index, (-1, ks.PAIR_SIZE)), np.reshape(solids, (-1, 2, ks.SOLID_SIZE))
+    return arrays._replace(pairs=ks.pair_arrays(index, solids))
 
 
 def solid_row(solid: Surface) -> Array:

@@ -127,8 +127,8 @@ def compile_unilateral(
         tie=reals(tie),
         index=integers(np.zeros((ku.INDICES, max(p, c + len(dry) + s + 2)))),
         vector=reals(np.zeros((ku.VECTORS, p))),
-        room=reals(np.zeros((ku.ROOM, p, p))),
-        split_room=reals(np.zeros(split_size(3 * c + len(dry) + s, c + len(dry) + s))),
+        room=np.zeros((ku.ROOM, p, p)),  # not copied: time stepping, with many candidates, does not touch it
+        split_room=np.zeros(split_size(3 * c + len(dry) + s, c + len(dry) + s)),
         number=reals(number),
         shares=reals(np.zeros(shares)),
         kept=reals(np.zeros(kept_size(shares, c, s, len(dry)))),

@@ -49,7 +49,7 @@ class ShapeArrays(NamedTuple):
     kind: np.ndarray  # (c, SHAPE_KIND_SIZE) int
     data: np.ndarray  # (c, SHAPE_SIZE)
     fields: np.ndarray  # B-spline coefficients of all height fields, (nx + 2) (ny + 2) each, one x after the other
-    pairs: PairArrays | None = None  # pairs of solids; None: there are no such pairs
+    pairs: PairArrays | None = None  # pairs of solids, possibly none; None: no body carries a surface
 
 
 @internal_kernel

@@ -518,6 +518,14 @@ def pair_row(pairs, shapes: ShapeArrays, unilateral: UnilateralArrays | None, mo
 
 
 @internal_kernel
+def carrier_of(pairs, contacts: ContactArrays, k):
+    """Return the link that carries the surface of candidate k; without pairs it is −1, known at compile time."""
+    if pairs is None:
+        return -1
+    return contacts.link[k, ka.CARRIER]
+
+
+@internal_kernel
 def shaped_row(
     shapes: ShapeArrays,
     unilateral: UnilateralArrays | None,
@@ -542,7 +550,7 @@ def shaped_row(
     R = rotation(links, i, ka.R)
     s = transform(vector(links, i, ka.P), R, vector(point, k, ka.POINT))
     d = rotate(R, vector(data, k, kd.D))
-    carrier = contacts.link[k, ka.CARRIER]
+    carrier = carrier_of(shapes.pairs, contacts, k)
     # Point and axis in the frame of the surface.
     x, e = s, d
     if carrier >= 0:

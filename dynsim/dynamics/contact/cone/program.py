@@ -626,6 +626,9 @@ def select_least_norm(W, w, kind, mu, p, f, room):
             now[i] += S[i, k] * f[a + k]
         for j in range(i + 1):
             b, total = int(row[j]), 0.0
+            if size[i] == 1.0 and size[j] == 1.0:  # then S is one
+                G[i, j], G[j, i] = W[a, b], W[a, b]
+                continue
             for k in range(int(size[i])):
                 for m in range(int(size[j])):
                     total += S[i, k] * W[a + k, b + m] * S[j, m]
@@ -641,8 +644,10 @@ def select_least_norm(W, w, kind, mu, p, f, room):
     for _ in range(1 + REFINEMENTS):
         for i in range(n):
             right[i] = 0.0
-            for j in range(n):
-                right[i] += G[i, j] * (now[j] - goal[j])
+        for j in range(n):
+            far = now[j] - goal[j]
+            for i in range(n):  # G is symmetric; along a row, the loop is vectorised
+                right[i] += G[j, i] * far
         solve_symmetric(L, right, n)
         for i in range(n):
             goal[i] += right[i]
