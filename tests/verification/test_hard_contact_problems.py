@@ -109,11 +109,11 @@ def test_hard_problems_are_solved():
 
 
 def test_events_solve_hard_problems():
-    """The same search, with a proof before its last resort."""
+    """The same search, with a proof before its last resort, but without the second proximal-point search of steps."""
     for problem in problems():
         residual, _ = solved(problem, as_events_do)
         if not unsolved(problem):
-            assert 0.0 <= residual <= 1e-10, problem.why
+            assert 0.0 <= residual <= (1e-9 if problem.why.startswith("bodies") else 1e-10), problem.why
 
 
 def test_jams_have_no_solution_but_without_the_additions_to_their_rates():

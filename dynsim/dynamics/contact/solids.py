@@ -36,6 +36,8 @@ FLAT = 0.98
 SAME = 1e-12
 # A feature of the last step keeps its slot unless another one is deeper by this distance [m] or further by this factor.
 STAYS, STAYS_FACTOR = 1e-6, 1.02
+# A place that is further behind the deepest one than this [m] only gets a slot that no other place needs.
+TOUCHES, APART_FACTOR = 1e-5, 1e-3
 # Places within this distance behind the deepest one can touch as well [m].
 BAND = 2e-3
 # Slope of the distance along an edge below which its ends are as near as its middle.
@@ -333,7 +335,7 @@ def fill_slots(known, slots, places, chosen):
     for f in range(FEATURES):
         if places[f, GAP] <= limit:
             offset = along(vector_of(places, f), first, -1.0)
-            square = dot_vector(offset, offset) * (STAYS_FACTOR if is_known(known, f) else 1.0)
+            square = dot_vector(offset, offset) * weight(places, known, f, deepest)
             if square > best:
                 best, chosen[1] = square, f
     if chosen[1] >= 0:
@@ -348,7 +350,7 @@ def fill_slots(known, slots, places, chosen):
         for f in range(FEATURES):
             if places[f, GAP] <= limit:
                 side = dot_vector(across, along(vector_of(places, f), first, -1.0))
-                side *= STAYS_FACTOR if is_known(known, f) else 1.0
+                side *= weight(places, known, f, deepest)
                 if side < least:
                     least, chosen[2] = side, f
                 elif side > most:
@@ -379,6 +381,13 @@ def deepest_place(places, known):
         if gap < least:
             deepest, least = f, gap
     return deepest
+
+
+@internal_kernel
+def weight(places, known, f, deepest):
+    """Return the weight of feature f in the choice of slots."""
+    touches = places[f, GAP] <= max(places[deepest, GAP], 0.0) + TOUCHES
+    return (1.0 if touches else APART_FACTOR) * (STAYS_FACTOR if is_known(known, f) else 1.0)
 
 
 @internal_kernel
