@@ -204,6 +204,17 @@ def test_exact_runs_have_a_note_next_to_errors_on_a_logarithmic_axis(record):
     assert mentions(dynsim.figure({"one": record, "two": record}, "comparison").caption, "one and two")
 
 
+def test_constant_joint_angles_are_in_a_note(record):
+    still = copy.deepcopy(record)
+    still["at_limit"][:] = 0
+    still["phi"][:, 0] = np.linspace(0.0, 1.0, len(record))
+    still["phi"][:, 1:] = 0.1
+    (panel,) = figures.joints(still).axes
+    first, *others = (snake_view.greek(name) for name in record.labels["phi"])
+    assert [text.get_text() for text in panel.get_legend().get_texts()] == [first]
+    assert mentions(figures.joints(still).notes, "at 5.7°", others[-1])
+
+
 def test_a_joint_that_is_never_straightened_has_no_time(simulated):
     rows = tables("snake_joint_limits", {v: simulated("snake_joint_limits", v) for v in JOINT_LIMITS})["joint_limits"]
     (fixed,) = [row[4] for row in rows if row[3] == "fixed"]

@@ -22,7 +22,7 @@ def named(figure: Figure) -> dict[str, list[Axes]]:
     """
     panels: dict[str, list[Axes]] = {}
     row: dict[int, str] = {}
-    for axes in figure.axes:
+    for axes in filter(Axes.get_subplotspec, figure.axes):  # without colour bars
         first = row_of(axes)
         if name := _name(axes) or (row.get(first, "") if axes.axison else ""):
             panels.setdefault(name, []).append(axes)

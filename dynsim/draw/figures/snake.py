@@ -242,9 +242,8 @@ def joints(record: Record) -> Figure:
         still: dict[str, list[str]] = {}
         for k in np.flatnonzero(~moves):
             still.setdefault(style.number(round(phi[0, k], 1) + 0.0, 3), []).append(greek(labels[k]))
-        figure.note(
-            f"Constant, not drawn: {'; '.join(f'{listed(names)} at {angle}°' for angle, names in still.items())}."
-        )
+        texts = [f"{listed(names)} at {angle}°" for angle, names in still.items()]
+        figure.note(f"Constant and not drawn: {'; '.join(texts)}.")
     if record["at_limit"].any():
         figure.note("Dots: the joint is excluded from allocation because it is at its limit.")
     return figure
