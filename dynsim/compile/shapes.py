@@ -49,8 +49,8 @@ def compile_shapes(robot: Robot, contacts: Sequence[Contact]) -> kd.ShapeArrays 
         arrays.kind[k, [kd.SURFACE, kd.FIELD, kd.COUNT]] = kd.PAIR, len(index) - 1, contact.slot
     if all(contact.surface.carrier is None for contact in contacts):
         return arrays
-    index, solids = np.reshape(index, (-1, ks.PAIR_SIZE)), np.reshape(solids, (-1, 2, ks.SOLID_SIZE))
-    return arrays._replace(pairs=ks.pair_arrays(index, solids))
+    both = np.reshape(solids, (-1, 2, ks.SOLID_SIZE))
+    return arrays._replace(pairs=ks.pair_arrays(np.reshape(index, (-1, ks.PAIR_SIZE)), both))
 
 
 def solid_row(solid: Surface) -> Array:
