@@ -17,7 +17,7 @@ from dynsim.model.description import Robot
 
 Array = NDArray[np.float64]
 
-# A body, or two bodies that touch each other: motions are those of the first relative to the second.
+# A body, or two bodies that touch each other; motions are relative to the second body.
 Ends = int | tuple[int, int]
 
 # Rows whose axes are fixed in the body that the whole joint carries; they share the velocity of their mount.

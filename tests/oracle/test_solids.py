@@ -43,7 +43,7 @@ def peer(core: np.ndarray) -> tuple[coal.CollisionGeometry, float]:
 
 
 @pytest.mark.parametrize(("first", "second"), list(itertools.product(KINDS, KINDS)))
-def test_distances_and_normals_are_those_of_coal(first: str, second: str) -> None:
+def test_distances_and_normals_agree_with_coal(first: str, second: str) -> None:
     rng = np.random.default_rng([KINDS.index(first), KINDS.index(second)])
     a, b, at_a, at_b = cores(first, rng), cores(second, rng), poses(rng, 0.6), poses(rng, 0.3)
     gaps, normals = np.zeros(PAIRS), np.zeros((PAIRS, 3))

@@ -98,7 +98,7 @@ def test_two_spheres_head_on(tmp_path, restitution):
     a, b = rates(record, "a")[0], rates(record, "b")[0]
     before = a[0] + 2.0 * b[0]
     assert before == pytest.approx(1.005, abs=1e-6)
-    # Without restitution, the penetration of the landing is undone at a speed that remains where nothing presses.
+    # Without restitution, the removal of the penetration leaves a speed that remains if no force presses.
     error = 0.03 if restitution == 0.0 else 1e-12
     assert a[0] == pytest.approx(before * (1.0 - 2.0 * restitution) / 3.0, abs=error)
     assert b[0] == pytest.approx(before * (1.0 + restitution) / 3.0, abs=error)

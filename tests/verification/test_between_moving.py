@@ -130,7 +130,7 @@ def test_a_rider_sticks_up_to_its_friction(tmp_path, method, share):
 
 @pytest.mark.parametrize("method", ["time_stepping", "dopri5", "radau5"])
 def test_a_sphere_rolls_on_an_accelerated_cart(tmp_path, method):
-    """Its acceleration is 2/7 of the cart's, whose force also accelerates two sevenths of the sphere's mass."""
+    """Its acceleration is 2/7 of the acceleration of the cart, which moves two sevenths of the sphere's mass, too."""
     rider, cart = ridden(tmp_path, 2.0, method, "sphere")
     a = (CART + RIDER) * 2.0 / (CART + 2.0 / 7.0 * RIDER)
     assert cart[-1] == pytest.approx(0.5 * a * 0.4**2, rel=1e-6)

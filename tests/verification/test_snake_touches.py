@@ -30,7 +30,7 @@ def between(record: Record, body: str) -> list[int]:
 
 @pytest.mark.long
 def test_wheels_push_a_box_with_its_friction():
-    """A smooth box in front of the first pair: the force is µ m g, and the box moves as far as the robot."""
+    """A smooth box in front of the first pair: the force is µ m g, and the box and the robot move by the same distance."""
     changes: dict[str, Any] = {
         "contacts.between": [{"bodies": ["box", "links"], "friction": 0.0}],
         "controller.paths": [{"type": "ramp", "start_s": 0.2, "duration_s": 1.8, "displacement": [0.08] + 5 * [0]}],
@@ -53,7 +53,7 @@ def test_wheels_push_a_box_with_its_friction():
 
 @pytest.mark.long
 def test_gripper_pushes_the_pipe_ahead():
-    """Contact forces of the head are the friction of the ground, and the pipe goes as far as the gripper."""
+    """Contact forces of the head are the friction of the ground, and the pipe and the gripper move by the same distance."""
     record = simulate(load_scenario("snake_pick_up", "pushes"))
     steady = (record.time > 14.0) & (record.time < 20.5)
     labels = record.labels["contact_normal_force"]
@@ -113,7 +113,7 @@ GRASPS: dict[str, tuple[str, str, dict[str, Any], float]] = {
 @pytest.mark.long
 @pytest.mark.parametrize("name", GRASPS)
 def test_gripper_touches_hinged_objects_and_moves_them(name):
-    """It stops at the hub or knob, and moves the object as far as without contact."""
+    """It stops at the hub or knob, and moves the object by the same angle as without contact."""
     scenario, variant, changes, angle = GRASPS[name]
     touching = {"contacts.between": [{"bodies": [name, "links"]}]}
     record = simulate(load_scenario(scenario, variant, touching | changes))
@@ -126,7 +126,7 @@ def test_gripper_touches_hinged_objects_and_moves_them(name):
 
 @pytest.mark.long
 def test_gripper_that_is_stopped_by_a_hub_does_not_reach_its_grasp_frame():
-    """The tip cannot touch the face of the hub, as it does without contact."""
+    """The tip cannot touch the face of the hub, unlike without contact."""
     touching = {"contacts.between": [{"bodies": ["valve", "links"]}]}
     with raises(SimulationStopped, "too_far", "valve", "plant.gripper") as caught:
         simulate(load_scenario("snake_valve", "turns", touching))
