@@ -175,7 +175,7 @@ REFUSALS: tuple[Refusal, ...] = (
             between=("objects", "links", "self"), contact=GLUED),
     _refuse("a ball on a glued arm touches nothing", "", between="carried", contact=GLUED),
     _refuse("there is only one object", "", between="objects", objects="none"),
-    _refuse("links of files have no radius", r"no links with a solid", between=("links", "self"),
+    _refuse("links of files have no radius", r"no links with a solid|has no solid", between=("links", "self"),
             plant=("urdf", "mimic", "floating", "planar")),
     _refuse("a snake moves its links as its own controller wants", "", between=("links", "carried", "self"),
             plant="snake"),

@@ -82,7 +82,6 @@ PHRASES = {
     "outside": "outside the triangle",
     "pulling": "surface pulls",
     "slides": "slides",
-    "unloaded": "a wheel carries no load",
     # Signs of a page.
     "at voltage limit": "voltage limit",
     "sunk sign": "joint or hand below a surface",

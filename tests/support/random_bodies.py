@@ -262,7 +262,7 @@ def _collect(seed: int, duration: float, result: Result) -> None:
         if worst > kt.FAIR or drops:
             p, coupled = int(ws.counts[ka.ROWS]), int(ws.counts[ka.COUPLED])
             start, b = np.zeros(p), s.right[:p].copy()
-            start[:coupled] = impulse[3 * len(ws.contacts) :][:coupled]
+            start[:coupled] = np.split(impulse, [3 * len(ws.contacts)])[1][:coupled]
             for c in range(len(ws.contacts)):
                 if ws.active[c, ka.MODE] == ka.STICKING:
                     r = int(ws.active[c, ka.FIRST_ROW])

@@ -370,9 +370,9 @@ def test_a_folder_is_no_scenario(tmp_path: Path):
 
 def test_a_record_of_10_GB_is_refused_with_a_rate_that_fits():
     with raises(
-        ScenarioError, "record.rate_hz = 920000", re.compile(r"\b10\.\d GB"), "2 GB", "Hz", "record.size_limit_GB"
+        ScenarioError, "record.rate_hz = 850000", re.compile(r"\b10\.\d GB"), "2 GB", "Hz", "record.size_limit_GB"
     ):
-        check(load_scenario("elbow_comparison", overrides={"record.rate_hz": 9.2e5}))
+        check(load_scenario("elbow_comparison", overrides={"record.rate_hz": 8.5e5}))
 
 
 def test_missing_file_lists_what_is_shipped():

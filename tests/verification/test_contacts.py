@@ -205,7 +205,7 @@ def test_more_contacts_than_a_machine_can_carry_are_refused_with_an_estimate():
     """The work of a right-hand side grows with p² n and p³."""
     points = {f"c{k}": {"body": "link_1"} for k in range(1000)}
     size = {"plant.chain.0.initial_deg": 90, "plant.chain.0.axis": "y", "duration_s": 100, "contacts.points": points}
-    overrides = {**size, "surfaces.floor.type": "plane", "integrator.wall_limit_s": 3600}
+    overrides = {**size, "surfaces.floor.type": "plane", "integrator.wall_limit_s": 3600, "record.rate_hz": 50}
     with raises(ScenarioError, "1", "1000", re.compile(r"[\d.]+e\+\d+ s"), "3600 s", "integrator.wall_limit_s"):
         check(load_scenario("single_pendulum", overrides=overrides))
     check(load_scenario("single_pendulum", overrides={**overrides, "integrator.wall_limit_s": 1e5}))

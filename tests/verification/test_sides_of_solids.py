@@ -10,7 +10,7 @@ from support.messages import raises
 
 import dynsim
 from dynsim.compile.clearance import axis_gaps
-from dynsim.compile.shapes import gap_at
+from dynsim.compile.touching import gap_at
 from dynsim.errors import ModelError
 from dynsim.scenario import build
 from dynsim.scenario.reading import scenario_from_resolved

@@ -8,8 +8,8 @@ import pytest
 from support.messages import lines_with, raises
 
 from dynsim.compile.model import Model
-from dynsim.compile.shapes import gap_at
 from dynsim.compile.snake_tree import configuration, lifted_moments
+from dynsim.compile.touching import gap_at
 from dynsim.engine import simulate
 from dynsim.engine.simulation import Simulation
 from dynsim.engine.snake_control import WheelLifter

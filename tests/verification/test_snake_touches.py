@@ -30,7 +30,7 @@ def between(record: Record, body: str) -> list[int]:
 
 @pytest.mark.long
 def test_wheels_push_a_box_with_its_friction():
-    """A smooth box in front of the first pair: the force is µ m g, and the box and the robot move by the same distance."""
+    """A smooth box in front of the first pair: the force is µ m g; box and robot move by the same distance."""
     changes: dict[str, Any] = {
         "contacts.between": [{"bodies": ["box", "links"], "friction": 0.0}],
         "controller.paths": [{"type": "ramp", "start_s": 0.2, "duration_s": 1.8, "displacement": [0.08] + 5 * [0]}],
@@ -53,7 +53,7 @@ def test_wheels_push_a_box_with_its_friction():
 
 @pytest.mark.long
 def test_gripper_pushes_the_pipe_ahead():
-    """Contact forces of the head are the friction of the ground, and the pipe and the gripper move by the same distance."""
+    """Contact forces of the head are the friction of the ground, pipe and gripper move by the same distance."""
     record = simulate(load_scenario("snake_pick_up", "pushes"))
     steady = (record.time > 14.0) & (record.time < 20.5)
     labels = record.labels["contact_normal_force"]

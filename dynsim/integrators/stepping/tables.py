@@ -128,7 +128,7 @@ def stepping_arrays(
     na: int,
     joint_rows: int,
     theta: float,
-    free: np.ndarray,
+    free: np.ndarray | None = None,
 ) -> SteppingArrays:
     """Allocate :class:`SteppingArrays` for ``joint_rows`` rows of joints, and the rows of all candidates."""
     n, c = model.body.shape[0], contacts.link.shape[0]
@@ -159,7 +159,7 @@ def stepping_arrays(
         room=np.zeros((kc.CONE_ROOM, p, p)),
         statistics=np.zeros(STATISTICS_SIZE),
         grid=np.zeros(GRID_SIZE),
-        free=integers(free),
+        free=integers(np.zeros(0) if free is None else free),
     )
 
 
