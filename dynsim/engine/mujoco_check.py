@@ -9,14 +9,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from dynsim.compile.scene import drawn_surface
 from dynsim.engine.prepare import Prepared
-from dynsim.engine.recording import drawn_scene
 from dynsim.errors import ModelError, first_few
 from dynsim.model.description import Array, Load, Robot
 from dynsim.model.drives import Motor, Servo
 from dynsim.model.mjcf import control_scale
 from dynsim.record import Record
-from dynsim.scenario import Scenario
+from dynsim.scenario import Scenario, build
 
 STEPS = (1e-3, 1e-4)
 """Longest steps of the comparison [s]: the step of the exported file, and a tenth of it."""
@@ -34,9 +34,13 @@ def omissions(scenario: Scenario, prepared: Prepared, touching: bool) -> list[st
     """
     robot, contacts = prepared.model.robot, prepared.contacts
     law = scenario.config.contacts.law
-    scene = drawn_scene(scenario, robot, contacts)
-    surfaces = scene.surfaces if scene is not None else ()
-    unsupported = [s.name for s in surfaces if s.kind in ("quadric", "height_field") or (s.radius or 0.0) < 0.0]
+    surfaces = {name: (drawn_surface(name, s), s.carrier) for name, s in build.surfaces(scenario).items()}
+    unsupported = [
+        name
+        for name, (s, carrier) in surfaces.items()
+        # Planes belong to the world in MuJoCo.
+        if s.kind in ("quadric", "height_field", *(("plane",) if carrier else ())) or (s.radius or 0.0) < 0.0
+    ]
     lost = [c.name for c in contacts if not touching or c.surface_name in unsupported]
     kept = [c for c in contacts if c.name not in lost]
     dc = [m for m in robot.motors if isinstance(m, Motor)]

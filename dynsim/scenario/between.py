@@ -127,6 +127,8 @@ def _bodies(
 
     for name in itertools.chain.from_iterable(entry.ignore):
         members(name, "ignore")
+    if names := {LINKS, OBJECTS, SELF} & set(robot.bodies):
+        raise ModelError(f"contacts.between: {min(names)!r} is a group and a body; rename the body", keys=keys)
     ignored = {frozenset(pair) for pair in entry.ignore} | _neighbours(robot)
     sides = [LINKS, LINKS] if entry.bodies == SELF else list(entry.bodies)
     seen = set[frozenset[str]]()
@@ -135,6 +137,8 @@ def _bodies(
         if len(pair) == 2 and pair not in ignored and pair not in seen:
             seen.add(pair)
             yield first, second
+    if not seen:
+        log.warning("contacts.between.%d has no effect: no pair remains without neighbours on joints and `ignore`", k)
 
 
 def _neighbours(robot: Robot) -> set[frozenset[str]]:
@@ -169,7 +173,8 @@ def _candidates(a: Solid, b: Solid) -> Iterable[Contact]:
     elif isinstance(a, Box):
         yield from _candidates(b, a)
     elif isinstance(b, Box):
-        yield from (*_along(a, b), *_corners(b, a))
+        # The distance of a sphere from a box covers corners, too.
+        yield from (*_along(a, b), *(_corners(b, a) if a.axis.any() else ()))
     elif not a.axis.any() or b.axis.any():
         yield from (*_along(a, b), *(_ends(b, a) if b.axis.any() and a.axis.any() else ()))
     else:
