@@ -165,7 +165,7 @@ def test_tipping_is_marked_in_every_panel_that_shows_its_time(tipped: Record, tu
         low, high = axes.get_xlim()
         assert {path.vertices[0, 0] for part in lines for path in part.get_paths()} <= times
         assert bool(lines) == any(low <= time <= high for time in times)
-    assert mentions(figure.caption, "base tips over")
+    assert mentions(figure.caption, "tip margin falls below 0")
     assert mentions(texts(figure), f"{min(times):.3g} s")
     assert mentions(texts(drawn(base.margin_comparison({"a": tipped, "b": turning}))), f"{min(times):.3g} s")
 

@@ -309,8 +309,21 @@ def test_short_peak_is_cut_and_stated() -> None:
     values[500] = 80.0
     (panels,) = style.time_rows(figure := style.new_figure(3.0, ""), [[(time, values)]], settle=2.0)
     assert 1.2 < panels[-1].get_ylim()[1] < 3.0
-    assert [text.get_text() for text in panels[-1].texts] == ["max 80"]
+    assert [text.get_text() for text in panels[-1].texts] == ["range −1 … 80"]
     assert mentions(figure.caption, "Short peaks")
+
+
+@pytest.mark.parametrize("lasting", [0.5, 3.0])
+def test_transient_of_many_samples_is_not_cut_in_a_narrow_figure(lasting: float) -> None:
+    time = np.linspace(0.0, 10.0, 1001)
+    values = np.where(time < lasting, 80.0, np.sin(time))
+    with style.look(style.Look(width=3.4)):
+        (panels,) = style.time_rows(figure := style.new_figure(3.0, ""), [[(time, values)]], settle=2.0)
+        style.line(panels[-1], time, values)
+    assert len(panels) == 1
+    assert panels[-1].get_ylim()[1] > 80.0
+    assert not panels[-1].texts
+    assert not figure.notes
 
 
 @pytest.mark.parametrize(("low", "high"), [(-0.005, 0.0045), (247.0, 286.0), (0.0, 92.0), (-1.0, 0.9)])
@@ -607,6 +620,7 @@ WAVE = np.sin(TIME)
         (WAVE + 1e-3, "Curves that coincide: a2 and b."),
         (WAVE + 0.3 * (np.abs(TIME - 5.0) < 0.5), "Curves that nearly coincide: a2 and b except 4.5–5.5 s."),
         (WAVE + 0.3 * (TIME < 3.0), ""),
+        (WAVE + 0.3 * (TIME > 6.0), "Curves that coincide: a2 and b until 6.0 s."),
         (WAVE + 0.3, ""),
     ],
 )

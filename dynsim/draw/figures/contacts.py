@@ -29,7 +29,7 @@ MARKS = {
     "stop_hit": ("joint stop hit",),
     "stop_left": ("joint stop left",),
     "chatter": ("chatter",),
-    TIP_OVER: ("base tips over",),
+    TIP_OVER: ("tip margin falls below 0",),
 }
 _SHAPES = dict(zip((text for texts in MARKS.values() for text in texts), "v^o>Ds|PX*p", strict=True))
 COLOUR = "#A6A6A6"
@@ -73,11 +73,15 @@ def mark_all(figure: style.Drawing, rows: Sequence[Sequence[Axes]], record: Reco
     kinds = {text: kinds[text] for text in _SHAPES if text in kinds}
     for axes in (axes for panels in rows for axes in panels):
         mark(axes, marked(record))
+    since = -np.inf
     for axes in rows[0]:
-        style.rug(axes, {_SHAPES[text]: _merged(times, axes.get_xlim()) for text, times in kinds.items()})
+        # An event has a mark in one panel only: the panel of the transient, or else the panel of the whole run.
+        shown = {text: [t for t in times if t > since] for text, times in kinds.items()}
+        style.rug(axes, {_SHAPES[text]: _merged(times, axes.get_xlim()) for text, times in shown.items()})
+        since = axes.get_xlim()[1]
     entries: dict[str, Any] = {}
-    for (text, times), marks in zip(kinds.items(), style.rug_rows(rows[0][-1]), strict=True):
-        drawn = np.size(marks.get_xdata())
+    for (text, times), *marked_as in zip(kinds.items(), *map(style.rug_rows, rows[0]), strict=True):
+        marks, drawn = marked_as[-1], sum(np.size(marks.get_xdata()) for marks in marked_as)
         fewer = f" in {drawn} mark{'s' * (drawn > 1)}" if drawn < len(times) else ""
         entries[f"{text} ({len(times)}{fewer})"] = marks
     figure.put_below({**entries, **_seen(rows)}, 4, last=True)
@@ -142,7 +146,7 @@ def _forces(records: Mapping[str, Record], title: str) -> Figure | None:
     above = 1.0 + more * style.legend_row() / 72.0
     figure = style.new_figure(min(above + ROW * len(chosen), PAGE), title + note)
     series = [[values for r in having[name].values() for values in _series(r, name)] for name in chosen]
-    styles = style.variant_styles(list(records))
+    styles, dashed = style.variant_styles(list(records)), False
     rows = style.time_rows(figure, series, max(run.settle_time for run in runs), zero=alone)
     for name, panels in zip(chosen, rows, strict=True):
         for axes in panels:
@@ -151,6 +155,8 @@ def _forces(records: Mapping[str, Record], title: str) -> Figure | None:
                 label = variant if many else labels[name, variant]
                 style.line(axes, record.time, force, label=label, **styles[variant])
                 for value in _extremes(record, name) if alone else ():
+                    low, high = (-np.inf, np.inf) if axes.get_autoscaley_on() else axes.get_ylim()
+                    dashed = dashed or low < value < high
                     axes.axhline(value, color=colour, linestyle=(0, (5, 3)), linewidth=0.7)
                 if alone:
                     mark(axes, marked(record, [name]))
@@ -169,7 +175,7 @@ def _forces(records: Mapping[str, Record], title: str) -> Figure | None:
         others = f" and {len(brief) - LISTED} more" * (len(brief) > LISTED)
         figure.note(f"Closed for an instant, not drawn: {'; '.join(brief[:LISTED])}{others}.")
     if not many:
-        also = ", also as dashed lines within the axes" if alone else ""
+        also = ", also as dashed lines" if dashed else ""
         figure.note(f"Legend: share of the run; range over all integration steps, with peaks between samples{also}.")
     if many:
         style.legend_below(figure, [panels[-1] for panels in rows], 5)

@@ -319,7 +319,8 @@ def torques(record: Record) -> Figure | None:
     if not loads:
         return None
     limits = {key for unit, motors in loads.items() for motor in motors for key in TORQUES[unit][2:] if key in motor}
-    subject = "load of each motor, with limit and rating" if limits else "load of each motor"
+    kinds = [kind for k, kind in ((2, "limit"), (3, "rating")) if limits & {names[k] for names in TORQUES.values()}]
+    subject = " and ".join(["load of each motor" + ", with" * bool(kinds), *kinds]).replace("with and", "with")
     heights = [0.7 + 0.17 * len(motors) for motors in loads.values()]
     figure = style.new_figure(0.7 + sum(heights), style.title(record, subject))
     panels = figure.subplots(len(loads), 1, height_ratios=heights, squeeze=False)[:, 0]

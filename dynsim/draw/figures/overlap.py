@@ -54,8 +54,10 @@ def separate(figure: Figure) -> list[str]:
         (axes, curves), apart = group[-1], parts[-1]
         worst = {pair: max(part[p][0] for part in parts for p in (pair, pair[::-1]) if p in part) for pair in apart}
         near = [pair for pair in apart if (worst[pair] if panel == PATHS else apart[pair][0]) <= APART]
+        begun = {} if panel == PATHS else {pair: _until(axes, *apart[pair][1:]) for pair in apart.keys() - {*near}}
+        early = {pair: until for pair, until in sorted(begun.items()) if until and not pair[1].startswith("target")}
         for name, (line, *_) in curves.items():
-            wide = line.get_linewidth() + STEP * min(sum(lower == name for lower, _ in near), STEPS)
+            wide = line.get_linewidth() + STEP * min(sum(lower == name for lower, _ in [*near, *early]), STEPS)
             widths[name] = max(wide, widths.get(name, 0.0))
         # Deviations from a target, which is a thin line above the curve, are visible.
         near = [(a, b) for a, b in near if not (worst[a, b] and b.startswith("target"))]
@@ -64,6 +66,9 @@ def separate(figure: Figure) -> list[str]:
             nearly, off = any(worst[pair] for pair in own), np.any([apart[pair][1] for pair in own], axis=0)
             where = f" except {_times(axes, off)}" if nearly and panel != PATHS else ""
             notes.setdefault(f"{'nearly ' * nearly}coincide: {listed(same)}{where}", []).append(panel)
+        for until in dict.fromkeys(early.values()):
+            for same in _joined(pair for pair in early if early[pair] == until):
+                notes.setdefault(f"coincide: {listed(same)} until {until}", []).append(panel)
     figure.set_dpi(dpi)
     for legend in [*figure.legends, *filter(None, (axes.get_legend() for axes in figure.axes))]:
         handles: Any = legend.legend_handles
@@ -77,10 +82,11 @@ def separate(figure: Figure) -> list[str]:
     return [f"Curves that {kind}: {'; '.join(own)}." for kind, own in kinds.items() if own]
 
 
-def _apart(axes: Axes, curves: Mapping[str, Sequence[Line2D]]) -> dict[tuple[str, str], tuple[float, Mask]]:
+def _apart(axes: Axes, curves: Mapping[str, Sequence[Line2D]]) -> dict[tuple[str, str], tuple[float, Mask, Mask]]:
     """Return for each pair of a lower and an upper curve at which part and columns of the picture they are apart.
 
-    Without a time axis, the part is that of the length of the curves.
+    The last columns are those in which the curves differ at all. Without a time axis, the part is that of the length
+    of the curves.
     """
     thin, thick = ({k: _picture(axes, lines, w) for k, lines in curves.items()} for w in (72.0 / DPI, 2.0 * CLOSE))
     # Curves that cover more of the picture are below the others.
@@ -88,13 +94,14 @@ def _apart(axes: Axes, curves: Mapping[str, Sequence[Line2D]]) -> dict[tuple[str
     for level, line in [(level, line) for level, k in enumerate(order) for line in curves[k]]:
         line.set_zorder(int(line.get_zorder()) + 1e-3 * level)
     in_order = {k for k, lines in curves.items() if all((np.diff(line.get_xdata()) >= 0.0).all() for line in lines)}
-    apart: dict[tuple[str, str], tuple[float, Mask]] = {}
+    apart: dict[tuple[str, str], tuple[float, Mask, Mask]] = {}
     for lower, upper in combinations([k for k in order if thin[k].any()], 2):
         if curves[lower][0].get_linewidth() < WIDER * curves[upper][0].get_linewidth():
             drawn, off = thin[lower] | thin[upper], thin[lower] & ~thick[upper] | thin[upper] & ~thick[lower]
             columns, over_time = np.any(off, axis=0), {lower, upper} <= in_order
             share = columns.sum() / drawn.any(axis=0).sum() if over_time else off.sum() / drawn.sum()
-            apart[lower, upper] = float(share) if share > INVISIBLE else 0.0, columns
+            differ = np.any(thin[lower] ^ thin[upper], axis=0)
+            apart[lower, upper] = float(share) if share > INVISIBLE else 0.0, columns, differ
     return apart
 
 
@@ -107,9 +114,21 @@ def _times(axes: Axes, off: Mask) -> str:
         return "for short times"
     digits = max(2 - math.ceil(math.log10(high - low)), 0)
     begin, end = (f"{low + share * (high - low):.{digits}f}" for share in ends)
-    labels = "".join(other.get_xlabel() for other in axes.get_shared_x_axes().get_siblings(axes))
-    unit = next(iter(re.findall(r" \[\w+", labels)), "").replace("[", "")
+    unit = next(iter(re.findall(r" \[\w+", _across(axes))), "").replace("[", "")
     return f"{begin}–{end}{unit}" if begin != end else f"near {end}{unit}"
+
+
+def _across(axes: Axes) -> str:
+    """Return the labels of the horizontal axes of a column of panels."""
+    return "".join(other.get_xlabel() for other in axes.get_shared_x_axes().get_siblings(axes))
+
+
+def _until(axes: Axes, off: Mask, differ: Mask) -> str:
+    """Return the time until which curves over time coincide, in words; "" for a short time."""
+    first = int(np.argmax(off))
+    if first < LONG * len(off) or differ[:first].mean() > APART or "time" not in _across(axes):
+        return ""
+    return _times(axes, np.arange(len(off)) == first).removeprefix("near ").rpartition("–")[2]
 
 
 def _joined(pairs: Iterable[tuple[str, str]]) -> list[list[str]]:

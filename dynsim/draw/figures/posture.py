@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -50,6 +51,11 @@ SHORT = 12.0
 MOUNT = 0.02
 # Distance from the centre of a contact mark to its label [point].
 NEAR_CONTACT = 7.0
+# Sine of the angle between a plane and the view below which they are parallel; depth below which points count as
+# outside [m].
+PARALLEL, INSIDE = 0.7, 0.01
+# Radius of the smallest contact sphere that is visible around a joint [point].
+SPHERE = 4.0
 # Extents below this [m] count as zero, because body poses are stored in single precision.
 NOTHING = 1e-6
 
@@ -266,22 +272,32 @@ class Label:
 def contact_labels(body: Skeleton, plane: SidePlane, scale: float) -> list[Label]:
     """Return labels with names and forces of the contacts, inside the surface and away from the arm.
 
-    Labels that would overlap at ``scale`` [point/m] are moved away from the surface.
+    Labels that would overlap at ``scale`` [point/m], and labels of surfaces that are too small for them, are moved away
+    from the contact.
     """
     labels: list[Label] = []
     points = [(*contact, plane.project(contact[2])) for contact in body.contacts()]
-    points = [point for point in points if point[0].body not in body.objects]
+    # A narrow figure has no space for labels of open contacts, which the legend explains.
+    points = [
+        point for point in points if point[0].body not in body.objects and not (style.narrow() and point[3] == 0.0)
+    ]
     if len(points) > LABELLED:
         return []
     largest = max((abs(force) for *_, force, _ in points if not np.isnan(force)), default=0.0)
-    for contact, normal, _, force, at in sorted(points, key=lambda entry: float(entry[4][0])):
+    for contact, normal, position, force, at in sorted(points, key=lambda entry: float(entry[4][0])):
         along, up = plane.axes @ normal
         steep = abs(along) > abs(up)
         side = (-1 if along > 0.0 else 1, 0) if steep else (0, 1 if up < 0.0 else -1)
         # Less than a thousandth of the largest force is printed as 0.
         value = style.number(0.0 if abs(force) < 1e-3 * largest else force, 3)
         text = contact.name if np.isnan(force) else f"{contact.name}\n{value} N"
-        label = Label(text, at, side, 0)
+        label, surface = Label(text, at, side, 0), body.scene.surface(contact.surface)
+        size = NEAR_CONTACT + 2.0 * float(label.half @ np.abs(side))
+        depth = np.linspace(0.0, 1.1 * size / scale, 50)
+        if surface is not None and (inside := surface.gap(position - depth[:, None] * normal) < 0.0).any():
+            thick = scale * float(depth[inside][-1])
+            level = math.ceil((thick - NEAR_CONTACT) / (size - NEAR_CONTACT))
+            label = replace(label, level=max(level, 0) * (not inside[-1]))
         while any(label.overprints(other, scale) for other in labels):
             label = replace(label, level=label.level + 1)
         labels.append(label)
@@ -456,14 +472,21 @@ def _frame_side(axes: Axes, plane: SidePlane, extent: tuple[Array, Array], surfa
     draw_cuts(axes, plane, surfaces)
 
 
-def draw_cuts(axes: Axes, plane: Projection, surfaces: Sequence[SceneSurface]) -> None:
-    """Draw surfaces within the limits of the axes: grey inside (C < 0), with a line at the cut with the plane."""
+def draw_cuts(axes: Axes, plane: Projection, surfaces: Sequence[SceneSurface], body: Array | None = None) -> None:
+    """Draw surfaces within the limits of the axes: grey inside (C < 0), with a line at the cut with the plane.
+
+    A surface without extent in the model, inside of which points of the ``body``, (n, 3) [m], are, is only a line. A
+    plane that is nearly parallel to the view is not drawn, because projected points may be on either side of its cut.
+    """
     along, up = np.meshgrid(np.linspace(*axes.get_xlim(), 160), np.linspace(*axes.get_ylim(), 120))
     points = plane.world(np.stack([along, up], axis=-1))
     for surface in surfaces:
+        if surface.kind == "plane" and np.linalg.norm(plane.axes @ surface.b) < PARALLEL * np.linalg.norm(surface.b):
+            continue
         value = surface.value(points)
         if value.min() < 0.0 < value.max():
-            axes.contourf(along, up, value, levels=[-np.inf, 0.0], colors=["#ECECEC"], zorder=0)
+            if body is None or surface.gap(body).min() > -INSIDE:
+                axes.contourf(along, up, value, levels=[-np.inf, 0.0], colors=["#ECECEC"], zorder=0)
             axes.contour(along, up, value, levels=[0.0], colors=[style.GREY], linewidths=1.0, zorder=1)
 
 
@@ -488,7 +511,8 @@ def _side_view(
     fixed = [plane.project(corners) for corners, _ in body.fixed()]
     add_outlines(axes, fixed, edgecolor=style.GREY, facecolor=BASE_COLOUR, lw=0.8, zorder=1.5)
     for centre, radius in body.pads(body.rows_shown[-1]) if drawn else []:
-        look = {"facecolor": PAD_COLOUR, "edgecolor": colour, "lw": 0.8, "zorder": 2.8, "label": "contact sphere"}
+        look = {"facecolor": PAD_COLOUR, "edgecolor": colour, "lw": 0.8, "zorder": 2.8}
+        look["label"] = style.UNLISTED * (scale * radius < SPHERE) + "contact sphere"
         axes.add_patch(Circle(tuple(plane.project(centre)), radius, **look))
     for base in (bases := body.bases()):
         last = base is bases[-1]
@@ -528,12 +552,13 @@ def _side_view(
         ring: dict[str, Any] = {"markersize": 9, "markerfacecolor": "none", "color": style.DEEP, "zorder": 5}
         for point_below in below:
             point = Point(point_below.name, "hand", point_below.body, point_below.position)
-            places = plane.project(point_positions(record, point, rows)[point_below.depth > point_below.least])
-            axes.plot(*places.T, "o", **ring)
+            # A second ring at the same joint would look like another point.
+            at = rows[point_below.depth > point_below.least][-1]
+            axes.plot(*plane.project(point_positions(record, point, at)), "o", **ring)
         deepest = max(below, key=lambda point_below: float(point_below.depth.max()))
         text = f"below {deepest.surface}, up to {style.number(1e3 * float(deepest.depth.max()), 3)} mm"
         axes.plot([], [], "o", label=text if named else "below a surface", **ring)
-    for label in labels:
+    for label in labels:  # without a box, which would hide outlines of surfaces
         axes.annotate(
             label.text,
             tuple(label.place),
@@ -543,7 +568,6 @@ def _side_view(
             va="center",
             fontsize=style.letters(LABEL_SIZE),
             linespacing=1.1,
-            bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.6, "pad": 0.5},
             # A line connects a distant label with its contact.
             arrowprops={"arrowstyle": "-", "color": style.GREY, "lw": 0.5, "shrinkB": 4} if label.level else None,
         )

@@ -222,7 +222,9 @@ def joints(record: Record) -> Figure:
         ("pitch of the head", np.flatnonzero(pitch[:n_h])),
         ("yaw of the base", np.arange(n_h, len(labels))),
     ]
-    moves = (np.ptp(phi, axis=0) > STILL[1]) | record["at_limit"].any(axis=0)
+    # Limits are in the panels, so smaller motions are flat lines there.
+    least = max(STILL[1], 0.01 * DEGREES * float((upper - lower).min()))
+    moves = (np.ptp(phi, axis=0) > least) | record["at_limit"].any(axis=0)
     parts = [(title, shown) for title, group in parts if len(shown := group[moves[group] | ~moves.any()])]
     figure = style.new_figure(2.0 * len(parts) + 0.4, style.title(record, "joint angles and limits"))
     axes = figure.subplots(len(parts), 1, sharex=True, squeeze=False)[:, 0]
@@ -243,7 +245,7 @@ def joints(record: Record) -> Figure:
         for k in np.flatnonzero(~moves):
             still.setdefault(style.number(round(phi[0, k], 1) + 0.0, 3), []).append(greek(labels[k]))
         texts = [f"{listed(names)} at {angle}°" for angle, names in still.items()]
-        figure.note(f"Constant and not drawn: {'; '.join(texts)}.")
+        figure.note(f"Constant within {style.number(least, 2)}° and not drawn: {'; '.join(texts)}.")
     if record["at_limit"].any():
         figure.note("Dots: the joint is excluded from allocation because it is at its limit.")
     return figure

@@ -116,7 +116,8 @@ class View:
             axes.plot(*self.centre[:2], "x", color="black", ms=4, mew=1.0, zorder=6)
         # Seen from above, surfaces are cut at the height of the controlled point.
         plane = Projection(np.array([0.0, 0.0, self.points[0, 2]]), ABOVE.axes) if above else self.beside
-        draw_cuts(axes, plane, self.surfaces)
+        # The model has no size of a plate, so the body may be inside of its plane.
+        draw_cuts(axes, plane, self.surfaces, np.concatenate([self.points, *(c for pair in self.wheels for c in pair)]))
         self.draw_body(axes, above, BODY, HEAD)
         for down, pair in zip(self.grounded, self.wheels, strict=True):
             # In side view, a lifted pair is drawn slightly above the ground; the model has no height for it ([T] II.A).

@@ -10,7 +10,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 from threading import RLock
@@ -129,7 +129,8 @@ _LOOK: Any = {
 LINE_POINTS = 4000
 # A transient panel shows TRANSIENT_ROOM times the transient, unless this exceeds TRANSIENT_MAX_SHARE of the run.
 TRANSIENT_ROOM, TRANSIENT_MAX_SHARE = 1.2, 0.8
-# Peaks in less than this share of the samples [%] are cut if the range with them is SPIKE times the range without them.
+# Peaks in less than this share of the samples of each series [%] are cut if the range with them is SPIKE times the
+# range without them.
 SHORT, SPIKE = 2.0, 5.0
 # Space beyond the settled range of a row that is cut, as a fraction of the range.
 HEADROOM = 0.3
@@ -901,7 +902,8 @@ def time_rows(
 
     If the transient would compress the settled range of a row to less than two thirds of the height, it gets an
     enlarged panel on the left, and the axes on the right are limited to the settled range. A transient that lasts for
-    most of the run gets no panel, because the panel would repeat the run.
+    most of the run gets no panel, because the panel would repeat the run. Without a panel, as in narrow figures, axes
+    are cut only if less than ``SHORT`` % of the samples exceed them.
 
     Parameters
     ----------
@@ -923,9 +925,9 @@ def time_rows(
     """
     end = max(time[-1] for row in rows for time, _ in row)
     longest = TRANSIENT_MAX_SHARE * end / TRANSIENT_ROOM
-    transients = [_transient(row, settle, zero, longest) or _spike(row) for row in rows]
+    transients = [_cut(row, settle, zero, longest) for row in rows]
     window = max((transient.end for transient in transients if transient is not None), default=0.0)
-    split = window > 0.0 and not narrow()
+    split = window > 0.0
     grid = figure.subplots(
         len(rows), 1 + split, sharex="col", squeeze=False, width_ratios=[1.0, 2.4] if split else [1.0]
     )
@@ -938,17 +940,18 @@ def time_rows(
             axes[-1].set_ylim(transient.low, transient.high)
         if transient is not None and split and compress:
             _compress(axes[0], transient)
-        if transient is not None and not (split and transient.end):
-            _state_peaks(axes[-1], transient)
+        if transient is not None and not transient.end:
+            # No curve is outside of the axes, on the right.
+            text = f"range {' … '.join(number(peak, 3) for peak in transient.peaks)}"
+            look: dict[str, Any] = {"rotation": 90, "va": "center", "color": NOTE, "fontsize": letters(6.5)}
+            axes[-1].text(1.01, 0.5, text, transform=axes[-1].transAxes, **look)
     for axis in grid[-1]:
         axis.set_xlabel("time [s]")
     if split:
         grid[-1, 0].set_xlabel("time [s]: initial transient")
         grid[-1, 1].set_xlabel("time [s]: whole run, axes cut to the settled range")
-    elif window > 0.0:
-        figure.note("Axes are cut to the settled range; the initial transient exceeds it (max, min: extremes).")
     if any(transient is not None and not transient.end for transient in transients):
-        figure.note("Short peaks exceed the axes (max, min: extremes).")
+        figure.note("Short peaks exceed the axes (range: with them).")
     return [tuple(axes) for axes in grid]
 
 
@@ -960,6 +963,18 @@ class Transient:
     low: float
     high: float
     peaks: tuple[float, float]
+
+
+def _cut(row: Sequence[Series], settle: float, zero: bool, longest: float) -> Transient | None:
+    """Return the transient of a row if it gets a panel, or the range without peaks in a few samples, or None."""
+    transient = _transient(row, settle, zero, longest)
+    if transient is not None and not narrow():
+        return transient
+    for ranged in filter(None, (transient, _spike(row))):
+        lasting = [out for time, out in _beyond(row, ranged.low, ranged.high) if time[-1] > time[0]]
+        if 100.0 * max((float(out.mean()) for out in lasting), default=1.0) < SHORT:
+            return replace(ranged, end=0.0)
+    return None
 
 
 def _transient(row: Sequence[Series], settle: float, zero: bool, longest: float) -> Transient | None:
@@ -978,11 +993,7 @@ def _transient(row: Sequence[Series], settle: float, zero: bool, longest: float)
     # A part that is cut leaves space, so that the settled range is not at the edge.
     within = (float(everything.min()) - 0.05 * span, float(everything.max()) + 0.05 * span)
     low, high = min(low, max(low - HEADROOM * span, within[0])), max(high, min(high + HEADROOM * span, within[1]))
-    end = 0.0
-    for time, values in row:
-        beyond = ((values < low) | (values > high)).reshape(len(time), -1).any(axis=1)
-        if beyond.any():
-            end = max(end, float(time[beyond][-1]))
+    end = max((float(time[out][-1]) for time, out in _beyond(row, low, high) if out.any()), default=0.0)
     # The panel also shows a little of the settled range.
     end, peaks = max(1.5 * end, 0.02 * settle), (float(everything.min()), float(everything.max()))
     return Transient(end, low, high, peaks) if end < longest else None
@@ -999,13 +1010,9 @@ def _spike(row: Sequence[Series]) -> Transient | None:
     return Transient(0.0, max(peaks[0], low - room), min(peaks[1], high + room), peaks)
 
 
-def _state_peaks(axes: Axes, transient: Transient) -> None:
-    """Write the extremes that are cut at the edges of the axes."""
-    low, high = transient.peaks
-    look: dict[str, Any] = {"color": NOTE, "fontsize": letters(6.5), "backgroundcolor": "#FFFFFFB0"}
-    for name, peak, y, side in (("max", high, 0.98, "top"), ("min", low, 0.02, "bottom")):
-        if not transient.low <= peak <= transient.high:
-            axes.text(0.03, y, f"{name} {number(peak, 3)}", transform=axes.transAxes, va=side, **look)
+def _beyond(row: Sequence[Series], low: float, high: float) -> list[tuple[Array, Any]]:
+    """Return the times of each series, and whether any of its values is outside of a range then."""
+    return [(time, ((y < low) | (y > high)).reshape(len(time), -1).any(axis=1)) for time, y in row]
 
 
 def _compress(axes: Axes, transient: Transient) -> None:
