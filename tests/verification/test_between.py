@@ -417,14 +417,15 @@ def test_bilateral_law_is_refused(tmp_path):
 
 def test_a_sphere_on_the_corner_of_a_box_is_one_contact(tmp_path):
     """The distance of the sphere covers corners; another contact there would double the stiffness."""
-    turned = np.degrees([math.atan(math.sqrt(0.5)), 0.0, 0.0])
-    box = {"size_m": [0.1, 0.1, 0.1], "mass_kg": 1.0, "position_m": [0, 0, 0], "rpy_deg": [45.0, turned[0], 0.0]}
-    record = run(tmp_path, {"box": box, "ball": ball(1.0, 0.05, [0, 0, 0.2])}, duration_s=0.002)
+    box = {"size_m": [0.1, 0.1, 0.1], "mass_kg": 1.0, "position_m": [0, 0, 0]}
+    upright = {"rpy_deg": [45.0, -math.degrees(math.atan(math.sqrt(0.5))), 0.0]}
+    record = run(tmp_path, {"box": box | upright, "ball": ball(1.0, 0.05, [0, 0, 0.2])}, duration_s=0.002)
     assert record.labels["contact_normal_force"] == ("ball-box",)
+    assert record["contact_gap"][0, 0] == pytest.approx(0.15 - 0.001 - math.sqrt(3.0) * 0.049, abs=1e-12)
 
 
 def test_groups_are_no_names_of_bodies_and_entries_without_effect_are_named(tmp_path, caplog):
     with pytest.raises(DynsimError, match="'links' is a group and a body"):
-        run(tmp_path, {"links": ball(1.0, 0.05, [0, 0, 0]), "b": ball(1.0, 0.05, [0, 0, 1])})
+        run(tmp_path, {"links": ball(1.0, 0.05, [0, 0, 0]), "b": ball(1.0, 0.05, [0, 0, 1])}, duration_s=0.002)
     run(tmp_path, {"b": ball(1.0, 0.05, [0, 0, 1])}, duration_s=0.002)
     assert "contacts.between.0 has no effect" in caplog.text
