@@ -424,7 +424,7 @@ def test_a_sphere_on_the_corner_of_a_box_is_one_contact(tmp_path):
     assert record["contact_gap"][0, 0] == pytest.approx(0.15 - 0.001 - math.sqrt(3.0) * 0.049, abs=1e-12)
 
 
-def test_groups_are_no_names_of_bodies_and_entries_without_effect_are_named(tmp_path, caplog):
+def test_names_of_groups_are_refused_for_bodies_and_entries_without_effect_are_named(tmp_path, caplog):
     with pytest.raises(DynsimError, match="'links' is a group and a body"):
         run(tmp_path, {"links": ball(1.0, 0.05, [0, 0, 0]), "b": ball(1.0, 0.05, [0, 0, 1])}, duration_s=0.002)
     run(tmp_path, {"b": ball(1.0, 0.05, [0, 0, 1])}, duration_s=0.002)
