@@ -126,7 +126,8 @@ def _bodies(
         return [name]
 
     for name in itertools.chain.from_iterable(entry.ignore):
-        members(name, "ignore")
+        if name not in robot.bodies:
+            members(name, "ignore")
     if names := {LINKS, OBJECTS, SELF} & set(robot.bodies):
         raise ModelError(f"contacts.between: {min(names)!r} is a group and a body; rename the body", keys=keys)
     ignored = {frozenset(pair) for pair in entry.ignore} | _neighbours(robot)

@@ -132,7 +132,7 @@ def test_gripper_that_is_stopped_by_a_hub_does_not_reach_its_grasp_frame():
         simulate(load_scenario("snake_valve", "turns", touching))
     record = caught.value.record
     assert record is not None
-    assert record["contact_normal_force"][-1, between(record, "valve")].max() > 20.0
+    assert record["contact_normal_force"][-1, between(record, "valve")].sum() > 20.0
     assert record["grasp_distance"][-1] == pytest.approx(0.025, abs=3e-3)
 
 

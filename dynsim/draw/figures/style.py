@@ -667,8 +667,9 @@ def with_panels(drawn: Iterable[tuple[str, Figure]]) -> Iterable[tuple[str, Figu
             figures[name].keep(axes)
         drawn = [(name, figures[name]) for name in kept]
     for name, figure in drawn:
-        if isinstance(figure, Drawing) and (notes := separate(figure)):
-            figure.note(*notes)
+        if isinstance(figure, Drawing):
+            literal(figure)  # before its first layout
+            figure.note(*separate(figure))
         yield name, figure
 
 

@@ -50,6 +50,7 @@ STOPPED = "joint at its limit"
 # Scenarios of Fig 13: without and with a pipe.
 PICK_UPS = ("snake_operator", "snake_pick_up")
 
+SIMULATED = {"kinematic": ""}
 Maker = Callable[[Mapping[str, Record]], Figure]
 
 
@@ -57,7 +58,7 @@ def figures(scenario: str, records: Mapping[str, Record]) -> dict[str, Maker]:
     """Return the drawing functions of comparisons with [T] by file name, for the variants that were run."""
     makers: dict[str, Maker] = {}
     if scenario == "snake_positioning" and set(records) & set(TABLE_III):
-        makers["table_iii"] = lambda r: _deviations(r, {"kinematic": ""})
+        makers["table_iii"] = lambda r: _deviations(r, SIMULATED)
     if scenario == "snake_positioning_dynamic":
         moved = [name for name in TABLE_III if name in records]
         if moved:
