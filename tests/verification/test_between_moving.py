@@ -168,7 +168,7 @@ def test_a_rider_on_a_turntable_slips_at_its_friction(tmp_path, method):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("method", ["dopri5", "radau5"])
+@pytest.mark.parametrize("method", ["dopri5", pytest.param("radau5", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("rider", ["box", "sphere"])
 @pytest.mark.parametrize("share", [0.9, 1.3])
 def test_m_star_agrees_between_bodies(tmp_path, method, rider, share):
@@ -182,7 +182,7 @@ def test_m_star_agrees_between_bodies(tmp_path, method, rider, share):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("method", ["dopri5", "radau5"])
+@pytest.mark.parametrize("method", ["dopri5", pytest.param("radau5", marks=pytest.mark.slow)])
 def test_m_star_agrees_where_a_ball_falls_on_an_arm(tmp_path, method):
     sweeps, dense = (leaning(method, 0.0, 0.3, tmp_path, solver=solver)["q"] for solver in ("articulated", "m_star"))
     assert np.abs(sweeps - dense).max() < 1e-10

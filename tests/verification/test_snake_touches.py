@@ -132,8 +132,9 @@ def test_gripper_that_is_stopped_by_a_hub_does_not_reach_its_grasp_frame():
         simulate(load_scenario("snake_valve", "turns", touching))
     record = caught.value.record
     assert record is not None
-    assert record["contact_normal_force"][-1, between(record, "valve")].sum() > 20.0
-    assert record["grasp_distance"][-1] == pytest.approx(0.025, abs=3e-3)
+    assert record["contact_normal_force"][-1, between(record, "valve")].sum() > 10.0
+    # The solid of the head ends 25 mm in front of the tip; the head also turns on the rim of the hub.
+    assert 0.022 < record["grasp_distance"][-1] < 0.035
 
 
 def test_the_head_is_raised_without_objects():
