@@ -266,6 +266,9 @@ def test_omissions_are_named(tmp_path: Path) -> None:
     assert "sample_time_s" in omitted("sampled_arm")
     assert "ground" in omitted("brace_on_shapes", True, variant="terrain")
     assert omitted(arm(tmp_path, "servo_current")) == ""
+    tray = {"surfaces": {"tray": {"type": "plane", "on": "turret"}}, "contacts.law": "unilateral"}
+    ball = {"ball": {"shape": "sphere", "radius_m": 0.02, "mass_kg": 0.1, "position_m": [0.0, 0.0, 5.0]}}
+    assert "tray" in omitted("six_axis_arm", True, overrides=tray | {"objects": ball})
 
 
 def test_command_checks_and_prints_differences_with_times(tmp_path: Path) -> None:
