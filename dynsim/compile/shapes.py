@@ -57,8 +57,7 @@ def solid_row(solid: Surface) -> Array:
     """Return the kernel table row of a capsule or box, (SOLID_SIZE,)."""
     row = np.zeros(ks.SOLID_SIZE)
     if isinstance(solid, Box):
-        axes, centre, radius = solid.axes.T, solid.centre, solid.edge_radius
-        half = 0.5 * solid.edges - radius
+        axes, centre, half, radius = solid.axes.T, solid.centre, solid.core, solid.edge_radius
     else:
         assert isinstance(solid, Capsule)
         length = float(np.linalg.norm(solid.axis))

@@ -345,8 +345,7 @@ def prepare(
     stepping = None
     if method == ki.TIME_STEPPING and system.unilateral is not None:
         system = with_shapes(system)
-        between = bool((system.contacts.link[:, ka.CARRIER] >= 0).any())
-        free = free_bodies(model.arrays) if between else None
+        free = free_bodies(model.arrays) if system.shapes and system.shapes.pairs is not None else None
         stepping = stepping_arrays(model.arrays, system.contacts, na, joint_rows, options.theta, free)
     y = np.zeros(layout.size)
     y[block(layout, "q")] = robot.initial

@@ -302,7 +302,7 @@ def _add_pairs(root: Element, pairs: Sequence[SolidPair], elements: Mapping[str 
                 names[id(solid)] = f"solid_{solid.carrier}_{len(names) + 1}"
                 geom = {"name": names[id(solid)], "group": "3"}
                 if isinstance(solid, Box):
-                    half = np.maximum(0.5 * solid.edges - solid.edge_radius, _LEAST_SIZE)
+                    half = np.maximum(solid.core, _LEAST_SIZE)
                     turn = numbers(of_matrix(solid.axes.T))
                     geom |= {"type": "box", "pos": numbers(solid.centre), "quat": turn, "size": numbers(half)}
                 elif solid.axis.any():

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import product
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 # Quadrics that spheres and capsules can touch.
 SIMPLE = ("plane", "sphere", "cylinder")
+# Signs of the coordinates of a box's corners in its axes.
+CORNERS = np.array(list(product((-1.0, 1.0), repeat=3)))
 
 
 @dataclass(frozen=True)
@@ -151,6 +154,16 @@ class Box(_Shaped):
     edge_radius: float
     carrier: str | None = None
 
+    @property
+    def core(self) -> Array:
+        """Half edges of the box whose corners are the centres of the rounded corners, (3,) [m]."""
+        return 0.5 * self.edges - self.edge_radius
+
+    @property
+    def corners(self) -> Array:
+        """Centres of the rounded corners, in the order of ``CORNERS``, (8, 3) [m]."""
+        return self.centre + (CORNERS * self.core) @ self.axes
+
     def shifted(self, by: Array) -> Box:
         """Return the box moved by a vector [m]."""
         return replace(self, centre=self.centre + by)
@@ -252,7 +265,7 @@ def shape_arrays(entries: Sequence[tuple[Surface | None, float, Array, bool]]) -
             kind[k, kd.SURFACE] = kd.BOX
             data[k, kd.POSITION : kd.POSITION + 3] = surface.centre
             data[k, kd.AXES : kd.AXES + 9] = np.asarray(surface.axes).ravel()
-            data[k, kd.SIZE : kd.SIZE + 3] = 0.5 * np.asarray(surface.edges) - surface.edge_radius
+            data[k, kd.SIZE : kd.SIZE + 3] = surface.core
             data[k, kd.EDGE] = surface.edge_radius
         elif isinstance(surface, Capsule):
             kind[k, kd.SURFACE] = kd.CAPSULE

@@ -454,9 +454,7 @@ def solid_points(robot: Robot, body: str) -> list[tuple[Array, float, bool]]:
             shares = (0.0, 1.0, *ALONG) if solid.axis.any() else (0.0,)
             points += [(solid.start + share * solid.axis, solid.radius, share in (0.0, 1.0)) for share in shares]
         else:
-            core = 0.5 * solid.edges - solid.edge_radius
-            corners = np.array(list(product((-1.0, 1.0), repeat=3))) * core
-            points += [(solid.centre + corner @ solid.axes, solid.edge_radius, True) for corner in corners]
+            points += [(corner, solid.edge_radius, True) for corner in solid.corners]
             points.append((solid.centre, 0.5 * float(solid.edges.min()), False))
     return points
 

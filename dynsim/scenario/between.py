@@ -19,7 +19,7 @@ from dynsim.config.problems import suggest
 from dynsim.dynamics.contact.solids import SLOTS
 from dynsim.errors import ModelError, first_few
 from dynsim.model.description import Array, Contact, Robot
-from dynsim.model.surfaces import Box, Capsule
+from dynsim.model.surfaces import CORNERS, Box, Capsule
 from dynsim.scenario.candidates import THINNER, unused
 from dynsim.scenario.schema import BodyPair, SceneObject
 
@@ -27,7 +27,6 @@ log = logging.getLogger(__name__)
 LINKS, OBJECTS, SELF = "links", "objects", "self"
 # Maximum number of candidates between bodies for event-driven methods.
 MOST_CANDIDATES = 20
-_CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 
 
 def contacts_between(
@@ -203,16 +202,13 @@ def _along(a: Capsule, b: Solid) -> Iterator[Contact]:
 
 def _corners(a: Box, b: Solid) -> Iterator[Contact]:
     """Yield the rounded corners of a box against a solid; those of a thin plate once."""
-    core = 0.5 * a.edges - a.edge_radius
-    for corner in _CORNERS[((_CORNERS < 0.0) | (core > 0.0)).all(axis=1)]:
-        yield _contact(a, a.centre + (corner * core) @ a.axes, b, a.edge_radius)
+    for corner in a.corners[((CORNERS < 0.0) | (a.core > 0.0)).all(axis=1)]:
+        yield _contact(a, corner, b, a.edge_radius)
 
 
 def _edges(a: Box, b: Box) -> Iterator[Contact]:
     """Yield the rounded edges of a box against another box."""
-    core = 0.5 * a.edges - a.edge_radius
     for k in range(3):
-        for corner in _CORNERS[_CORNERS[:, k] < 0.0]:
-            start = a.centre + (corner * core) @ a.axes
-            tip = start + 2.0 * core[k] * a.axes[k]
+        for start in a.corners[CORNERS[:, k] < 0.0]:
+            tip = start + 2.0 * a.core[k] * a.axes[k]
             yield _contact(a, start, b, max(a.edge_radius - THINNER, 0.0), tip)
