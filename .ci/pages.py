@@ -29,7 +29,8 @@ from dynsim.snake.published import TABLE_III
 from dynsim.system.terminal import Terminal
 
 ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT / "tests"))
+sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "docs" / "site")]
+from reference import scenario_keys  # noqa: E402
 from studies.bench.programs import (  # noqa: E402
     ABA,
     CONSTRAINT_DYNAMICS,
@@ -533,10 +534,10 @@ def falling_dominoes() -> str:
     return lines(heads, [[r["program"], *t, number(r["wave_m_s"], 3)] for r, t in zip(rows, times, strict=True)])
 
 
-def of_snake(key: str, k: int) -> float:
-    """Return the ratio of a number of program k to the number of dynsim, which is the first program."""
-    own, peer = bench()["snake"][0], bench()["snake"][k]
-    return float(peer[key] / own[key])
+def of_snake(key: str, k: int, own: int = 0) -> float:
+    """Return the ratio of a number of program k to the number of dynsim, with its controller (0) or without (1)."""
+    rows = bench()["snake"]
+    return float(rows[k][key] / rows[own][key])
 
 
 def between_snakes(k: int, coordinate: int) -> float:
@@ -689,6 +690,24 @@ def planned_scenes() -> str:
         "survives",
     )  # fmt: skip
     return lines(heads, rows, left=2)
+
+
+def brace_pads() -> str:
+    """Return the best position of the pad for each height of the bench."""
+    height, pad = "surfaces.bench.center_m.2", "contacts.points.pad.point_m.2"
+    plans = data("planner/brace_pad.json")
+    rows = []
+    for top in dict.fromkeys(row[height] for row in plans):
+        best = min((row for row in plans if row[height] == top), key=lambda row: (not row["survives"], row["heat_W"]))
+        numbers = (fixed(best["heat_W"], 2), fixed(1e3 * best["hand_sag_m"], 2), fixed(best["rating_share"], 2))
+        at = fixed(best[pad], 1) if best["count"] else NONE
+        rows.append((fixed(top + 0.05, 2), at, *numbers, "yes" if best["survives"] else "no"))
+    return lines(("top [m]", "pad [m]", "heat [W]", "hand sag [mm]", "rms torque / rating", "survives"), rows)
+
+
+def pad_free(key: str) -> float:
+    """Return a number of the arm without the pad."""
+    return float(next(row[key] for row in data("planner/brace_pad.json") if row["count"] == 0))
 
 
 def snake_table_iii() -> str:
@@ -960,8 +979,8 @@ TABLES: dict[str, Callable[[], str]] = {
         elbows, glued_and_real, overturning_holds, overturning_drives, assumptions, ledger,
         snake_table_iii, snake_table_iv, snake_table_v, time_stepping, endings, right_hand_side, ratios, job, precision,
         sweeps, snake_bench, touching_bodies, falling_dominoes,
-        combinations, comparison, faults, planned_arm, planned_gains, planned_scenes,
-        snake_positioning, snake_limits,
+        scenario_keys, combinations, comparison, faults, planned_arm, planned_gains, planned_scenes,
+        brace_pads, snake_positioning, snake_limits,
         snake_ways, snake_circles, snake_order, snake_areas, snake_on_servos, snake_tasks, modules,
     )
 }  # fmt: skip
@@ -1093,12 +1112,10 @@ NUMBERS: dict[str, Callable[[], str]] = {
     "lift_off_ms": lambda: fixed(1e3 * event("two_elbows", "lift_off", 1), 1),
     "lift_7_ms": lambda: fixed(1e3 * event("two_elbows", "lift_off"), 1),
     "landing_7_ms": lambda: fixed(1e3 * event("two_elbows", "landing"), 0),
-    "landing_7_alone_ms": lambda: fixed(1e3 * event("elbow_7", "landing"), 0),
     "stuck_1_s": lambda: fixed(stuck(0), 2),
     "stuck_2_s": lambda: fixed(stuck(1), 2),
     "brush_s": lambda: fixed(brush()["events"][0][0], 3),
     "brush_ms": lambda: fixed(1e3 * (brush()["events"][1][0] - brush()["events"][0][0]), 0),
-    "brush_mJ": lambda: fixed(1e3 * brush()["impact_loss_J"], 0),
     "job_held_ms": lambda: number(1e3 * of_job(HELD_CASE, DYNSIM_RADAU5)["cpu_median_s"], 2),
     "job_held_ratio": lambda: against_mujoco(HELD_CASE, MUJOCO_EULER),
     "job_held_ratio_implicit": lambda: against_mujoco(HELD_CASE, MUJOCO_IMPLICIT),
@@ -1107,11 +1124,12 @@ NUMBERS: dict[str, Callable[[], str]] = {
     "boxes_slower": lambda: slower("other"),
     "beside_slower": lambda: slower("side"),
     "dominoes_slower": lambda: slower("dominoes"),
-    "snake_slower": lambda: fixed(1.0 / of_snake("us_per_step", 1), 1),
-    "snake_faster_stiff": lambda: fixed(of_snake("times_real_time", 2), 1),
-    "snake_farther": lambda: fixed(of_snake("z_rms_m", 1), 1),
-    "snake_apart_mm": lambda: fixed(1e3 * between_snakes(3, Z), 1),
-    "snake_apart_mrad": lambda: fixed(1e3 * between_snakes(3, BETA), 1),
+    "snake_slower": lambda: fixed(1.0 / of_snake("us_per_step", 2), 1),
+    "snake_alone": lambda: percent(1.0 / of_snake("us_per_step", 2, 1)),
+    "snake_slower_stiff": lambda: fixed(1.0 / of_snake("times_real_time", 3), 1),
+    "snake_farther": lambda: fixed(of_snake("z_rms_m", 2), 1),
+    "snake_apart_mm": lambda: fixed(1e3 * between_snakes(4, Z), 1),
+    "snake_apart_mrad": lambda: fixed(1e3 * between_snakes(4, BETA), 1),
     "rhs_us": lambda: number(by_links()[1][10, DYNSIM_CONTACTS], 2),
     "cold_wall_s": lambda: number(start_up()["radau5"]["cold"]["wall_s"], 2),
     "cold_cpu_s": lambda: number(start_up()["radau5"]["cold"]["cpu_s"], 2),
@@ -1157,13 +1175,11 @@ NUMBERS |= {
     "snake_pull_deg": lambda: turned("snake_door_arc", "pull"),
     "snake_circle_deg": lambda: turned("snake_circle", "backward_switching"),
     "snake_singular_s": lambda: fixed(backward_circle()["waiting_for_s"]["singular posture"], 1),
-    "snake_refused": lambda: str(backward_circle()["modes_refused"]),
     "snake_margin_mm": lambda: fixed(1e3 * backward_circle()["support_margin_min_m"], 1),
     "snake_operator_m": lambda: small(of_kinematic("snake_operator")["final_position_error_m"]),
     "snake_operator_rad": lambda: small(of_kinematic("snake_operator")["final_attitude_error_rad"]),
     "snake_operator_switches": lambda: str(of_kinematic("snake_operator")["mode_switches"]),
     "snake_eq20_jump": lambda: small(kinematic()["eq20_predictive"]["cost_rise_max_within_a_mode"]),
-    "snake_min_rise": lambda: small(of_kinematic("snake_joint_limits", "eq20_min")["cost_rise_max_within_a_mode"]),
     "snake_dz_mm": lambda: fixed(1e3 * sag_error("dz_m"), 1),
     "snake_steps_mm": lambda: fixed(steps()["spread_mm"], 2),
     "snake_steps_mrad": lambda: fixed(steps()["spread_mrad"], 2),
@@ -1224,6 +1240,8 @@ NUMBERS |= {
     "ticks_rms_mm": lambda: number(lifted_wheels()["in_ticks"]["off_rms_mm"], 2),
     "ticks_max_mm": lambda: number(lifted_wheels()["in_ticks"]["off_max_mm"], 2),
     "ticks_clear_mm": lambda: number(lifted_wheels()["in_ticks"]["clear_mm"], 2),
+    "pad_free_mm": lambda: fixed(1e3 * pad_free("hand_sag_m"), 2),
+    "pad_free_share": lambda: fixed(pad_free("rating_share"), 2),
     "planned_1_W": lambda: planned_heat(1),
     "planned_2_W": lambda: planned_heat(2),
     "planned_3_W": lambda: planned_heat(3),
@@ -1278,15 +1296,10 @@ NUMBERS |= {
     "seven_more": lambda: fixed(
         100 * (ratio_of_energies("elbow_comparison elbow_7", "elbow_comparison two_elbows") - 1), 0
     ),
-    "late_4_low": lambda: _depth("elbow_4", "joint_depth_from_2_s_min_m"),
-    "late_4_high": lambda: _depth("elbow_4", "joint_depth_from_2_s_max_m"),
-    "late_none_low": lambda: _depth("no_elbow", "joint_depth_from_2_s_min_m"),
-    "late_none_high": lambda: _depth("no_elbow", "joint_depth_from_2_s_max_m"),
     "depth_7": lambda: fixed(1e3 * validation()["elbows"]["elbow_7"]["joint_depth_max_m"], 1),
     "push_ms": lambda: fixed(1e3 * at_the_start("pushes_until_s"), 0),
     "push_N": lambda: fixed(at_the_start("push_max_N"), 1),
     "pull_N": lambda: fixed(at_the_start("pull_max_N"), 1),
-    "pull_then_N": lambda: fixed(-at_the_start("at_0.1_s_N"), 1),
     "pull_low_N": lambda: fixed(at_the_start("pull_from_0.17_s_min_N"), 1),
     "pull_high_N": lambda: fixed(at_the_start("pull_from_0.17_s_max_N"), 1),
     "pull_7_from_ms": lambda: fixed(1e3 * at_the_start("elbow_7_pulls_from_s"), 1),

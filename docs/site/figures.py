@@ -88,6 +88,14 @@ COMMANDS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
         ),
     ),
     ("Plan of braces", "Plans.", ("plan pressing --count 0:2 --candidates link_4:link_8 --starts 2 --out .",)),
+    (
+        "Plans for several values",
+        "Plans with `--vary`.",
+        (
+            "plan bench_arm --candidates pad --count 0:1 --no-verify --vary contacts.points.pad.point_m.2=0.1:0.3:3 "
+            "--out .",
+        ),
+    ),
 )
 
 

@@ -46,6 +46,7 @@ SHOTS: dict[str, tuple[str | None, str, float]] = {
     "falling_arm": (None, "side", 0.2),
     "floor_below": ("lands", "side", 0.5),
     "free_flyer": ("cycle", "iso", 0.35),
+    "hand_over": (None, "side", 0.5),
     "mobile_path": (None, "iso", 0.8),
     "mobile_reach": (None, "side", 1.0),
     "mobile_turns": ("fast_arc", "iso", 0.9),
@@ -62,6 +63,7 @@ SHOTS: dict[str, tuple[str | None, str, float]] = {
     "snake_short": ("rises", "side", 0.6),
     "snake_valve": ("turns", "iso", 0.6),
     "soft_floor": ("foam", "side", 0.5),
+    "tall_path": (None, "side", 0.5),
     "wall_push": ("strong_hold", "side", 0.5),
 }
 """Variant, view, and time relative to the duration of stills; default: the first variant, iso, 0.5."""

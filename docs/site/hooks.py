@@ -1,12 +1,15 @@
-"""MkDocs hooks: generated pages, files from outside of docs/ and links to them, equations as MathML, indices."""
+"""MkDocs hooks: generated pages, files from outside of docs/ and links to them, equations as MathML, redirects."""
 
 from __future__ import annotations
 
+import json
 import re
 import sys
 from pathlib import Path
+from posixpath import dirname, relpath
 from typing import Any
 
+import yaml
 from latex2mathml.converter import convert
 from mkdocs.structure.files import File, Files
 
@@ -34,12 +37,20 @@ _INDEX = re.compile(
     flags=re.MULTILINE | re.DOTALL,
 )
 _OUTSIDE = re.compile(rf"\]\((?:\.\./)+({'|'.join(map(re.escape, OUTSIDE))})(?=[)#])")
+# A page at an old address: with JavaScript it leads to the heading, without to the page.
+_MOVED = """<!doctype html><html lang="en"><meta charset="utf-8"><title>Moved</title>
+<script>
+const moved = {moved}, anchor = decodeURIComponent(location.hash.slice(1));
+location.replace(moved[anchor] ?? moved[""] + location.hash);
+</script>
+<noscript><meta http-equiv="refresh" content="0; url={url}"></noscript>
+<p>This page moved to <a href="{url}">{url}</a>.</p></html>
+"""
 _PICTURE = re.compile(r"\]\((?:\.\./)*(results/[\w/.-]+\.(?:png|gif))\)")
 
 
 def on_files(files: Files, config: Any) -> Files:
     """Add generated files, and files of the repository that pages show."""
-    files.append(File.generated(config, "reference/scenario-keys.md", content=reference.scenario_page()))
     files.append(File.generated(config, "reference/servo-map-keys.md", content=reference.servo_map_page()))
     files.append(File.generated(config, "reference/commands.md", content=reference.cli_page()))
     files.append(File.generated(config, WORKER, abs_src_path=str(SITE / WORKER)))
@@ -73,3 +84,16 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
 
 def _typeset(equation: re.Match[str]) -> str:
     return f'<div class="equation">{convert(equation[1], display="block")}</div>'
+
+
+def on_post_build(config: Any) -> None:
+    """Write pages that redirect from the old addresses of redirects.yml to the new ones."""
+    pages: dict[str, dict[str, str]] = {}
+    for old, new in yaml.safe_load((SITE / "redirects.yml").read_text(encoding="utf-8")).items():
+        page, _, anchor = old.partition("#")
+        address = relpath(new, dirname(page) or ".").replace(".md", ".html")
+        pages.setdefault(page, {})[anchor] = address
+    for page, moved in pages.items():
+        target = Path(config["site_dir"], page).with_suffix(".html")
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_text(_MOVED.format(moved=json.dumps(moved), url=moved[""]), encoding="utf-8")

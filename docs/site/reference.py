@@ -1,4 +1,4 @@
-"""Generated pages of the reference: keys of files from their schemas, commands from the application."""
+"""Generated text of the reference: keys of files from their schemas, commands from the application."""
 
 from __future__ import annotations
 
@@ -7,47 +7,100 @@ from typing import Any
 
 Schema = dict[str, Any]
 
-SCENARIO_INTRODUCTION = """# Keys of scenarios
-
-Every key that a scenario file may have, from the schema that it is checked with. What the keys mean together, with
-examples, is in [Scenarios](../scenarios.md). `dynsim schema` prints the schema for editors.
-
-"""
-
 SERVO_MAP_INTRODUCTION = """# Keys of servo maps
 
 Every key that a servo map may have, from the schema that it is checked with. What the keys mean together, with
-an example, is in [Replaying a record on Dynamixel servos](../hardware.md#the-servo-map). `dynsim hw schema` prints
-the schema for editors.
+an example, is in [Servo map](../hardware/servo-map.md). `dynsim hw schema` prints the schema for editors.
 
 """
 
 
-def scenario_page() -> str:
-    """Return the page on the keys of scenarios."""
+# Titles of definitions whose names are short because their keys are clear from their place in a scenario.
+TITLES = {
+    "Base": "Base of pws_arm",
+    "BaseConfig": "Base of serial_arm",
+    "WheelConfig": "Wheel of pws_arm",
+    "LinkConfig": "Entry of chain",
+    "LinkKeys": "Default of chain",
+    "Constant": "Load constant",
+    "Samples": "Load samples",
+    "Table": "Load csv",
+    "Payload": "Load payload",
+    "Linear": "Tie linear",
+    "Torsion": "Tie torsion",
+    "SceneObject": "Object",
+    "Part": "Object part",
+    "Hinge": "Object hinge",
+    "Slide": "Object slide",
+    "Grasp": "Object grasp",
+    "OperatorConfig": "Operator",
+    "Velocity": "Operator command",
+    "Dynamics": "Snake dynamics",
+    "Lifting": "Snake lifting",
+    "Switching": "Snake switching",
+    "Ramp": "Snake path ramp",
+    "Circle": "Snake path circle",
+    "DoorArc": "Snake path door_arc",
+    "GripperConfig": "Snake gripper",
+    "JointLimits": "Snake limits",
+    "JointStops": "Snake stops",
+}
+CATALOGUE = "Motor catalogue"
+
+
+def scenario_keys() -> str:
+    """Return a section of keys for each mapping of a scenario."""
     from dynsim.scenario import ScenarioConfig
 
-    return _page(SCENARIO_INTRODUCTION, ScenarioConfig.model_json_schema())
+    return f"\n{_sections(ScenarioConfig.model_json_schema())}\n"
 
 
 def servo_map_page() -> str:
     """Return the page on the keys of servo maps."""
     from dynsim.hardware.servo_map import json_schema
 
-    return _page(SERVO_MAP_INTRODUCTION, json_schema())
+    return SERVO_MAP_INTRODUCTION + _sections(json_schema())
 
 
-def _page(introduction: str, schema: Schema) -> str:
-    named = {name: _title(name) for name in schema["$defs"]}
-    parts = [introduction, "## Top level\n\n", _keys(schema, named)]
-    for name, definition in sorted(schema["$defs"].items(), key=lambda item: named[item[0]].lower()):
-        parts += [
-            f"\n## {named[name]}\n\n",
-            _plain(definition.get("description", "")),
-            "\n\n",
-            _keys(definition, named),
-        ]
+def _sections(schema: Schema) -> str:
+    definitions = schema["$defs"]
+    named = {name: _title(name) for name in definitions}
+    parts = ["## Top level\n\n", _keys(schema, named)]
+    for name, title in sorted(named.items(), key=lambda item: item[1].lower()):
+        if title != CATALOGUE:
+            text = _plain(definitions[name].get("description", ""))
+            parts += [f"\n## {title}\n\n", text, "\n\n", _keys(definitions[name], named)]
+    if CATALOGUE in named.values():
+        servo = next(definitions[name] for name, title in named.items() if title == "Motor servo")
+        parts.append(_catalogue(servo, [definitions[name] for name in named if named[name] == CATALOGUE]))
     return "".join(parts)
+
+
+def _catalogue(servo: Schema, motors: list[Schema]) -> str:
+    """Return the values of the motors that differ from the defaults of a servo, one row per motor."""
+    values = [{key: value for key, value in motor["properties"].items() if key != "type"} for motor in motors]
+    keys = [key for key in values[0] if any(_value(row[key]) != _value(servo["properties"][key]) for row in values)]
+    rows = [
+        f"\n## {CATALOGUE}\n\nServos with the values of data sheets, and the other defaults of a servo. "
+        "\\*: assumed. †: fitted to a robot.\n",
+        f"| type | robot | {' | '.join(f'`{key}`' for key in keys)} | source |",
+        f"|---|---{'|---:' * len(keys)}|---|",
+    ]
+    for motor, row in zip(motors, values, strict=True):
+        texts = " ".join(value.get("description", "") for value in row.values())
+        sources = " ".join(f"[page]({url})" for url in dict.fromkeys(re.findall(r"https?://[^\s,;)]+", texts)))
+        cells = " | ".join(_value(row[key]) for key in keys)
+        name = motor["properties"]["type"]["const"]
+        robot = re.sub(r"^.*: | with its rated values|\.$", "", _plain(motor["description"]))
+        rows.append(f"| `{name}` | {robot} | {cells} | {sources} |")
+    return "\n".join(rows) + "\n"
+
+
+def _value(value: Schema) -> str:
+    text = value.get("description", "")
+    mark = r" \*" if "(assumed)" in text else " †" if "fitted" in text else ""
+    default = value.get("default")
+    return "–" if default is None else f"{default:g}{mark}" if isinstance(default, float) else f"`{default}`{mark}"
 
 
 def _title(name: str) -> str:
@@ -58,8 +111,8 @@ def _title(name: str) -> str:
     if member:
         return f"{member[1].replace('_', ' ').rstrip('s').capitalize()} {member[2]}"
     if name in catalogue.NAMES:
-        return f"Motor {name}"
-    return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name).capitalize()
+        return CATALOGUE
+    return TITLES.get(name) or re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name).capitalize()
 
 
 def _keys(schema: Schema, named: dict[str, str]) -> str:
@@ -81,7 +134,7 @@ def _default(value: Schema) -> str:
     default = value["default"]
     words = {None: "none", True: "`true`", False: "`false`", "": "empty"}
     if isinstance(default, dict) and "$ref" in value:
-        return "of its keys"
+        return "see its keys"
     if isinstance(default, (dict, list)):
         return f"`{default}`" if default else "none"
     return (
@@ -108,7 +161,7 @@ def _kind(value: Schema, named: dict[str, str]) -> str:
         return f"{size} × {items[0]}" if size else f"list of {' or '.join(dict.fromkeys(items))}"
     if kind == "object":
         inner = value.get("additionalProperties")
-        return f"by name: {_kind(inner, named)}" if isinstance(inner, dict) else "mapping"
+        return f"mapping to {_kind(inner, named)}" if isinstance(inner, dict) else "mapping"
     bounds = [
         f"{sign} {value[key]}"
         for key, sign in (("minimum", "≥"), ("exclusiveMinimum", ">"), ("maximum", "≤"), ("exclusiveMaximum", "<"))

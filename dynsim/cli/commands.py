@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -75,6 +76,9 @@ if TYPE_CHECKING:
     from dynsim.record import Record
     from dynsim.scenario import Scenario
 
+# Maximum number of variants whose figures `compare` draws unless an option requests them.
+FEW = 4
+
 
 @app.command(epilog="Example: dynsim run elbow_comparison --variant two_elbows --set integrator.rtol=1e-8")
 def run(
@@ -117,8 +121,8 @@ def run(
     page = None
     with interruptible_drawing(folder):
         if not no_figures:
-            page = draw_all([Figures({loaded.variant: record}, folder / "figures", format_)], shown, quiet)
-        elif view:
+            draw(Figures({loaded.variant: record}, folder / "figures", format_), quiet)
+        if view or not no_figures:
             page = shown.draw()
     if not quiet:
         print_summary(console, record.summary, rows is Rows.all)
@@ -128,13 +132,22 @@ def run(
         open_page(page)
 
 
-@app.command(epilog="Example: dynsim compare scenarios/elbow_comparison.yaml --jobs 2")
+@app.command(epilog="Example: dynsim compare snake_positioning --jobs 2 --variant-figures")
 def compare(
     scenario: ScenarioArgument,
     overrides: SetOption = None,
     out: Annotated[Path | None, folder_option("results/SCENARIO")] = None,
-    jobs: Annotated[int, option("N", "Number of worker processes.", min=1)] = 1,
+    jobs: Annotated[int, option("N", "Number of processes.", min=1)] = 1,
     no_figures: FiguresOption = False,
+    variant_figures: Annotated[
+        bool | None,
+        typer.Option(
+            "--variant-figures/--no-variant-figures",
+            help=f"Draw also the figures of each variant, without animations; default: with at most {FEW} variants. "
+            "`dynsim plot` draws them later.",
+            show_default=False,
+        ),
+    ] = None,
     format_: FormatOption = FigureFormat.png,
     size: SizeOption = None,
     font: FontOption = None,
@@ -193,10 +206,12 @@ def compare(
         warn_about_meshes(record.scene for record in records.values())
         with interruptible_drawing(folder):
             if not no_figures:
+                if variant_figures is None:
+                    variant_figures = len(loaded) <= FEW
                 wanted = [
-                    Figures({name: record}, folder / name / "figures", format_, look)
+                    Figures({name: record}, folder / name / "figures", format_, replace(look, film=False))
                     for name, record in records.items()
-                    if not look.panels
+                    if variant_figures and not look.panels
                 ]
                 together = Figures(records, folder, format_, look, together=True)
                 page = draw_all([together, *wanted], Page(records, folder), quiet)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -26,12 +27,17 @@ from dynsim.cli.app import (
     parsed_overrides,
 )
 from dynsim.cli.output import console, plan_progress, print_line, print_written
-from dynsim.errors import ScenarioError, UnreachableReference
+from dynsim.errors import ScenarioError, SimulationInterrupted, UnreachableReference
 from dynsim.system.terminal import escaped
 
 if TYPE_CHECKING:
     from dynsim.planner.answer import BracePlan, Size
+    from dynsim.planner.problem import Task
+    from dynsim.planner.vary import Variation
+    from dynsim.planner.verify import Requirement
 
+# Number of values of ``--vary`` without a count.
+VALUES = 5
 EXAMPLE = "Example: dynsim plan pressing --count 0:3 --candidates link_3:link_9"
 
 
@@ -39,6 +45,17 @@ def plan(
     scenario: ScenarioArgument,
     variant: VariantOption = None,
     overrides: SetOption = None,
+    require: Annotated[
+        list[str] | None,
+        option("KEY=VALUE", "Override one of the requirements, e.g. `rating_share=1`; repeatable."),
+    ] = None,
+    vary: Annotated[
+        list[str] | None,
+        option(
+            "KEY=start:stop:count",
+            "Plan for each value of one key: start:stop:count (default: 5 values) or a,b,c; two keys at most.",
+        ),
+    ] = None,
     candidates: Annotated[
         str,
         option(
@@ -53,6 +70,9 @@ def plan(
     ] = None,
     radius: Annotated[float | None, option("M", "Brace radius [m]; default: the radius of the link.", min=0.0)] = None,
     count: Annotated[str, option("MIN:MAX", "Smallest and largest number of braces.")] = "0:3",
+    phases: Annotated[
+        str, option("MIN:MAX", "Smallest and largest number of brace sets along the path, one after the other.")
+    ] = "1:1",
     surface: Annotated[list[str] | None, option("NAME", "Surface that may be used; repeatable; default: all.")] = None,
     weight: Annotated[
         list[str] | None, option("peak=VALUE", "Extra cost of the largest torque of revolute joints [W/(N m)].")
@@ -72,7 +92,10 @@ def plan(
         str | None, option("LIST", "Candidate gains k_p [V/rad], comma-separated; default: 500 to 5.")
     ] = None,
     exhaustive: Annotated[bool, typer.Option("--exhaustive", help="Try every set of candidates (slow).")] = False,
-    starts: Annotated[int, option("N", "Number of independent search rounds.", min=1)] = 8,
+    starts: Annotated[int, option("N", "Number of rounds of each search.", min=1)] = 4,
+    budget: Annotated[
+        float, option("S", "Time after which no further search starts or continues [s]; 0: one search.", min=0.0)
+    ] = 30.0,
     seed: Annotated[int, option("S", "Seed for the random starting postures.")] = 0,
     explain: Annotated[
         bool, typer.Option("--explain", help="For rejected plans, find the largest error they tolerate.")
@@ -95,67 +118,69 @@ def plan(
     results/SCENARIO/plan/plan.yaml`.
     """
     from dynsim.draw.figures.look import Look
-    from dynsim.scenario import load_scenario
+    from dynsim.scenario import load_scenario, read_scenario
 
     look = Look.of(size, font, style, title=not no_title, caption=not no_caption)
+    overrides = [*(overrides or ()), *(f"requirements.{text}" for text in require or ())]
     loaded = load_scenario(scenario, variant, parsed_overrides(overrides))
     folder = out or Path("results", loaded.name, loaded.variant, "plan")
-    least, most = _numbers(count)
+    least, most = _numbers("count", count, "0:3")
+    fewest, largest = _numbers("phases", phases, "1:2")
     peak = _weights(weight or [])
     names = [name.strip() for name in candidates.split(",") if name.strip()]
     if candidates and not names:
         raise ScenarioError(
             f"--candidates {escaped(candidates)}: must list at least one candidate; omit it for the default"
         )
-    from dynsim.planner.answer import plan_braces
+    from dynsim.planner.answer import plan_with
     from dynsim.planner.files import check_plan_folder, save_plan
+    from dynsim.planner.problem import Options
+    from dynsim.planner.vary import vary_plans
     from dynsim.planner.verify import Tolerances
     from dynsim.studies.processes import cores
+    from dynsim.studies.sweep_plan import Axis, Plan
 
-    check_plan_folder(folder)
+    axes = tuple(Axis.parse(text, "--vary", VALUES) for text in vary or ())
+    check_plan_folder(folder, bool(axes))
     errors = (0.0, surface_error, -surface_error) if surface_error > 0.0 else (0.0,)
     factors = (1.0, 1.0 - friction_error, 1.0 + friction_error) if friction_error > 0.0 else (1.0,)
     chosen = Tolerances.gains if gains is None else _gains(gains)
     tolerances = Tolerances(friction=factors, shift_m=errors, gains=chosen)
+    options = Options(
+        tuple(names), tuple(along or ()), radius, (least, most), tuple(surface or ()), peak, clearance, min_force,
+        starts, seed, budget, exhaustive, (fewest, largest),
+    )  # fmt: skip
+    runs = Plan(read_scenario(scenario), (variant,), parsed_overrides(overrides), axes) if axes else None
+    variation = None
     with plan_progress(quiet) as tell:
-        result = plan_braces(
-            loaded,
-            candidates=names,
-            along=along or (),
-            radius_m=radius,
-            count=(least, most),
-            surfaces=surface or (),
-            peak_W_per_N_m=peak,
-            clearance_m=clearance,
-            min_N=min_force,
-            verify=verify,
-            explain=explain,
-            exhaustive=exhaustive,
-            starts=starts,
-            seed=seed,
-            jobs=jobs or cores(),
-            tolerances=tolerances,
-            tell=tell,
-        )
+        if runs is None:
+            result = plan_with(loaded, options, tolerances, verify, explain, jobs or cores(), tell)
+        else:
+            variation = vary_plans(runs, options, tolerances, verify, explain, jobs or cores(), tell)
+            result = variation.chosen[1]
         tell("writing", 0.98)
-        save_plan(result, folder, figures=not no_figures, kind=format_.value, look=look)
+        save_plan(result, folder, not no_figures, format_.value, look, variation)
     if not quiet:
+        if variation is not None:
+            print_variation(variation)
         print_plan(result)
         print_written(folder)
         if result.best is not None:
             print_line(f"Run the best plan: dynsim run {escaped(folder / 'plan.yaml')}")
     if result.best is None:
         raise UnreachableReference(f"no plan: {escaped(result.sizes[0].reason)}")
+    if result.tally.ended == "interrupted":
+        raise typer.Exit(SimulationInterrupted.exit_code)
 
 
-def _numbers(text: str) -> tuple[int, int]:
-    """Parse the minimum and maximum number of braces, such as ``0:3``, or a single number, such as ``2``."""
+def _numbers(key: str, text: str, example: str) -> tuple[int, int]:
+    """Parse the minimum and maximum of an option, such as ``example``, or a single number, such as ``2``."""
     first, colon, last = text.partition(":")
     try:
         least = int(first)
         return least, int(last) if colon else least
     except ValueError:
-        raise ScenarioError(f"--count {escaped(text)}: must be MIN:MAX, such as 0:3, or one number") from None
+        raise ScenarioError(f"--{key} {escaped(text)}: must be MIN:MAX, such as {example}, or one number") from None
 
 
 def _weights(texts: list[str]) -> float:
@@ -188,6 +213,10 @@ def _gains(text: str) -> tuple[float, ...]:
 
 # Table of a brace plan. A brace counts as lifted off if it is in contact for less than this fraction of the time.
 LIFTED = 0.999
+# Ratio of the heat of the run to the planned heat, and rms error of the hand beyond the surface error [m], above which
+# there is a remark.
+MORE, HAND_ERROR = 1.05, 5e-3
+_SURVIVES = {True: "yes", False: "no", None: "not verified"}
 
 
 def print_plan(plan: BracePlan) -> None:
@@ -195,19 +224,27 @@ def print_plan(plan: BracePlan) -> None:
 
     Reasons that do not fit on the screen are only in ``plan.json``.
     """
+    from dynsim.record.quantities import summary_quantity
+
     width, height = screen.size(console)
     table = screen.new_table(f"{plan.task.scenario.title}: braces")
+    required = dict.fromkeys(summary_quantity(r.key).label for size in plan.sizes for r in size.requirements)
     heads = (
-        "braces", "on", "heat [W]", "simulated [W]", "all energy [J]", "k_p [V/rad]", "forces [N]", "rounds",
-        "survives",
+        "braces", "on", "heat [W]", "simulated [W]", "all energy [J]", "k_p [V/rad]", "forces [N]", "searches",
+        *required, "survives",
     )  # fmt: skip
     for head in heads:
         table.add_column(head, justify="left" if head in ("on", "survives") else "right")
     for size in plan.sizes:
-        table.add_row(*_cells(size))
+        fewer = plan.no_gain(size)
+        table.add_row(*_cells(size, None if fewer is None else fewer.count, len(required)))
     console.print(table, width=min(width, console.width))
-    if any(size.planned is not None and size.agreed == 0 for size in plan.sizes):
-        print_line("rounds: search rounds that found this heat independently; 0 if it was found by exchanging braces")
+    if plan.tally.ended != "agreed":
+        ends = {
+            "budget": "the time budget ended before two searches agreed for each number of braces; increase --budget",
+            "interrupted": "interrupted: the best plans so far, without verification",
+        }
+        print_line(ends[plan.tally.ended])
     best = plan.best
     if best is not None:
         label = escaped(best.label) if best.braces else "no braces"
@@ -215,7 +252,7 @@ def print_plan(plan: BracePlan) -> None:
     notes = [
         f"{size.count} brace{'' if size.count == 1 else 's'}: {escaped(text)}"
         for size in plan.sizes
-        for text in _notes(size)
+        for text in [*_phases(plan.task, size), *_notes(size)]
     ]
     # Three lines are above the notes, and two below.
     left = height - screen.lines(console, [table]) - 5
@@ -231,12 +268,48 @@ def print_plan(plan: BracePlan) -> None:
         )
 
 
-def _cells(size: Size) -> tuple[str, ...]:
+def print_variation(variation: Variation) -> None:
+    """Print the best plan for each combination of values."""
+    from dynsim.record.quantities import rounded, summary_quantity
+
+    keys = [axis.key for axis in variation.axes]
+    drawn = {key: summary_quantity(key) for key in ("heat_W", *variation.limits)}
+    table = screen.new_table(f"{variation.scenario.title}: best plan for each value")
+    for head in (*keys, "braces", "on", *(q.label for q in drawn.values()), "survives"):
+        table.add_column(escaped(head), justify="left" if head in ("on", "survives") else "right")
+    for row in variation.table:
+        numbers = [
+            "–"
+            if row.get(key) is None
+            else rounded(q.scale * row[key], 3, "#") + " ✗" * (row.get(f"{key}_met") is False)
+            for key, q in drawn.items()
+        ]
+        table.add_row(
+            *(f"{row[key]:g}" for key in keys), str(row.get("count", "–")), escaped(row.get("braces", "no plan")),
+            *numbers, _SURVIVES.get(row.get("survives"), "–") if "count" in row else "–",
+        )  # fmt: skip
+    console.print(table)
+    values = ", ".join(f"{key} = {value:g}" for key, value in variation.chosen[0].items())
+    print_line(f"least heat at {escaped(values)}:")
+
+
+def _value(requirement: Requirement) -> str:
+    """Return the value of a requirement with its margin, such as "0.42 (58 %)"."""
+    from dynsim.record.quantities import rounded, summary_quantity
+
+    value = summary_quantity(requirement.key).scale * requirement.value
+    return f"{rounded(value, 3, '#')} ({100.0 * requirement.margin:.0f} %)"
+
+
+def _cells(size: Size, no_gain_over: int | None, columns: int = 0) -> tuple[str, ...]:
+    """Return a table row; plans have ``columns`` requirements."""
     if size.planned is None:
-        return str(size.count), "not found", "–", "–", "–", "–", "–", f"0/{size.rounds}", "–"
+        return (str(size.count), "not found", *5 * ("–",), f"0/{size.searches}", *(columns + 1) * ("–",))
+    if no_gain_over is not None:
+        label = f"no gain over {no_gain_over} brace{'' if no_gain_over == 1 else 's'}"
+        return (str(size.count), label, f"{size.heat:.4g}", *(columns + 6) * ("–",))
     dense, nominal = size.planned.dense, size.nominal
     forces = f"{dense.forces.min():.3g} … {dense.forces.max():.3g}" if size.count else "–"
-    survives = {True: "yes", False: "no", None: "not verified"}[size.survives]
     return (
         str(size.count),
         escaped(size.label),
@@ -245,8 +318,9 @@ def _cells(size: Size) -> tuple[str, ...]:
         "–" if nominal is None else f"{nominal.electrical_energy_J:.4g}",
         f"{size.k_p:g}",
         forces,
-        f"{size.agreed}/{size.rounds}",
-        survives,
+        f"{size.agreed}/{size.searches}",
+        *(_value(requirement) for requirement in size.requirements),
+        _SURVIVES[size.survives],
     )
 
 
@@ -260,15 +334,29 @@ def _tolerated(shift_m: float | None, friction: float | None) -> list[str]:
     return [f"tolerates, one at a time and in both directions: {' and '.join(texts)}"] if texts else []
 
 
+def _phases(task: Task, size: Size) -> list[str]:
+    """Return a text with the braces of each phase and its end; empty if the braces do not change."""
+    if size.planned is None or not size.dense.schedule.borders:
+        return []
+    parts = [(phase.end, ", ".join(b.label for b in phase.braces)) for phase in task.phases(size.dense.schedule)]
+    return ["; ".join(f"until {end:.3g} s {label or 'no braces'}" for end, label in parts)]
+
+
 def _notes(size: Size) -> list[str]:
     notes = [f"rejected, {size.reason}"] if size.planned is not None and size.reason else []
     if size.planned is None:
         notes.append(size.reason)
-    if size.verdict is not None and not size.verdict.sound:
+    if size.nominal is not None and size.nominal.reason:
         notes.append(f"rejected as planned with k_p = {size.k_p:g} V/rad: errors were not tested")
+    if size.nominal is not None and size.nominal.heat_W > MORE * size.heat:
+        notes.append(f"the run needs {size.nominal.heat_W:.4g} W, {size.nominal.heat_W / size.heat:.2g} times the plan")
+    if size.verdict is not None and size.verdict.hand_m > HAND_ERROR:
+        notes.append(f"hand error of up to {1e3 * size.verdict.hand_m:.2g} mm rms beyond the error of the surfaces")
+    if not math.isnan(size.bound):
+        notes.append(f"changing braces more often along the paths found would need at least {size.bound:.4g} W")
     for brace, share in ({} if size.nominal is None else size.nominal.closed_fraction).items():
         if share < LIFTED:
-            notes.append(f"{brace} lifts off for {100.0 * (1.0 - share):.2g} % of the time in the run without errors")
+            notes.append(f"{brace} lifts off for {100.0 * (1.0 - share):.2g} % of its time in the run without errors")
     if size.tolerance is not None:
         notes += _tolerated(*size.tolerance)
     notes += [f"{label} would need less heat, but: {why}" for label, why in size.cheaper]

@@ -74,7 +74,7 @@ def sweep(
         str | None, option("all|NAMES", "`all`, or comma-separated variant names; default: the first in the file.")
     ] = None,
     overrides: SetOption = None,
-    jobs: Annotated[int | None, option("N", "Number of worker processes; default: one per core.", min=1)] = None,
+    jobs: Annotated[int | None, option("N", "Number of processes; default: one per core.", min=1)] = None,
     scheduler: Annotated[
         str | None, option("ADDRESS", "Run on the workers of this Dask scheduler (tcp://HOST:PORT).")
     ] = None,

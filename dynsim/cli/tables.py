@@ -311,10 +311,13 @@ def print_starts(console: Console, starts: Mapping[str, Start]) -> None:
         values = {"hand": f"{_coordinates(start.hand)}"}
         values |= {f"contact {name}": f"{_coordinates(point)}" for name, point in start.contacts.items()}
         pairs = list(start.pairs.items())
-        gaps = {**start.gaps, **dict(pairs[:_MOST_PAIRS])}
-        values |= {f"gap of {name}": f"{_format(_without_rounding(gap), '+.4g')} m" for name, gap in gaps.items()}
+        texts = {
+            name: f"{_format(_without_rounding(gap), '+.4g')} m" for name, gap in {**start.pairs, **start.gaps}.items()
+        }
+        values |= {f"gap of {name}": texts[name] for name, _ in pairs[:_MOST_PAIRS]}
         if further := pairs[_MOST_PAIRS:]:
             values[f"{len(further)} more pairs"] = f"{further[0][1]:+.4g} m or more"
+        values |= {f"gap of {name}": texts[name] for name in start.gaps}
         for joint, (to, was, unit) in start.solved.items():
             values[joint] = f"{to!r} {unit}, set by `initial`; was {was:.6g}"
         for joint, (at, unit) in start.nearest.items():

@@ -13,10 +13,12 @@ from dynsim.dynamics.contact.braces import statics as kb
 from dynsim.dynamics.contact.braces.statics import brace_motion, brace_statics
 from dynsim.errors import ModelError, brief
 from dynsim.jit.kernel import integers, reals
-from dynsim.model.description import Array, Robot
+from dynsim.model.description import Array, Contact, Robot
 from dynsim.model.drives import Motor, Servo, TorqueSource
 
 MIN_N = 0.5
+# Time within which the force of a brace rises at the start of an interval, and falls at its end [s].
+RAMP = 0.1
 
 
 @dataclass(frozen=True)
@@ -137,6 +139,41 @@ class BraceStatics:
     certificate: Array | None = None
 
 
+@dataclass(frozen=True)
+class PressingBrace:
+    """Contact that presses along references.
+
+    Attributes
+    ----------
+    contact : Contact
+        Contact point and surface.
+    force : float or None
+        Commanded normal force [N]; None for the force that minimizes the motor heat.
+    during : tuple of (float, float) or None
+        Intervals in which the brace presses [s]; None for the whole run.
+    """
+
+    contact: Contact
+    force: float | None = None
+    during: tuple[tuple[float, float], ...] | None = None
+
+    def share(self, times: Array) -> Array:
+        """Return the share of the brace in the plan at times of the whole run, (T,): 1 if it presses, 0 if not.
+
+        Within ``RAMP`` at the ends of an interval the share is 3 s² − 2 s³ with s from 0 to 1, except for ends that are
+        also ends of the run.
+        """
+        if self.during is None:
+            return np.ones(len(times))
+        share = np.zeros(len(times))
+        for start, end in self.during:
+            rise = 1.0 if start <= times[0] else (times - start) / RAMP
+            fall = 1.0 if end >= times[-1] else (end - times) / RAMP
+            inside = (times >= start) & (times <= end)
+            share = np.maximum(share, np.where(inside, np.clip(np.minimum(rise, fall), 0.0, 1.0), 0.0))
+        return np.asarray(share**2 * (3.0 - 2.0 * share))
+
+
 class BracePlanner:
     """Kernel tables for the braces of a robot, including the workspace of the solver.
 
@@ -172,7 +209,9 @@ class BracePlanner:
         brace_motion(self._model, self._ws, self.arrays, reals(q), reals(v), positions, velocities)
         return positions, velocities
 
-    def least_heat(self, q: Array, v: Array, vdot: Array, tables: Array) -> tuple[Array, Array, int]:
+    def least_heat(
+        self, q: Array, v: Array, vdot: Array, tables: Array, shares: Array | None = None
+    ) -> tuple[Array, Array, int]:
         """Compute the torques and normal forces that minimize the motor heat along a motion.
 
         Parameters
@@ -183,6 +222,8 @@ class BracePlanner:
             Rates and accelerations.
         tables : (T, c, BRACE_SIZE) ndarray
             Rows of :func:`brace_rows`.
+        shares : (T, c) ndarray, optional
+            Shares of the braces, 0 to 1; see Notes. Default: all braces press.
 
         Returns
         -------
@@ -192,12 +233,31 @@ class BracePlanner:
             Normal forces [N].
         solved : int
             Number of samples solved before the first infeasible one.
+
+        Notes
+        -----
+        Shares mix the solutions of different sets of braces: tau = ∫ tau_S(u) du over u from 0 to 1, where the braces
+        of S(u) have shares of at least u, and likewise the forces. Torques are therefore as continuous as the shares.
+        All constraints except ``min_N`` are satisfied, because they are convex.
         """
         torques, normal = np.zeros(v.shape), np.zeros(tables.shape[:2])
-        solved = brace_statics(
-            self._model, self._ws, self.arrays, reals(q), reals(v), reals(vdot), tables, torques, normal, False
-        )
-        return torques, normal, int(solved)
+        if shares is None:
+            solved = brace_statics(
+                self._model, self._ws, self.arrays, reals(q), reals(v), reals(vdot), tables, torques, normal, False
+            )
+            return torques, normal, int(solved)
+        solved, ends = len(q), np.zeros((len(q), 1))
+        edges = np.hstack([ends, np.sort(shares, axis=1), ends + 1.0])
+        for m, weight in enumerate(np.diff(edges).T):
+            rows = np.flatnonzero(weight)
+            part, off = tables[rows], shares[rows] < edges[rows, m + 1, None]
+            part[off, kb.COMMANDED] = part[off, kb.FRICTION] = 0.0
+            some, forces, done = self.least_heat(q[rows], v[rows], vdot[rows], part)
+            torques[rows] += weight[rows, None] * some
+            normal[rows] += weight[rows, None] * forces
+            if done < len(rows):
+                solved = min(solved, int(rows[done]))
+        return torques, normal, solved
 
 
 class PreparedBraces(BracePlanner):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 
 from dynsim.compile.touching import Kinematics, touch
 from dynsim.errors import ModelError, UnreachableReference
-from dynsim.model.description import Array, Contact
+from dynsim.model.description import Array, Contact, Robot
 
 ITERATIONS = 200
 # Maximum change of a coordinate in one iteration [rad or m]; it prevents jumps to another solution branch.
@@ -52,15 +53,23 @@ def hand_posture(
     See :meth:`dynsim.Model.inverse_kinematics`.
     """
     robot = model.robot
-    if robot.couplings or model.nq != model.n:
-        raise ModelError("inverse_kinematics: coupled joints and joints with several coordinates are not supported")
     if any(contact.tip is not None for contact in braces):
         raise ModelError("inverse_kinematics: braces must be points or spheres, not link axes")
+    ends = [robot.hand[0], *(body for contact in braces for body in (contact.body, contact.surface.carrier))]
+    chain = _chain(robot, [body for body in ends if body is not None])
+    movable = np.array([link.name in chain and (moving is None or link.joint in moving) for link in robot.links])
+    coupled = {joint for coupling in robot.couplings for joint in (coupling.joint, coupling.leader)}
+    for link in itertools.compress(robot.links, movable):
+        if link.joint in coupled or link.coordinates != (link.joint,):
+            raise ModelError(
+                f"inverse_kinematics: {link.joint}: coupled joints and joints with several coordinates are not "
+                "supported"
+            )
     lower, upper = (np.array([getattr(link, side) for link in robot.links]) for side in ("lower", "upper"))
     revolute = np.array([link.units[0] == "rad" for link in robot.links])
-    movable = np.array([moving is None or link.joint in moving for link in robot.links])
     hand, axes = robot.attach(*robot.hand)[0], robot.hand_axes
-    q = np.clip(q, lower, upper)
+    q, places = q.copy(), np.array(robot.position_index)
+    q[places[movable]] = np.clip(q[places], lower, upper)[movable]
     error = np.zeros(0)
     for _ in range(ITERATIONS):
         position, J = model.point_position_and_jacobian(*robot.hand, q)
@@ -77,14 +86,26 @@ def hand_posture(
         size = float(np.abs(error).max())
         if size <= tolerance:
             return q
-        q = _stepped(q, J, error * min(1.0, 0.3 / size), size, lower, upper, movable)
-    limited = [robot.links[k].joint for k in range(model.n) if q[k] in (lower[k], upper[k])]
+        stepped = _stepped(q[places], J, error * min(1.0, 0.3 / size), size, lower, upper, movable)
+        q[places[movable]] = stepped[movable]
+    limited = [robot.links[k].joint for k in np.flatnonzero(movable) if q[places[k]] in (lower[k], upper[k])]
     stuck = f"; at their limits: {', '.join(limited)}" if limited else ""
     left = float(np.abs(error).max())
     raise UnreachableReference(
         f"no posture near the start satisfies all targets for hand and braces: residual {left:.3g} [m or rad]{stuck}; "
         "change the start or relax a target"
     )
+
+
+def _chain(robot: Robot, bodies: Sequence[str]) -> set[str]:
+    """Return the names of the links between the world and some bodies or frames."""
+    parents, chain = {link.name: link.parent for link in robot.links}, set[str]()
+    for body in bodies:
+        name: str | None = robot.links[robot.attach(body, np.zeros(3))[0]].name
+        while name is not None:
+            chain.add(name)
+            name = parents[name]
+    return chain
 
 
 def _stepped(

@@ -228,7 +228,7 @@ class Model:
 
         known = surfaces or {}
         drawn = [(drawn_surface(name, surface), surface.carrier) for name, surface in known.items()]
-        own = [contact for contact in contacts if contact.surface.carrier is None or contact.surface_name in known]
+        own = [contact for contact in contacts if not contact.is_between_bodies]
         rubs = {rubbing.joint: rubbing.gear + rubbing.bearing for rubbing in dry_frictions(self.robot)}
         damping = self.damping.copy()
         for motor in self.robot.motors:

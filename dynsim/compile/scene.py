@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from dynsim.compile.clearance import axis_ends
 from dynsim.model.description import Array, Contact, Link, Robot
 from dynsim.model.drives import Motor
 from dynsim.model.mobile_base import SUPPORTS, MobileBase
@@ -49,13 +50,14 @@ _ALONG_Y: Quaternion = (math.sqrt(0.5), -math.sqrt(0.5), 0.0, 0.0)
 def robot_scene(robot: Robot, contacts: Sequence[Contact], surfaces: Mapping[str, Surface]) -> Scene | None:
     """Return the scene of a tree of bodies with joint positions ``q``; None if a joint cannot be drawn."""
     index = {link.name: k for k, link in enumerate(robot.links)}
-    bodies = []
+    bodies, tips = [], axis_ends(robot)
     for link in robot.links:
         kind = link.row.drawn
         if kind is None:
             return None
         parent = WORLD if link.parent is None else index[link.parent]
-        carried = tuple(solid_shape(surface) for surface in surfaces.values() if surface.carrier == link.name)
+        own = (surface for surface in surfaces.values() if surface.carrier == link.name)
+        carried = tuple(solid_shape(surface, _patch(tips[link.name])) for surface in own)
         bodies.append(Body(link.name, parent, _joint(link, kind), shapes(link) + carried))
     hand_body, hand_point = robot.hand
     points = [Point("hand", "hand", index[hand_body], vector3(hand_point))]
@@ -94,8 +96,13 @@ def _shared(values: Iterable[float]) -> float | None:
     return float(value) if math.isfinite(value) else None
 
 
-def solid_shape(surface: Surface) -> Shape:
-    """Return the solid that stands for a surface on a body; only a part of what is infinite is drawn."""
+def _patch(tips: Sequence[Array]) -> float:
+    """Return the size of infinite surfaces on a link with these axes [m]: 0.6 of the longest one, or PATCH."""
+    return 0.6 * max((float(np.linalg.norm(tip)) for tip in tips), default=0.0) or PATCH
+
+
+def solid_shape(surface: Surface, patch: float = PATCH) -> Shape:
+    """Return the solid that represents a surface on a body; of infinite surfaces, a part of the size ``patch`` [m]."""
     if isinstance(surface, Box):
         return Shape("box", vector3(surface.edges), vector3(surface.centre), quaternion(surface.axes.T))
     if isinstance(surface, Capsule):
@@ -108,8 +115,10 @@ def solid_shape(surface: Surface) -> Shape:
         return Shape("sphere", (radius,), position)
     turn = HERE if drawn.direction is None else turn_from_z(np.array(drawn.direction))
     if drawn.kind == "cylinder":
-        return Shape("cylinder", (radius, PATCH), position, turn)
-    return Shape("box", (PATCH, PATCH, 0.01 * PATCH), position, turn)
+        return Shape("cylinder", (radius, patch), position, turn)
+    if isinstance(surface, Quadric) and surface.middle is not None:
+        position = vector3(surface.middle)
+    return Shape("box", (patch, patch, 0.01 * patch), position, turn)
 
 
 def drawn_surface(name: str, surface: Surface) -> SceneSurface:

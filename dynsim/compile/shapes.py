@@ -43,11 +43,12 @@ def compile_shapes(robot: Robot, contacts: Sequence[Contact]) -> kd.ShapeArrays 
         if contact.solid is None:
             continue
         if contact.slot == 0:
-            links = [robot.attach(str(s.carrier), np.zeros(3))[0] for s in (contact.solid, contact.surface)]
+            carrier = contact.surface.carrier
+            links = [-1 if s is None else robot.attach(s, np.zeros(3))[0] for s in (contact.solid.carrier, carrier)]
             index.append((links[0], links[1]))
             solids.append([solid_row(contact.solid), solid_row(contact.surface)])
         arrays.kind[k, [kd.SURFACE, kd.FIELD, kd.COUNT]] = kd.PAIR, len(index) - 1, contact.slot
-    if all(contact.surface.carrier is None for contact in contacts):
+    if all(contact.surface.carrier is None and contact.solid is None for contact in contacts):
         return arrays
     both = np.reshape(solids, (-1, 2, ks.SOLID_SIZE))
     return arrays._replace(pairs=ks.pair_arrays(np.reshape(index, (-1, ks.PAIR_SIZE)), both))
@@ -67,6 +68,30 @@ def solid_row(solid: Surface) -> Array:
     row[ks.CORE : ks.CORE + 3], row[ks.CORE + 3] = half, radius
     row[ks.BOUND] = float(np.linalg.norm(half)) + radius
     return row
+
+
+def core_pose(row: Array, R: Array, p: Array) -> tuple[Array, Array]:
+    """Return axes, (T, 3, 3) by rows, and centres, (T, 3) [m], of a core in W; R and p are those of its link."""
+    local, centre = row[ks.POSE : ks.POSE + 9].reshape(3, 3), row[ks.POSE + 9 : ks.POSE + 12]
+    return np.einsum("ijt,jk->tki", R, local), p.T + np.einsum("ijt,j->ti", R, centre)
+
+
+def overlaps(rows: Sequence[Array], cores: Sequence[tuple[Array, Array]]) -> tuple[Array, Array, Array]:
+    """Return distances of centres along separating axes of two solids, overlaps, (T, n) [m], and axes, (T, n, 3).
+
+    The least overlap is the depth if the cores overlap. The axes are those of the solids, their cross products and, as
+    the last one, the line of centres.
+    """
+    (A, a), (B, b) = cores
+    edges = np.cross(A[:, :, None], B[:, None]).reshape(-1, 9, 3)
+    axes = np.concatenate([A, B, edges, (a - b)[:, None]], axis=1)
+    length = np.linalg.norm(axes, axis=2)
+    axes = axes / np.maximum(length, 1e-300)[..., None]
+    apart = np.einsum("tni,ti->tn", axes, a - b)
+    reach = rows[0][ks.CORE + 3] + rows[1][ks.CORE + 3] - np.abs(apart)
+    for core, row in zip((A, B), rows, strict=True):
+        reach += np.abs(np.einsum("tni,tki->tnk", axes, core)) @ row[ks.CORE : ks.CORE + 3]
+    return apart, np.where(length > 1e-6, reach, np.inf), axes
 
 
 def axes_along(direction: Array) -> Array:

@@ -19,7 +19,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dynsim.compile.model import Model
 from dynsim.compile.scene import BODY_RADIUS, snake_tube, snake_wheel
@@ -273,29 +272,3 @@ def _link_inertia(mass: float, length: float, ahead: float) -> Inertia:
     across = mass * (length**2 + BOX_WIDTH**2) / 12.0
     tensor = np.diag([mass * BOX_WIDTH**2 / 6.0, across, across])
     return Inertia(float(mass), np.array([0.5 * ahead * length, 0.0, 0.0]), tensor)
-
-
-def lifted_moments(robot: SnakeTree, lifted: NDArray[np.bool_]) -> Array:
-    """Return the weight moments at the pitch joints of lifted pairs, (pairs − 1,) [N m], for a straight base part.
-
-    Between two grounded pairs, the base part is treated as simply supported; behind the last one, as a cantilever.
-    Positive moments lower the part behind the joint.
-    """
-    d = robot.description
-    n, l, g = d.pairs, d.link_length, float(-robot.gravity[2])
-    # Weight of the plate behind each axle: the two links up to the next axle.
-    masses = d.link_mass[d.head_joints :]
-    weight = [g * float(masses[2 * k] + masses[2 * k + 1]) for k in range(n - 1)]
-    moments = np.zeros(n - 1)
-    down = np.flatnonzero(~lifted).tolist()
-    for first, last in zip(down, [*down[1:], n], strict=True):
-        count = last - first
-        if last == n:  # the tail, behind the last grounded pair
-            for k in range(first, n - 1):
-                moments[k] = sum(weight[i] * l * (2 * (i - k) + 1) for i in range(k, n - 1))
-        elif count > 1:
-            plates = weight[first:last]
-            reaction = sum(plates[i] * (2 * (count - i) - 1) for i in range(count)) / (2 * count)
-            for k in range(1, count):
-                moments[first + k] = -(reaction * 2 * l * k - sum(plates[i] * l * (2 * (k - i) - 1) for i in range(k)))
-    return moments

@@ -11,7 +11,7 @@ import numpy as np
 from dynsim.compile.clearance import axis_ends, poses
 from dynsim.compile.scene import solid_shape
 from dynsim.compile.shapes import bends_outward
-from dynsim.model.description import Array, Contact, Robot
+from dynsim.model.description import WORLD, Array, Contact, Robot
 from dynsim.model.surfaces import Box, Capsule, Quadric, Surface
 from dynsim.record.quaternion import rotated
 from dynsim.record.scene import Shape
@@ -32,7 +32,7 @@ def solids_of(robot: Robot) -> dict[str, list[Solid]]:
     """Return the solids of each body that has any.
 
     Those of a link with a radius are capsules about its axes, those of other bodies their shapes. Wheels are the
-    spheres with which they touch the ground.
+    spheres with which they touch the ground. The solids of the root link, the last entry, are fixed to the world.
     """
     solids: dict[str, list[Solid]] = {}
     tips = axis_ends(robot)
@@ -47,12 +47,9 @@ def solids_of(robot: Robot) -> dict[str, list[Solid]]:
             own += [Capsule(np.array(at), np.zeros(3), r, link.name) for *at, r in wheels if r > link.radius]
         if own:
             solids[link.name] = own
+    if robot.fixed_solids:
+        solids[robot.root or WORLD] = [_solid_of(shape, None) for shape in robot.fixed_solids]
     return solids
-
-
-def fixed_solids(robot: Robot) -> list[Solid]:
-    """Return the solids of the parts of a robot that are fixed to the world."""
-    return [_solid_of(shape, None) for shape in robot.fixed_solids]
 
 
 def with_solids(robot: Robot) -> Robot:

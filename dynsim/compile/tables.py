@@ -73,6 +73,7 @@ def compile_unilateral(
     slow: float,
     creep: float,
     dry: Sequence[DryFriction] = (),
+    stepped: bool = False,
 ) -> UnilateralArrays:
     """Return the tables of the unilateral law.
 
@@ -90,6 +91,8 @@ def compile_unilateral(
         Rate below which a joint with dry friction may be at rest [rad/s or m/s].
     dry : sequence of DryFriction, optional
         Joints with dry friction.
+    stepped : bool, optional
+        True for time stepping, which has scratch of its own: the result has no ``room``.
     """
     c, s, ties = len(contacts), len(stops), robot.ties
     shares = share_count(len(robot.couplings), c, s, len(dry))
@@ -127,7 +130,7 @@ def compile_unilateral(
         tie=reals(tie),
         index=integers(np.zeros((ku.INDICES, max(p, c + len(dry) + s + 2)))),
         vector=reals(np.zeros((ku.VECTORS, p))),
-        room=np.zeros((ku.ROOM, p, p)),  # not copied: time stepping, with many candidates, does not touch it
+        room=np.zeros((ku.ROOM, *(0 if stepped else p,) * 2)),
         split_room=np.zeros(split_size(3 * c + len(dry) + s, c + len(dry) + s)),
         number=reals(number),
         shares=reals(np.zeros(shares)),

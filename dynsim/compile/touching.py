@@ -8,11 +8,12 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dynsim.compile.shapes import share_of_axis, solid_row
+from dynsim.compile.shapes import core_pose, overlaps, share_of_axis, solid_row
 from dynsim.dynamics.contact import solids as ks
 from dynsim.errors import ModelError
 from dynsim.jit.kernel import reals
 from dynsim.model.description import Array, Contact, Robot
+from dynsim.model.surfaces import Box, Capsule
 
 
 class Kinematics(Protocol):
@@ -108,7 +109,7 @@ def touch(model: Kinematics, contact: Contact, q: Array, share: float | None = N
     carrier = -1 if contact.surface.carrier is None else model.body_index(contact.surface.carrier)
     if contact.solid is not None:
         return _slot(model, contact, carrier, q)
-    turned, origin = (np.eye(3), np.zeros(3)) if carrier < 0 else model.body_pose(carrier, q)
+    turned, origin = _pose(model, carrier, q)
     point, ends = contact.point, contact.point[None] if contact.tip is None else np.array([contact.point, contact.tip])
     seen = [(model.point_position(contact.body, end, q) - origin) @ turned for end in ends]
     nearest = seen[0]
@@ -122,13 +123,18 @@ def touch(model: Kinematics, contact: Contact, q: Array, share: float | None = N
     return TouchPoint(contact, link, point, model.point_position(link, point, q), normal, carrier, nearest)
 
 
+def _pose(model: Kinematics, index: int, q: Array) -> tuple[Array, Array]:
+    """Return the pose of a body, or of the world for index −1."""
+    return (np.eye(3), np.zeros(3)) if index < 0 else model.body_pose(index, q)
+
+
 def _slot(model: Kinematics, contact: Contact, carrier: int, q: Array) -> TouchPoint:
     """Return one of the contacts of two solids; see :func:`dynsim.dynamics.contact.solids.find_contacts`."""
     link, rows, poses = model.body_index(contact.body), [], []
     for index, solid in ((link, contact.solid), (carrier, contact.surface)):
         assert solid is not None
         row = solid_row(solid)
-        R, p = model.body_pose(index, q)
+        R, p = _pose(model, index, q)
         local = row[ks.POSE : ks.POSE + 9].reshape(3, 3)
         rows.append(row)
         poses.append(np.concatenate([(R @ local).ravel(), p + R @ row[ks.POSE + 9 : ks.POSE + 12]]))
@@ -144,3 +150,22 @@ def _slot(model: Kinematics, contact: Contact, carrier: int, q: Array) -> TouchP
 def gap_at(model: Kinematics, contact: Contact, q: Array) -> float:
     """Return the gap [m] of a contact at a configuration, (nq,); raises ModelError for an unknown body."""
     return touch(model, contact, q).gap
+
+
+def separation(model: Kinematics, first: Box | Capsule, second: Box | Capsule, q: Array) -> Array:
+    """Return the shortest translation of a moving solid that ends its overlap with another one, in W, (3,) [m].
+
+    If the cores overlap, it is along a face normal, or along a common normal of two edges. Otherwise it is along the
+    line between the nearest points of the cores. It is zero if the solids do not overlap.
+    """
+    assert first.carrier is not None
+    rows, poses = [solid_row(first), solid_row(second)], list[tuple[Array, Array]]()
+    for row, solid in zip(rows, (first, second), strict=True):
+        R, p = _pose(model, -1 if solid.carrier is None else model.body_index(solid.carrier), q)
+        poses.append(core_pose(row, R[..., None], p[:, None]))
+    apart, (depths,), axes = overlaps(rows, poses)
+    k = int(depths.argmin())
+    if depths[k] > rows[0][ks.CORE + 3] + rows[1][ks.CORE + 3]:
+        return np.asarray(np.copysign(depths[k], apart[0, k]) * axes[0, k])
+    at = touch(model, Contact("", first.carrier, np.zeros(3), second, solid=first), q)
+    return max(-at.gap, 0.0) * at.normal

@@ -223,7 +223,7 @@ def _locate(data: Any, loc: tuple[int | str, ...]) -> tuple[list[int | str], Any
         in_list = isinstance(node, list) and isinstance(part, int) and part < len(node)
         if exists and (in_mapping or in_list):
             node = node[part]
-        elif isinstance(node, Mapping) and part in (node.get(tag) for tag in TAGS):
+        elif part == "" or (isinstance(node, Mapping) and part in (node.get(tag) for tag in TAGS)):
             continue
         elif exists and isinstance(node, (int, float, str, list)):
             # Skip parts that name a branch of a union of plain types, such as "float" or "list[float]".

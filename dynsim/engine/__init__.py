@@ -121,8 +121,9 @@ def simulate(scenario: Scenario, progress: Progress | None = None, *, pictured: 
 
     Notes
     -----
-    The equations of motion are [WM] eqs 42–44 and 54–55, extended by motors and contacts, see docs/physics.md. Runs
-    within one ``dynsim.system.memo.remembering`` block, as in a sweep, share intermediate results.
+    The equations of motion are [WM] eqs 42–44 and 54–55, extended by motors and contacts, see
+    docs/theory/multibody.md. Runs within one ``dynsim.system.memo.remembering`` block, as in a sweep, share
+    intermediate results.
 
     Examples
     --------
@@ -182,7 +183,7 @@ def check(scenario: Scenario, started: Callable[[Start], None] | None = None) ->
 
     Notes
     -----
-    Nothing is integrated. docs/physics.md states when contact forces exist.
+    Nothing is integrated. docs/theory/uniqueness.md states when contact forces exist.
 
     Examples
     --------

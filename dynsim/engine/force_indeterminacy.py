@@ -2,7 +2,7 @@
 
 The check during a run is compiled (dynsim.dynamics.contact.delassus). When that check fails, this module finds the time
 of the failure and writes the text of the warning or stop message. It also computes the range of accelerations that
-dependent frictional rows allow. docs/physics.md derives the criteria.
+dependent frictional rows allow. docs/theory/uniqueness.md derives the criteria.
 """
 
 from __future__ import annotations

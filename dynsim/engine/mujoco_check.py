@@ -36,12 +36,10 @@ def omissions(scenario: Scenario, prepared: Prepared, touching: bool) -> list[st
     law = scenario.config.contacts.law
     surfaces = {name: (drawn_surface(name, s), s.carrier) for name, s in build.surfaces(scenario).items()}
     unsupported = [
-        name
-        for name, (s, carrier) in surfaces.items()
-        # Planes belong to the world in MuJoCo.
-        if s.kind in ("quadric", "height_field", *(("plane",) if carrier else ())) or (s.radius or 0.0) < 0.0
+        name for name, (s, _) in surfaces.items() if s.kind in ("quadric", "height_field") or (s.radius or 0.0) < 0.0
     ]
-    lost = [c.name for c in contacts if not touching or c.surface_name in unsupported]
+    moving = [name for name, (s, carrier) in surfaces.items() if s.kind == "plane" and carrier]
+    lost = [c.name for c in contacts if not touching or c.surface_name in (*unsupported, *moving)]
     kept = [c for c in contacts if c.name not in lost]
     dc = [m for m in robot.motors if isinstance(m, Motor)]
     servos = [m for m in robot.motors if isinstance(m, Servo)]
@@ -49,6 +47,9 @@ def omissions(scenario: Scenario, prepared: Prepared, touching: bool) -> list[st
     features = {
         "contacts do not collide; pass --contacts": lost if not touching else [],
         "MJCF has no such surface; contacts there are omitted": unsupported if touching else [],
+        "in MuJoCo, planes are fixed to the world; contacts on planes of bodies are omitted; use a box": (
+            moving if touching else []
+        ),
         "bilateral contacts become unilateral": [c.name for c in kept] if law == "bilateral" else [],
         "restitution is omitted": [c.name for c in kept if c.restitution > 0.0],
         "friction keeps only its kinetic coefficient": [

@@ -32,6 +32,8 @@ from dynsim.compile.tables import (
 )
 from dynsim.dynamics import state as kst
 from dynsim.dynamics import tables as ka
+from dynsim.dynamics.contact import unilateral as ku
+from dynsim.dynamics.contact.cone import steps as kc
 from dynsim.dynamics.derivative import System, new_workspace
 from dynsim.dynamics.drive.law import dc_block, servo_block
 from dynsim.dynamics.state import OutputLayout, StateLayout, block, output_layout, state_layout
@@ -49,6 +51,7 @@ from dynsim.integrators.events import TIP_MARGIN
 from dynsim.integrators.methods import METHODS, by_number
 from dynsim.integrators.run import RATE_TOLERANCE
 from dynsim.integrators.simd.forms import has_forms
+from dynsim.integrators.stepping.articulated_contacts import articulated_arrays
 from dynsim.integrators.stepping.free_bodies import free_bodies
 from dynsim.integrators.stepping.tables import stepping_arrays
 from dynsim.model.description import Array, Contact, Load, Robot
@@ -325,6 +328,8 @@ def prepare(
             model = pressed(model, contacts, still, control, real)
             balance = balanced(model, contacts, still, control, real, requested)
             robot = model.robot
+    if real:
+        _check_scratch(c, ka.row_limit(c, joint_rows), kc.CONE_ROOM if method == ki.TIME_STEPPING else ku.ROOM)
     floors = None if real else recall("floors", lambda: mobility_floors(model, contacts), model, places)
     system = System(
         layout=layout,
@@ -337,7 +342,13 @@ def prepare(
         couplings=compile_couplings(robot),
         shapes=compile_shapes(robot, contacts),
         unilateral=compile_unilateral(
-            robot, contacts, stops, slow_slip(options.absolute_tolerance), creep(options.absolute_tolerance), dry
+            robot,
+            contacts,
+            stops,
+            slow_slip(options.absolute_tolerance),
+            creep(options.absolute_tolerance),
+            dry,
+            method == ki.TIME_STEPPING,
         )
         if real
         else None,
@@ -346,7 +357,8 @@ def prepare(
     if method == ki.TIME_STEPPING and system.unilateral is not None:
         system = with_shapes(system)
         free = free_bodies(model.arrays) if system.shapes and system.shapes.pairs is not None else None
-        stepping = stepping_arrays(model.arrays, system.contacts, na, joint_rows, options.theta, free)
+        articulated = articulated_arrays(system)
+        stepping = stepping_arrays(model.arrays, system.contacts, na, joint_rows, options.theta, free, articulated)
     y = np.zeros(layout.size)
     y[block(layout, "q")] = robot.initial
     if balance is not None:
@@ -378,6 +390,18 @@ def prepare(
         lanes=has_forms(system),
     )
     return Prepared(model, contacts, control, system, run, new_workspace(system), loads, stops, choice, balance, dry)
+
+
+def _check_scratch(c: int, rows: int, tables: int) -> None:
+    """Raise ModelError if the scratch of the contact problem of c candidates cannot be allocated; it is not touched."""
+    try:
+        np.empty((tables, rows, rows))
+    except MemoryError:
+        raise ModelError(
+            f"{c} contact candidates need {8e-9 * tables * rows**2:.3g} GB of address space, more than this computer "
+            "allocates; use fewer pairs in contacts.between, fewer contacts.candidates, or fewer links",
+            keys=("contacts",),
+        ) from None
 
 
 def at_start(scenario: Scenario) -> tuple[Robot, list[Contact], JointControl | None]:
@@ -455,7 +479,7 @@ def _ticks(control: JointControl) -> tuple[np.ndarray, np.ndarray] | None:
         return None
     tick = np.zeros((1, ki.TICK_SIZE))
     tick[0, ki.TICK_PERIOD] = control.sample_time
-    return tick, np.array([[ki.TAKE_COMMANDS, 0]])
+    return tick, np.array([[ki.TAKE_COMMANDS, 0, 0]])
 
 
 def guards(

@@ -190,7 +190,7 @@ def summarise(
         **_loads(end),
         "energy_turnover_J": turnover,
         "energy_residual_relative": residual / scale if scale > 0.0 else 0.0,
-        "constraint_drift_max_m": float(run.extremes[:, ki.DRIFT_MAX].max(initial=0.0)),
+        **_drift(run),
         **_base(record, scenario, prepared),
         "contacts": [
             _contact(record, end, k, contact, prepared, duration, contact.name in scenario.config.contacts.points)
@@ -226,6 +226,13 @@ def _base(record: Record, scenario: Scenario, prepared: Prepared) -> dict[str, A
     # For rolling wheels s = r (φ_l + φ_r)/2 holds for any sample spacing.
     travel = base.wheel_radius * record["q"][:, columns].mean(axis=1)
     return {"base": base_summary(record, scenario.metrics.settle_s, support.least, travel)}
+
+
+def _drift(run: ki.Run) -> dict[str, float]:
+    """Return the largest gap of closed contacts [m]; empty for time stepping, where contacts have depths."""
+    if run.stepping is not None:
+        return {}
+    return {"constraint_drift_max_m": float(run.extremes[:, ki.DRIFT_MAX].max(initial=0.0))}
 
 
 def _loads(end: Record) -> dict[str, Any]:
@@ -328,6 +335,7 @@ def _time_stepping(run: ki.Run, springs: bool) -> dict[str, Any]:
         "step_s": float(run.clock[ki.STEP]),
         "contact_solves": int(results[kt.SOLVES]),
         "long_solves": int(results[kt.LONG_SOLVES]),
+        "cycled_solves": int(results[kt.CYCLED]),
         "dropped_solves": int(results[kt.DROPPED]),
         "capped_solves": int(results[kt.CAPPED]),
         "residual_max_m_s": float(results[kt.WORST]),
@@ -660,10 +668,10 @@ def _add_unilateral(record: Record, prepared: Prepared) -> None:
 def _add_touching_points(record: Record, contacts: Sequence[Contact], touch: Array) -> None:
     """Add where forces act on spheres, capsules and solids, and normals of surfaces on bodies, in single precision."""
     at = [k for k, c in enumerate(contacts) if c.radius > 0.0 or c.tip is not None or c.solid is not None]
-    carried = [k for k, contact in enumerate(contacts) if contact.surface.carrier is not None]
+    carried = [k for k, c in enumerate(contacts) if c.surface.carrier is not None or c.is_between_bodies]
     for columns, name, first, unit, text in (
         (at, TOUCHING, kst.OUT_POSITION, "m", "points of force application on spheres, capsules and solids"),
-        (carried, NORMAL, kst.OUT_NORMAL, "1", "normals of surfaces that bodies carry, in W"),
+        (carried, NORMAL, kst.OUT_NORMAL, "1", "normals of solids and of surfaces that bodies carry, in W"),
     ):
         if columns:
             values = touch[:, columns, first : first + 3].astype(np.float32)

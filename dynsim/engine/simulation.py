@@ -33,7 +33,7 @@ from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.cone import steps as kc
 from dynsim.dynamics.contact.unilateral import UnilateralArrays
-from dynsim.dynamics.drive.law import take_commands
+from dynsim.dynamics.drive.law import follow_lines, take_commands
 from dynsim.dynamics.state import block
 from dynsim.dynamics.tree import loads as kl
 from dynsim.dynamics.tree.joints import normalise
@@ -54,12 +54,14 @@ from dynsim.errors import ModelError, ScenarioError, SimulationInterrupted, Simu
 from dynsim.integrators import driver
 from dynsim.integrators import run as ki
 from dynsim.integrators.run import state_within
+from dynsim.jit.kernel import integers, reals
 from dynsim.library.families import member
 from dynsim.model.description import Contact, Robot
 from dynsim.model.drives import Drive
 from dynsim.record import Event, Record
 from dynsim.record.measures import TIP_OVER
 from dynsim.scenario import Scenario, build, require_scenario
+from dynsim.scenario.between import idle_entries
 from dynsim.scenario.build import START_TOLERANCE, check_start
 from dynsim.scenario.combinations import LINEARIZATION, WATCHED_EVENTS
 from dynsim.scenario.effect import without_effect
@@ -131,7 +133,7 @@ class Simulation:
     -----
     As long as the caller changes nothing, results are bit-identical to :func:`dynsim.simulate`. Every change, such as
     :meth:`set_wrench`, takes effect at :attr:`time`. The equations are [WM] eqs 25, 42–44 and 54–55, see
-    docs/physics.md.
+    docs/theory/multibody.md.
 
     Examples
     --------
@@ -180,6 +182,8 @@ class Simulation:
             # Log the warning now: it is in the summary of a record, but a live session may never create a record.
             log.warning("%s: %s", scenario.title, unstable[0])
         self._time, self._begun, self._wall = start, start, 0.0
+        # Time until which steps are taken without a return to the caller.
+        self._until = start
         # With a ring buffer or a start from a state, the ledger counts from the first sample.
         self._relative = trace is not None or state is not None
         self._happened: list[Event] = []
@@ -267,10 +271,27 @@ class Simulation:
             )
         periods = control_periods(self._scenario, control.task_space.schedule.period)
         pilot = SnakePilot(self.model, control.task_space, *periods, source, self._scenario.config.sensors)
+        pilot.ticks_ahead, pilot.queue = self._ticks_ahead, self._queue
         for sensor in pilot.sensors:
             # Register sensors first: if both are due, they are called before the controller.
             self.every(sensor.period, sensor)
         return pilot
+
+    def _ticks_ahead(self) -> int:
+        """Return the number of ticks before the next return to the caller, 0 if there are other callbacks."""
+        tick = self._prepared.run.tick
+        if len(self._calls) > 1 or len(tick) > 1:
+            return 0
+        until = self._until if self._window is not None else min(self._until, self._samples_end)
+        return min(int((until - self._time) / float(tick[0, ki.TICK_PERIOD]) + 1e-6), ki.QUEUE_LENGTH)
+
+    def _queue(self, motors: NDArray[np.int64], lines: Array) -> None:
+        """Set linear references of all motors at the next ticks, (k, na, 2); see :meth:`set_lines`."""
+        run = self._prepared.run
+        first = len(run.queue) - len(lines)
+        run.queue[first:, motors], run.tick_table[0, ki.TICK_QUEUED] = lines, len(lines)
+        if (balance := self._prepared.balance) is not None:
+            run.queue[first:, :, 0] += balance.shift
 
     def _encoded_commands(self) -> EncodedCommands | None:
         """Return the handler that computes commands at the ticks of a sampled controller with encoders, or None."""
@@ -521,7 +542,7 @@ class Simulation:
         run = self._prepared.run
         tick = np.zeros((1, ki.TICK_SIZE))
         tick[0, [ki.TICK_PERIOD, ki.TICK_NEXT, ki.TICK_PHASE]] = period, first, first
-        table = np.array([[ki.CALLER << len(self._calls), 0]])
+        table = np.array([[ki.CALLER << len(self._calls), 0, 0]])
         self._calls.append(call)
         self._swap(tick=np.vstack([run.tick, tick]), tick_table=np.vstack([run.tick_table, table]))
 
@@ -672,7 +693,7 @@ class Simulation:
         >>> simulation.set_lines(np.array([8, 9]), [[-0.7, 0.0], [1.0, 0.1]])
         >>> state = simulation.advance(0.5)
         """
-        values = _finite("reference", lines)
+        values = reals(_finite("reference", lines))
         if np.asarray(motors).dtype.kind not in "iu" or values.shape != (*np.shape(motors), 2):
             raise ModelError(
                 f"motors = {brief(motors)}: must be indices of motors, with one row (position, rate) each in lines"
@@ -686,10 +707,9 @@ class Simulation:
     def _follow_lines(self, motors: NDArray[np.int64], values: Array) -> None:
         """Set linear references of motors from now on, values (motors, 2)."""
         self._settle_now()
-        drives, reference = self._prepared.system.drives, self._prepared.system.reference
-        reference.spline[motors], drives.table[motors, ka.SAMPLED] = ka.REWRITTEN, self._sampled[motors]
-        drives.input[motors, ka.LINE_START : ka.LINE_RATE + 1] = values
-        drives.input[motors, ka.LINE_SINCE] = self._time
+        drives, spline, chosen = self._prepared.system.drives, self._prepared.system.reference.spline, integers(motors)
+        if not follow_lines(spline, drives.table, drives.input, self._sampled, chosen, values, self._time):
+            raise ModelError(f"motors = {brief(motors)}: must be indices from 0 to {len(spline) - 1}")
         self._restart()
 
     def _plan_voltages(self, motors: NDArray[np.int64], share: float) -> None:
@@ -1296,6 +1316,11 @@ class Simulation:
             begun=self._begun,
         )
         record.summary["warnings"] += self._warnings
+        if queued := int(run.tick_table[:, ki.TICK_QUEUED].sum()):
+            assert self._operator is not None
+            assert not isinstance(self._operator, Operator)
+            self._operator.rewind(queued)
+            run.tick_table[:, ki.TICK_QUEUED] = 0
         for handler in self._tick_handlers:
             handler.add_to(record)
         if "final_position_error_m" in record.summary:
@@ -1351,16 +1376,16 @@ class Simulation:
 
     def _reach(self, asked: float) -> None:
         """Integrate until a step ends at a time, or until the step that would pass this time is pending."""
-        until = asked = min(asked, self._end)
+        until = asked = self._until = min(asked, self._end)
         while not self.finished and self._time < until:
             self._keep_window(until)
             run = self._prepared.run
             # Include a tick that differs from the requested time by rounding.
             slack = TICK_SLACK * max(1.0, abs(asked))
-            near = run.tick[:, ki.TICK_NEXT] if len(self._calls) else np.zeros(0)
-            near = near[np.abs(near - asked) <= slack]
-            until = min(max(until, float(near.max(initial=until))), self._end)
-            beyond = until + slack if len(near) else until
+            ticks = run.tick[:, ki.TICK_NEXT].tolist() if self._calls else []
+            near = [time for time in ticks if abs(time - asked) <= slack]
+            until = min(max([until, *near]), self._end)
+            beyond = until + slack if near else until
             if run.count[ki.PENDING] == 1 and run.clock[ki.TIME] + run.clock[ki.STEP] > beyond:
                 break
             self._piece(until)
@@ -1470,7 +1495,7 @@ class Simulation:
 
     def _integrate_to(self, until: float, calling: bool) -> None:
         """Integrate to a time as if the run ended there, or until it ends earlier."""
-        reached = False
+        reached, self._until = False, until
         while not (reached or self.finished):
             self._keep_window(until)
             run = self._prepared.run
@@ -1560,7 +1585,8 @@ def _finite(quantity: str, values: ArrayLike) -> Array:
         array = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError):
         raise ModelError(f"{quantity} must be numeric, got {brief(values)}") from None
-    if not np.isfinite(array).all():
+    # The sum of squares is faster to check, but may overflow.
+    if not math.isfinite(np.vdot(array, array)) and not np.isfinite(array).all():
         raise ModelError(f"{quantity} must be finite, got {array.tolist()}")
     return array
 
@@ -1635,6 +1661,10 @@ def start_of(scenario: Scenario) -> Start:
     movable = declared.keys() - {contact.name for contact in contacts if contact.left_out}
     if piloted is not None:  # `initial` does not place the joints of a snake
         movable = set()
+    brace = getattr(scenario.config.controller, "brace", None)
+    for name, force in brace.items() if isinstance(brace, dict) else ():
+        if (during := getattr(force, "during_s", None)) and during[0][0] > 0.0:  # presses later
+            movable = movable - {name}
     aloft = [name for name, gap in gaps.items() if name in movable and abs(gap) > build.START_TOLERANCE]
     solved = {}
     if scenario.config.initial is not None and scenario.config.initial.on_surface:
@@ -1650,6 +1680,7 @@ def start_of(scenario: Scenario) -> Start:
     warnings = [
         *robot.notes,
         *without_effect(scenario, bool(robot.motors)),
+        *idle_entries(scenario, robot),
         *_below(scenario, robot),
         *build.left_out_warnings(scenario, contacts),
     ]

@@ -5,6 +5,7 @@ It serves kinematic and dynamic snakes. The control law is in :mod:`dynsim.snake
 
 from __future__ import annotations
 
+import bisect
 import math
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
@@ -15,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.compile.control import JointControl
-from dynsim.compile.snake_tree import GROUND, SnakeTree, configuration, lifted_moments
+from dynsim.compile.snake_tree import GROUND, SnakeTree, configuration
 from dynsim.engine.saved_state import Stateful
 from dynsim.errors import ModelError, ScenarioError, SimulationStopped
 from dynsim.jit.kernel import integers, reals
@@ -37,7 +38,8 @@ from dynsim.snake.description import (
     SnakeDescription,
     TaskSpaceController,
 )
-from dynsim.snake.kinematics import SnakeModel, pose_of_point
+from dynsim.snake.fold import LiftTables, lift_angles
+from dynsim.snake.kinematics import SnakeModel, pose_of_point, zero_arrays
 from dynsim.snake.lifting import height_of
 from dynsim.snake.ticks import (
     SnakeState,
@@ -58,8 +60,6 @@ from dynsim.system.memo import recall
 LOWERED = (0.10, 0.30, 0.15)
 # Times to settle, to raise the head, and to settle again [s] (assumed).
 SETTLE, RAISE, SETTLE_AGAIN = 0.5, 1.0, 1.0
-# Ticks between two updates of the geometry of lifted pairs while their heights do not change.
-STEADY_TICKS = 4
 
 
 class WheelLifter(Stateful):
@@ -68,63 +68,60 @@ class WheelLifter(Stateful):
     Pairs are put down before other pairs are lifted.
     """
 
-    SAVED = ("_grounded", "_up", "_down")
+    SAVED = ("_grounded", "up", "down")
 
     def __init__(self, robot: SnakeTree, grounded: Array) -> None:
-        self._robot = robot
-        self._grounded = grounded.copy()
-        pairs = len(grounded)
-        self._up, self._down = np.where(grounded == 0, -np.inf, np.inf), np.full(pairs, np.inf)
+        d, part, self._lifts = robot.description, robot.base_part, robot.lifts
+        self._grounded, pairs = grounded.copy(), len(grounded)
+        # Times at which the pairs leave and reach the ground [s].
+        self.up, self.down = np.where(grounded == 0, -np.inf, np.inf), np.full(pairs, np.inf)
         servos = {motor.joint: motor for motor in robot.motors}
         chosen = [servo for joint in robot.lifting_joints if isinstance(servo := servos[joint], Servo)]
-        # Stiffness of the position loop, torque per angle [N m/rad].
-        self._stiffness = np.array([servo.k_p * servo.torque_constant / servo.resistance for servo in chosen])
+        stiffness = np.array([servo.k_p * servo.torque_constant / servo.resistance for servo in chosen])
+        # Each plate consists of the two links up to the next axle.
+        masses = reals(d.link_mass[d.head_joints :]).reshape(pairs - 1, 2)
+        self.lifting = zero_arrays(
+            LiftTables,
+            dict.fromkeys(("yaw", "hinge", "moments"), pairs - 1) | dict.fromkeys(("height", "lower", "tilt"), pairs),
+            before=reals(part.before),
+            behind=reals(part.behind),
+            half_track=reals(part.half_track),
+            radius=float(part.radius),
+            clearance=1e-3 * robot.lifts.clearance_mm,
+            blend=robot.lifts.blend_s,
+            weight=float(-robot.gravity[2]) * (masses[:, 0] + masses[:, 1]),
+            length=float(d.link_length),
+            stiffness=stiffness if robot.sag_compensation else np.full(pairs - 1, np.inf),
+        )
 
     def change(self, time: float, grounded: Array) -> None:
         """Set the grounded pairs, (pairs,) 1 or 0, from a time [s] on."""
-        blend = self._robot.lifts.blend_s
+        blend = self._lifts.blend_s
         put_down = (grounded == 1) & (self._grounded == 0)
         lifted = (grounded == 0) & (self._grounded == 1)
-        self._down[put_down] = np.maximum(time, self._up[put_down] + blend) + blend
-        begin = max([time, *self._down[put_down]])
+        self.down[put_down] = np.maximum(time, self.up[put_down] + blend) + blend
+        begin = max([time, *self.down[put_down]])
         for pair in np.flatnonzero(lifted):
-            landed = self._down[pair] if math.isfinite(self._down[pair]) else -math.inf
-            self._up[pair], self._down[pair] = max(begin, landed), math.inf
+            landed = self.down[pair] if math.isfinite(self.down[pair]) else -math.inf
+            self.up[pair], self.down[pair] = max(begin, landed), math.inf
         self._grounded = grounded.copy()
-
-    def moving(self, time: float) -> bool:
-        """Return whether a height changes after a time [s]."""
-        rising = np.isfinite(self._up) & (time < self._up + self._robot.lifts.blend_s)
-        return bool((rising | (np.isfinite(self._down) & (time < self._down))).any())
 
     def heights(self, time: float) -> Array:
         """Return the heights of the pairs at a time [s], (pairs,) [m]."""
-        return height_of(np.array(time), self._up, self._down, self._robot.lifts)
+        return height_of(time, self.up, self.down, self._lifts)
 
     def angles(self, time: float, yaw: Array) -> Array:
         """Return the angles added to the pitch joints on the axles at a time [s] and yaw angles, both (pairs − 1,)
-        [rad].
+        [rad], including the sag of the servos.
+
+        Raises
+        ------
+        ArithmeticError
+            If a height is out of reach.
         """
-        return angles_of_heights(self._robot, self.heights(time), yaw, self._stiffness)
-
-
-def angles_of_heights(robot: SnakeTree, height: Array, yaw: Array, stiffness: Array) -> Array:
-    """Return the pitch angles that move wheel pairs to heights (pairs,) [m], including the sag of the servos.
-
-    ``stiffness`` has shape (pairs − 1,) [N m/rad].
-    """
-    if not height.any():
-        return np.zeros(len(yaw))
-    hinge = np.asarray(robot.base_part.fold(yaw[None], height[None]).hinge[0])
-    if not robot.sag_compensation:
-        return hinge
-    # The moments include all pairs higher than s and are averaged over s from zero to the clearance, so that they
-    # change continuously.
-    share, below = height / (1e-3 * robot.lifts.clearance_mm), 0.0
-    for level in np.unique(share[share > 0.0]).tolist():
-        hinge = hinge + (level - below) * lifted_moments(robot, share >= level) / stiffness
-        below = level
-    return hinge
+        if not lift_angles(self.lifting, self.up, self.down, float(time), reals(yaw)):
+            raise ArithmeticError
+        return self.lifting.hinge.copy()
 
 
 def command_angles(robot: SnakeTree, phi: Array, added: Array) -> dict[str, float]:
@@ -166,7 +163,8 @@ def snake_start(scenario: Scenario, robot: SnakeTree, follow: Follow) -> tuple[S
     if robot.raised:
         alone = _alone(scenario)
         parts = alone.config
-        known = parts.plant, parts.contacts, parts.integrator, parts.surfaces, parts.surface_error, parts.loads
+        errors = parts.surface_error, parts.mass_error
+        known = parts.plant, parts.contacts, parts.integrator, parts.surfaces, errors, parts.loads
         own = recall("raised", lambda: _raised(alone, height, added, follow), *known, grounded)
         # Objects start where the scenario places them.
         q = np.concatenate([own, robot.initial[len(own) :]])
@@ -408,6 +406,8 @@ class SnakeControl:
     blocked: bool = False
     recovering: bool = False
     switch_due: bool = False
+    # The block, and the ticks of its requests.
+    _requests: tuple[CommandBlock | None, list[int]] = (None, [])
 
     def __post_init__(self) -> None:
         model, description, controller = self.model, self.description, self.controller
@@ -548,10 +548,12 @@ class SnakeControl:
 
     def periods(self) -> int:
         """Return the number of periods from the present one in which commands and mode cannot change, at least one."""
-        now = self.tick
-        ahead = self.block.request[now - self.block_start :]
-        later = 1 + np.flatnonzero(ahead[1:] != NO_REQUEST)
-        ends = [now + len(ahead), *(now + later[:1])]
+        now, block = self.tick, self.block
+        if self._requests[0] is not block:
+            self._requests = block, (self.block_start + np.flatnonzero(block.request != NO_REQUEST)).tolist()
+        requests = self._requests[1]
+        later = bisect.bisect_right(requests, now)
+        ends = [self.block_start + len(block.request), *requests[later : later + 1]]
         if (event := self.switcher.next_event()) is not None:
             ends.append(event)
         return int(min(ends)) - now

@@ -18,16 +18,19 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from dynsim.compile.clearance import poses
 from dynsim.compile.model import Model
 from dynsim.compile.snake_tree import GROUND, HEAD, ROOT, SnakeTree
 from dynsim.engine.gripper import GripperControl
 from dynsim.engine.kinematic import add_task, effort, hold_last, task_summary, task_warnings
 from dynsim.engine.operator import Referenced, SampledSensor
 from dynsim.engine.saved_state import Stateful
-from dynsim.engine.snake_control import STEADY_TICKS, SnakeControl, WheelLifter
+from dynsim.engine.snake_control import SnakeControl, WheelLifter
 from dynsim.engine.stepped import State
 from dynsim.errors import SimulationStopped
+from dynsim.integrators.run import QUEUE_LENGTH
 from dynsim.jit.kernel import FixedSignature
 from dynsim.model.description import Array
 from dynsim.model.drives import Servo
@@ -36,7 +39,7 @@ from dynsim.record import Record
 from dynsim.scenario.schema import Sensors
 from dynsim.snake import ticks as ss
 from dynsim.snake.description import CommandSource, TaskSpaceController
-from dynsim.snake.ticks import FEEDFORWARD, GIVEN, MEASURED, SnakeTrace, command_tick, record_row
+from dynsim.snake.ticks import FEEDFORWARD, GIVEN, MEASURED, NOT_FINITE, SnakeTrace, command_ticks, record_rows
 
 _ROOT_COORDINATES = 7
 # Interval of the overload checks, and duration of an overload after which the run ends [s].
@@ -67,7 +70,7 @@ class SnakePilot(Stateful, SnakeControl):
 
     SAVED = (
         "state", "gripper", "block", "block_start", "blocked", "recovering", "switch_due", "switcher", "grip",
-        "_lifter", "_row", "_added", "_added_rate", "_next_look", "_commanded", "_overloaded_since",
+        "_lifter", "_row", "_added", "_added_rate", "_update", "_begun", "_commanded", "_overloaded_since",
     )  # fmt: skip
     path = None  # the record has the target as part of the controller state
 
@@ -92,7 +95,7 @@ class SnakePilot(Stateful, SnakeControl):
         super().__init__(d, d.arrays(), controller, chosen, ticks, stride)
         self.state_source, self.tree, self.robot = state_source, model, robot
         self.period, self.rate = schedule.period, 1.0 / schedule.period
-        self._joints, self._root = _places(robot, d.joint_names), model.body_index(ROOT)
+        self._joints = _places(robot, d.joint_names)
         # Head contacts with the ground. The last joint of the head part is at the axle of wheel pair 1.
         ends = (HEAD, f"{HEAD}_end", *d.joint_names[: d.head_joints - 1])
         self._head_contacts = frozenset([*ends, *(f"{name}_{GROUND}" for name in ends)])
@@ -100,15 +103,17 @@ class SnakePilot(Stateful, SnakeControl):
         joints = (*d.joint_names, *robot.lifting_joints[1:])
         motors = [motor.joint for motor in robot.motors]
         self._motors = np.array([motors.index(joint) for joint in (*joints, *robot.wheel_joints)])
-        self._lifting = np.array([joints.index(joint) for joint in robot.lifting_joints])
-        self._command = FixedSignature(command_tick)
-        # Rows of joint_positions that form the drawn polyline; the last two are the hand and the tail's axle.
+        self._command = FixedSignature(command_ticks)
+        self._lines = np.zeros((1 + QUEUE_LENGTH, len(self._motors), 2))
+        # Number of ticks until the simulation may change otherwise, and queue of references for these ticks.
+        self.ticks_ahead: Callable[[], int] = lambda: 0
+        self.queue: Callable[[NDArray[np.int64], Array], None]
+        # Bodies at whose origins the drawn polyline has its corners, from the hand to the axle of the tail.
         chain = list(d.joint_names[: d.head_joints + 1])
         for k in range(1, d.base_joints):
             chain += [robot.lifting_joints[k], d.joint_names[d.head_joints + k]]
-        rows = [link.joint for link in robot.links]
-        self._line = [len(rows), *map(rows.index, chain), len(rows) + 1]
-        self._tail = model.body_index(f"pair{d.pairs}"), np.array([-d.link_length, 0.0, 0.0])
+        body_of = {link.joint: link.name for link in robot.links}
+        self._chain, self._tail = [body_of[joint] for joint in chain], f"pair{d.pairs}"
         self._lifter = WheelLifter(robot, controller.law.grounded[controller.fixing_row].astype(np.float64))
         self._row = controller.fixing_row
         self._added = self._lifter.angles(0.0, self.state.phi[d.head_joints :])
@@ -121,7 +126,9 @@ class SnakePilot(Stateful, SnakeControl):
         self.sensors = self._sensors(sensors or Sensors())
         objects = graspable(robot)
         self.grip = GripperControl(model, robot.gripper, objects, self.period) if objects else None
-        self._next_look = self._commanded = 0
+        # Tick of the next update of the rates of lifting; state and this tick before the last call with several ticks.
+        self._update = self._commanded = 0
+        self._begun = list[Array](), 0
         self._seen: Any = None
         self.read_commands(waiting=False)
 
@@ -144,52 +151,99 @@ class SnakePilot(Stateful, SnakeControl):
         return np.concatenate([p + R @ point, roll_pitch_yaw(R)])
 
     def __call__(self, simulation: Referenced) -> None:
-        """Run one control period: rewrite the references for the interval up to the next tick."""
-        if self.tick >= self.ticks:
+        """Run control periods: rewrite the references up to the next tick, and queue those of the ticks after it.
+
+        Without sensors, the commands do not depend on the robot's motion. They are computed for several ticks at once,
+        unless something must be done at a tick before.
+        """
+        tick, time, state, lifter = self.tick, self.time, self.state, self._lifter
+        if tick >= self.ticks:
             return
+        if self._update < 0:
+            raise self._failed()
         self._seen = simulation.state
-        self._refuse_overload(simulation)
+        if tick % self._overload_ticks == 0:
+            self._refuse_overload(simulation)
         self._read_sensors()
         self.begin_period()
         if self.grip is not None:
-            self.grip.step(self.time, bool(self.gripper[self.tick]), self._seen, simulation)
-        state, row = self.state, self.tick // self.stride if self.tick % self.stride == 0 else -1
-        time, phi = self.time, state.phi.copy()
-        mode = int(state.counts[ss.MODE])
+            self.grip.step(time, bool(self.gripper[tick]), self._seen, simulation)
+        mode, count = int(state.counts[ss.MODE]), 1
         if mode != self._row:
-            self._row, self._next_look = mode, 0
-            self._lifter.change(time, self.controller.law.grounded[mode].astype(np.float64))
-        self._commanded = max(self._commanded, row + 1)
-        law, schedule, velocity = self.controller.law, self.controller.schedule, self.block.velocity
-        moving, slows = int(not self.recovering), int(self.controller.when_blocked)
-        blocked = self._command(self.model, law, schedule, state, velocity, moving, slows, self.ws, row, self.trace)
-        if not math.isfinite(float(state.phi.sum())):
-            raise self.diverged()
-        self.end_period(bool(blocked))
-        self._set_references(simulation, time, phi)
+            self._row, self._update = mode, 0
+            lifter.change(time, self.controller.law.grounded[mode].astype(np.float64))
+        if self.blind and self.grip is None and not self.recovering and (ahead := self.ticks_ahead()) > 0:
+            looks = self._overload_ticks - tick % self._overload_ticks
+            count = min(1 + ahead, looks, self.periods(), self.ticks - tick)
+            self._begun = [array.copy() for array in self._changing()], self._update
+        done, blocked = self._command_ticks(count)
+        if done == 0:
+            raise self._failed()
+        self.end_period(blocked)
+        # Joint servos follow their rates from here on, and lifting adds to the pitch joints on the axles.
+        simulation.set_lines(self._motors, self._lines[0])
+        if done > 1:
+            self.queue(self._motors, self._lines[1:done])
+
+    def _command_ticks(self, count: int) -> tuple[int, bool]:
+        """Command periods, see :func:`command_ticks`; return their number, and whether the last one was blocked."""
+        lifter, controller = self._lifter, self.controller
+        moving, slows = int(not self.recovering), int(controller.when_blocked)
+        done, blocked, self._update = self._command(
+            self.model, controller.law, controller.schedule, self.state, self.block.velocity, moving, slows, self.ws,
+            self.stride, self.trace, lifter.lifting, lifter.up, lifter.down, self._added, self._added_rate,
+            self._update, count, self._lines,
+        )  # fmt: skip
+        self._commanded = (self.tick - 1) // self.stride + 1
+        return done, blocked
+
+    def _changing(self) -> list[Array]:
+        """Return the arrays that a command changes, except the trace."""
+        return [*self.state, self._added, self._added_rate]
+
+    def rewind(self, queued: int) -> None:
+        """Return to the last tick that the simulation has reached, ``queued`` ticks ago."""
+        reached = self.tick - queued
+        begun, self._update = self._begun
+        for array, value in zip(self._changing(), begun, strict=True):
+            array[...] = value
+        self._command_ticks(reached - self.tick)
+
+    def _failed(self) -> SimulationStopped:
+        """Return the exception for the last period."""
+        if self._update == NOT_FINITE:
+            return self.diverged()
+        time = (self.tick - 1) * self.period
+        return SimulationStopped(
+            f"too_far: no pitch angles can lift the wheel pairs of mode {self.mode} at t = {time:g} s: the base part "
+            "is bent too much",
+            time=time,
+            state=self.postures(),
+        )
 
     def _refuse_overload(self, simulation: Referenced) -> None:
         """Stop if the robot overturns, or if a servo is saturated and the head stays far below its target."""
-        if self.tick % self._overload_ticks:
-            return
         q, time = self._seen.q, self.time
-        R, _ = self.tree.body_pose(self._root, q)
-        tilt = float(np.arccos(np.clip(R[2, 2], -1.0, 1.0)))
+        _, x, y, _ = q[3:_ROOT_COORDINATES].tolist()
+        tilt = math.acos(max(1.0 - 2.0 * (x * x + y * y), -1.0))
         if tilt > OVERTURNED:
             text = f"overturned: {ROOT}, which carries the head, is tilted by {np.degrees(tilt):.0f}° at t = {time:g} s"
             raise SimulationStopped(text, time=time, state=self.postures(), kind="overturned")
-        off = np.abs(self._volts_per_rad * (self.state.phi - q[self._joints]))
-        overloaded = [name for name, most in zip(self.description.joint_names, off >= self._volts, strict=True) if most]
+        overloaded = np.abs(self._volts_per_rad * (self.state.phi - q[self._joints])) >= self._volts
+        if not overloaded.any():
+            self._overloaded_since = None
+            return
         below = float(self.state.w_target[2] - self.head_pose(q)[2])
         on_ground = any(touch.force > 0.0 for name, touch in simulation.touching.items() if name in self._head_contacts)
-        if not overloaded or not (on_ground or below > SAG):
+        if not (on_ground or below > SAG):
             self._overloaded_since = None
         elif self._overloaded_since is None:
             self._overloaded_since = time
         elif time - self._overloaded_since >= OVERLOAD_TIME:
+            names = ", ".join(np.array(self.description.joint_names)[overloaded])
             how = "the head lies on the ground" if on_ground else f"the head is {1e3 * below:.0f} mm below its target"
             raise SimulationStopped(
-                f"too_heavy: {how} at t = {time:g} s, with {', '.join(overloaded)} at the voltage limit since "
+                f"too_heavy: {how} at t = {time:g} s, with {names} at the voltage limit since "
                 f"t = {self._overloaded_since:g} s",
                 time=time,
                 state=self.postures(),
@@ -224,42 +278,6 @@ class SnakePilot(Stateful, SnakeControl):
             return [sensor(lambda state: state.q[self._joints], encoders, noise, resolution)]
         return []
 
-    def _set_references(self, simulation: Referenced, time: float, phi: Array) -> None:
-        """Set the references of joints and wheels from the tick at ``time`` on; joints start at ``phi``."""
-        rates, joints, lines = self.ws.work.u, len(phi), np.zeros((len(self._motors), 2))
-        self._lift(time)
-        lines[:joints, 0], lines[:joints, 1] = phi, rates[:joints]
-        lines[self._lifting, 0] += self._added
-        lines[self._lifting, 1] += self._added_rate
-        lines[joints + len(self._lifting) - 1 :, 1] = rates[joints:]
-        simulation.set_lines(self._motors, lines)
-        self._added = self._added + self.period * self._added_rate
-
-    def _lift(self, time: float) -> None:
-        """Update the rates at which lifting moves the pitch joints.
-
-        They are updated at every tick while heights change, otherwise less often.
-        """
-        now = self.tick  # number of the tick that has just been commanded
-        if now < self._next_look:
-            return
-        ticks = 1 if self._lifter.moving(time) else STEADY_TICKS
-        span = ticks * self.period
-        # Yaw angles continue at their rates until the next update.
-        head, joints = self.description.head_joints, len(self.state.phi)
-        yaw = self.state.phi[head:] + (span - self.period) * self.ws.work.u[head:joints]
-        try:
-            then = self._lifter.angles(time + span, yaw)
-        except ArithmeticError:
-            raise SimulationStopped(
-                f"too_far: no pitch angles can lift the wheel pairs of mode {self.mode} at t = {time:g} s: the base "
-                "part is bent too much",
-                time=time,
-                state=self.postures(),
-            ) from None
-        self._added_rate = (then - self._added) / span
-        self._next_look = now + ticks
-
     def saved_state(self) -> dict[str, Any]:
         """Return the state of the control, of its sensors and of the recorded samples."""
         return super().saved_state() | {
@@ -279,15 +297,15 @@ class SnakePilot(Stateful, SnakeControl):
 
     def add_to(self, record: Record) -> None:
         """Add signals and summary of the control, and the signals of joints and wheels under their snake names."""
-        rows, q, v = len(record), record["q"], record["v"]
-        if rows == 0:
+        q, v = record["q"], record["v"]
+        if len(record) == 0:
             return
         # The last sample may be between ticks, at the end of the run.
         ticks = np.floor(record.time / self.period + 1e-6).astype(int) // self.stride
-        d, law, model = self.description, self.controller.law, self.model
+        d, axle = self.description, np.array([-self.description.link_length, 0.0, 0.0])
         trace = SnakeTrace(*(array[ticks] for array in self.trace))
         commanded = trace.phi.copy()
-        trace.base[:], trace.phi[:] = base_pose(q), q[:, self._joints]
+        trace.base[:], trace.phi[:] = [base_pose(row) for row in q], q[:, self._joints]
         trace.rho[:] = q[:, _places(self.robot, self.robot.wheel_joints)]
         end, begun = float(record.time[-1]), float(ticks[-1] * self.stride * self.period)
         between, before = end > begun + 1e-6 * self.period, trace.w_target[-1].copy()
@@ -302,14 +320,14 @@ class SnakePilot(Stateful, SnakeControl):
             if end < now:
                 trace.w_target[-1] = before + (end - begun) / (now - begun) * (self.state.w_target - before)
         hold_last(trace)
-        w, points, shown, write_row = np.zeros((rows, 6)), [], deepcopy(self.state), FixedSignature(record_row)
-        for r in range(rows):
-            shown.base[:], shown.phi[:], shown.w_target[:] = trace.base[r], trace.phi[r], trace.w_target[r]
-            shown.rho[:], shown.counts[ss.MODE] = trace.rho[r], trace.mode[r]
-            write_row(model, law, shown, self.ws, r, trace)
-            w[r] = self.head_pose(q[r])
-            # Controlled point, joints and axles to the tail.
-            points.append(self.tree.joint_positions(q[r], self._tail)[self._line])
+        record_rows(self.model, self.controller.law, deepcopy(self.state), self.ws, trace)
+        # Controlled point, joints and axles to the tail.
+        (head, point), places = self.robot.hand, {link.name: (R, p) for link, R, p in poses(self.robot, q)}
+        ends = [
+            (p + np.einsum("ijt,j->it", R, x)).T for R, p, x in ((*places[head], point), (*places[self._tail], axle))
+        ]
+        w = np.hstack([ends[0], roll_pitch_yaw(np.moveaxis(places[head][0], -1, 0))])
+        points = np.stack([ends[0], *(places[body][1].T for body in self._chain), ends[1]], axis=1)
         slip = np.linalg.norm(record["contact_slip_velocity"], axis=2)
         trace.slip[:] = np.where(record["contact_normal_force"] > 0.0, slip, 0.0).max(axis=1)
         rate = dict(zip(record.labels["v"], v.T, strict=True))
@@ -325,7 +343,7 @@ class SnakePilot(Stateful, SnakeControl):
         text = "commanded rates, held from this time on"
         add("phi_dot_command", trace.u[:, :columns], "rad/s", labels=names, description=f"joint {text}")
         add("rho_dot_command", trace.u[:, columns:], "rad/s", labels=d.wheel_names, description=f"wheel {text}")
-        add_task(record, self, trace, w, np.array(points))
+        add_task(record, self, trace, w, points)
         if self.grip is not None:
             self.grip.add_to(record)
         summary = {**record.summary, **task_summary(self, record), **effort(record.summary)}
@@ -339,11 +357,10 @@ def _places(robot: SnakeTree, joints: tuple[str, ...]) -> Array:
 
 
 def base_pose(q: Array) -> Array:
-    """Return x, y [m] of wheel pair 1 and yaw [rad] of the base part at coordinates (…, nq) of the tree, (…, 3)."""
-    w, x, y, z = (q[..., k] for k in range(3, _ROOT_COORDINATES))
+    """Return x, y [m] of wheel pair 1 and yaw [rad] of the base part at coordinates (nq,) of the tree, (3,)."""
+    px, py, _, w, x, y, z = q[:_ROOT_COORDINATES].tolist()
     # Use the yaw of the axle, e_y of the root, because the axle stays level even if the body behind it is tilted.
-    yaw = np.arctan2(-2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z))
-    return np.stack([q[..., 0], q[..., 1], yaw], axis=-1)
+    return np.array([px, py, math.atan2(-2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z))])
 
 
 def roll_pitch_yaw(R: Array) -> Array:

@@ -48,6 +48,8 @@ CONTACT_EVENTS = {
 def take_log(run: ki.Run) -> list[tuple[float, int]]:
     """Empty the event log of the kernels and return times [s] and event numbers."""
     logged = int(run.count[ki.LOGGED])
+    if logged == 0:
+        return []
     run.count[ki.LOGGED] = 0
     return list(zip(run.log_time[:logged].tolist(), run.log_event[:logged].tolist(), strict=True))
 
@@ -84,7 +86,7 @@ class State:
 
     Notes
     -----
-    docs/notation.md explains the symbols.
+    docs/terms.md explains the symbols.
 
     Examples
     --------

@@ -16,7 +16,7 @@ command beyond the limits of the motor.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -70,6 +70,8 @@ TEXTS = {
     "drift": ("drift of the base on its wheels", "use controller.state: measured"),
     "clamped": ("{} clamped at joint limits", "use controller.limit_policy: allocate"),
 }
+# Fixes for the head of a snake, whose controllers have neither feed-forward nor braces.
+HEAD_FIXES = {"sag": "raise the gains", "motion": "run until the joints settle, or slow down"}
 
 
 COLUMNS = [ka.DRIVEN, ka.DRIVE_KIND, ka.SERVO_MODE, ka.SAMPLED]
@@ -176,8 +178,9 @@ def hand_causes(
     nodes = [w * model.point_jacobian(*robot.hand, referenced + x * (q - referenced)) for x, w in NODES]
     rates = np.sum(nodes, axis=0)
     for k, loop in loops.items():
+        moved = weight @ rates @ motions[:, k]
         for cause, share in loop.parts.items():
-            parts[cause][robot.links[k].joint] = float(weight @ rates @ motions[:, k] * share)
+            parts[cause][robot.links[k].joint] = float(moved * share)
     if sensed:
         causes = [_cause(cause, parts[cause]) for cause in ("limit", "stop") if cause in parts]
         return [cause for cause in causes if cause.share >= PART]
@@ -263,7 +266,9 @@ def head_distance(record: Record, prepared: Prepared, blind: bool) -> None:
     record.summary["final_position_error_causes"] = [cause._asdict() for cause in causes]
     if distance > _limit(END_LIMIT, reach):
         far, time = _beyond(distance, END_LIMIT, reach), record.time[-1]
-        record.summary["warnings"].append(f"head: {far} from its target at t = {time:.4g} s{because(causes)}")
+        record.summary["warnings"].append(
+            f"head: {far} from its target at t = {time:.4g} s{because(causes, HEAD_FIXES)}"
+        )
 
 
 def _limit(share: float, reach: float) -> float:
@@ -275,7 +280,7 @@ def _beyond(distance: float, share: float, reach: float) -> str:
     return f"{1e3 * distance:.3g} mm (limit {1e3 * _limit(share, reach):.3g} mm{part})"
 
 
-def because(causes: Sequence[DistanceCause]) -> str:
+def because(causes: Sequence[DistanceCause], fixes: Mapping[str, str] | None = None) -> str:
     """Return the causes of a distance and the fix of the first one, as the end of a warning."""
     if not causes:
         return "; no single cause was identified; compare q with the references"
@@ -283,7 +288,8 @@ def because(causes: Sequence[DistanceCause]) -> str:
     for cause, share, joints in causes:
         text = TEXTS[cause][0].format(first_few(joints) or "several joints")
         texts.append(f"{text} ({100.0 * min(share, 1.0):.0f} %)")
-    return f", because of {' and '.join(texts)}; {TEXTS[causes[0].cause][1]}"
+    first = causes[0].cause
+    return f", because of {' and '.join(texts)}; {(fixes or {}).get(first, TEXTS[first][1])}"
 
 
 class _Loop(NamedTuple):

@@ -14,6 +14,7 @@ from dynsim.compile.tables import START_TOLERANCE, JointStop, format_quantity
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.engine.force_indeterminacy import motion_spread, sharing, wedges
+from dynsim.engine.overlaps import one_digit, passed_through, squeezed
 from dynsim.engine.prepare import Prepared
 from dynsim.engine.soundness import unstable_later, unstable_loop
 from dynsim.engine.target_distance import off_target
@@ -27,6 +28,7 @@ from dynsim.model.drives import Drive, Motor, Servo, TorqueSource
 from dynsim.record import Record
 from dynsim.record.measures import RESIDUAL_LIMIT, SHORT, TIP_OVER, least_loads, overturns_settled, percent
 from dynsim.scenario import Scenario, build
+from dynsim.scenario.between import idle_entries
 from dynsim.scenario.effect import without_effect
 
 DRIFT_LIMIT_M = 1e-9
@@ -108,8 +110,10 @@ def warnings_of(
             f"the energy ledger does not close: residual {summary['energy_residual_relative']:.1e} of the turnover; "
             "tighten integrator.rtol or the step"
         )
+    compressed = squeezed(record, prepared)
+    warnings += [*compressed, *passed_through(record, prepared)]
     if (stepping := summary.get("time_stepping")) is not None:
-        warnings += [*capped(stepping), *coarse(stepping, scale, summary["contacts"])]
+        warnings += [*capped(stepping), *coarse(stepping, scale, summary["contacts"], bool(compressed))]
     elif summary["constraint_drift_max_m"] > DRIFT_LIMIT_M:
         warnings.append(f"contacts drifted by {summary['constraint_drift_max_m']:.1e} m")
     warnings += _undetermined(record, prepared, stepping is not None)
@@ -117,7 +121,7 @@ def warnings_of(
     warnings += _slipping_start(record, prepared) or _moving_start(record, prepared)
     warnings += _sunk(record, sunk)
     warnings += _beyond_stops(robot, prepared.stops, prepared.control)
-    warnings += [*robot.notes, *without_effect(scenario, bool(robot.motors))]
+    warnings += [*robot.notes, *without_effect(scenario, bool(robot.motors)), *idle_entries(scenario, robot)]
     warnings += _overloaded(motors)
     hand = getattr(scenario.config.controller, "hand", None)
     from_start = getattr(hand, "from_start", False)
@@ -503,12 +507,15 @@ def _beyond_stops(robot: Robot, stops: Sequence[JointStop], control: JointContro
     ]
 
 
-def coarse(stepping: dict[str, Any], scale: float, contacts: Sequence[dict[str, Any]] = ()) -> list[str]:
+def coarse(
+    stepping: dict[str, Any], scale: float, contacts: Sequence[dict[str, Any]] = (), squeezed: bool = False
+) -> list[str]:
     """Warn of steps that are too long, and suggest a shorter step.
 
     Such steps remove or add too much energy, leave the energy uncertain, or let points sink in too far. ``scale`` is
     the energy turnover [J], but at least the resolution of the ledger; it is zero before the first motion. ``contacts``
-    are the contacts of the summary; the deepest one is named.
+    are the contacts of the summary; the deepest one is named. If edges are ``squeezed`` beyond their rounding, shorter
+    steps do not improve the energy.
     """
     step, worst, deepest = stepping["step_s"], stepping["scheme_loss_worst_J"], stepping["penetration_max_m"]
     # This value is missing for a ring buffer.
@@ -517,8 +524,10 @@ def coarse(stepping: dict[str, Any], scale: float, contacts: Sequence[dict[str, 
     made = stepping.get("scheme_gain_J", 0.0)
     warnings: list[str] = []
 
-    def warn(text: str, shorter: float) -> None:
-        fix = f"integrator.step_s is {step:g}: use {_shorter(shorter):g}"
+    def warn(text: str, shorter: float, helps: bool = not squeezed) -> None:
+        fix = f"integrator.step_s is {step:g}: use {one_digit(shorter):g}"
+        if not helps:
+            fix = "smaller steps do not help; increase the stiffness of the compressed edges"
         warnings.append(f"time stepping: {text}; {fix}")
 
     def part(energy: float, limit: float) -> str:
@@ -540,7 +549,7 @@ def coarse(stepping: dict[str, Any], scale: float, contacts: Sequence[dict[str, 
         text = f"points sink up to {1e3 * deepest:.3g} mm into their surfaces as they land"
         name = max(contacts, key=lambda contact: contact["penetration_max_m"])["name"] if contacts else ""
         limit = f"{name and f'{name}; '}limit {1e3 * PENETRATION_LIMIT_M:g} mm"
-        warn(f"{text} ({limit})", step * PENETRATION_LIMIT_M / deepest)
+        warn(f"{text} ({limit})", step * PENETRATION_LIMIT_M / deepest, helps=True)
     return warnings
 
 
@@ -557,13 +566,6 @@ def _resolving(stepping: dict[str, Any], share: float) -> float:
     if pulsation == 0.0:  # ties with dampers only
         return step * GAIN_LIMIT / share
     return float(min(GAIN_LIMIT**0.5 / pulsation, step * (GAIN_LIMIT / share) ** 0.5))
-
-
-def _shorter(step: float) -> float:
-    """Return the step rounded down to one digit."""
-    power = 10.0 ** np.floor(np.log10(step))
-    # Just below a power of ten, the logarithm rounds up to an integer.
-    return float(max(np.floor(step / power), 1.0) * power)
 
 
 def capped(stepping: dict[str, Any]) -> list[str]:

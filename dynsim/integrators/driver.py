@@ -155,7 +155,7 @@ def evaluate_for_commands(unilateral: UnilateralArrays | None, system: System, w
 def ready(system: System, ws: Workspace, run: Run):
     """Start or restart, and process ticks, if due; return False if control must return to the caller."""
     count = run.count
-    due = take_ticks(run)
+    due = take_ticks(run, system.drives.input)
     if due & ki.TAKE_COMMANDS:
         evaluate_for_commands(system.unilateral, system, ws, run)
         take_commands(system.drives, system.reference, run.clock[ki.TIME], ws)

@@ -276,10 +276,11 @@ def next_tick(run: Run, until):
 
 
 @internal_kernel
-def take_ticks(run: Run):
+def take_ticks(run: Run, line):
     """Return the kinds of the due ticks, as a sum of their bits; advance them, and set TIME exactly to them.
 
-    The method restarts at a break.
+    A tick with queued references writes them to ``line``, the table of the drives, and does not count as due. The
+    method restarts there and at a break.
     """
     due, clock, tick, k = 0, run.clock, run.tick, run.count[ki.NEXT_BREAK]
     while k < run.breaks.shape[0] and run.breaks[k] - clock[ki.TIME] <= 1e-12 * max(1.0, abs(clock[ki.TIME])):
@@ -293,5 +294,13 @@ def take_ticks(run: Run):
             run.tick_table[k, ki.TICK_COUNT] += 1
             # Do not sum periods, because rounding errors would accumulate.
             tick[k, ki.TICK_NEXT] = tick[k, ki.TICK_PHASE] + run.tick_table[k, ki.TICK_COUNT] * tick[k, ki.TICK_PERIOD]
-            due |= run.tick_table[k, ki.TICK_KIND]
+            queued = run.tick_table[k, ki.TICK_QUEUED]
+            if queued == 0:
+                due |= run.tick_table[k, ki.TICK_KIND]
+                continue
+            for a in range(line.shape[0]):
+                line[a, ka.LINE_START] = run.queue[ki.QUEUE_LENGTH - queued, a, 0]
+                line[a, ka.LINE_RATE] = run.queue[ki.QUEUE_LENGTH - queued, a, 1]
+                line[a, ka.LINE_SINCE] = clock[ki.TIME]
+            run.tick_table[k, ki.TICK_QUEUED], run.count[ki.STARTED] = queued - 1, 0
     return due

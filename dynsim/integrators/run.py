@@ -76,9 +76,12 @@ LOG, RETURN, STOP = 0, 1, 2
 TICK_PERIOD, TICK_NEXT, TICK_PHASE = 0, 1, 2
 TICK_SIZE = 3
 TICK_KIND, TICK_COUNT = 0, 1
-TICK_TABLE_SIZE = 2
+TICK_QUEUED = 2  # number of rows at the end of Run.queue that the next ticks use instead of returning to the caller
+TICK_TABLE_SIZE = 3
 TAKE_COMMANDS, CALLER = 1, 2
 LOG_LENGTH = 1024
+# Rows of Run.queue.
+QUEUE_LENGTH = 8
 GAPS_SIZE = 10
 # Codes in Run.log_event from these numbers on belong to contacts, joint stops, and joints with dry friction; see
 # dynsim.integrators.contacts.events.
@@ -113,6 +116,7 @@ class Run(NamedTuple):
     event_table: np.ndarray  # (e, EVENT_TABLE_SIZE) int
     tick: np.ndarray  # (k, TICK_SIZE)
     tick_table: np.ndarray  # (k, TICK_TABLE_SIZE) int
+    queue: np.ndarray  # (QUEUE_LENGTH, na, 2) positions and rates of the references from a tick on
     breaks: np.ndarray  # (b,) increasing times at which derivatives jump or bend and steps must end [s]
     log_time: np.ndarray  # (LOG_LENGTH,) event times [s]
     log_event: np.ndarray  # (LOG_LENGTH,) int: event codes
@@ -236,6 +240,7 @@ def new_run(
         event_table=integers(event_table),
         tick=reals(tick),
         tick_table=integers(tick_table),
+        queue=np.zeros((QUEUE_LENGTH, na, 2)),
         breaks=reals(np.zeros(0) if breaks is None else breaks),
         log_time=np.zeros(LOG_LENGTH),
         log_event=np.zeros(LOG_LENGTH, dtype=np.int64),

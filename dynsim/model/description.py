@@ -12,6 +12,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -108,6 +109,10 @@ class Inertia:
         """Return the same inertia in a frame in which B has rotation R and origin p [m]."""
         tensor = R @ self.tensor @ R.T
         return Inertia(self.mass, p + R @ self.com, 0.5 * (tensor + tensor.T))
+
+    def times(self, factor: float) -> Inertia:
+        """Return the inertia of the same body with another density; a factor of 1 changes no bit."""
+        return Inertia(factor * self.mass, self.com, factor * self.tensor)
 
     @classmethod
     def merged(cls, parts: Iterable[Inertia]) -> Inertia:
@@ -344,16 +349,12 @@ class Contact:
     left_out: bool = False
     solid: Surface | None = None
     slot: int = 0
+    is_between_bodies: bool = False
 
     @property
     def friction_at_rest(self) -> float:
         """Static coefficient μ_s; default: the kinetic coefficient."""
         return self.friction if self.static_friction is None else self.static_friction
-
-    @property
-    def is_between_bodies(self) -> bool:
-        """Whether the surface is a solid of another body, from ``contacts.between``."""
-        return self.surface_name == self.surface.carrier
 
     @property
     def geometry(self) -> tuple[str, str, Array, Surface, float, Array | None, Surface | None, int]:
@@ -509,7 +510,7 @@ class Robot:
     fixed_shapes, fixed_inertia : tuple of Shape, Inertia
         Shapes and mass of the parts fixed to the world.
     fixed_solids : tuple of Shape
-        Collision shapes of the parts fixed to the world; only plans keep clear of them.
+        Collision shapes of the parts fixed to the world.
     couplings : tuple of Coupling
         Couplings between joints.
     ties : tuple of Tie
@@ -552,6 +553,12 @@ class Robot:
     def hand_axes(self) -> Array:
         """Axes of the hand in the axes of the body that carries it, (3, 3)."""
         return np.asarray(self.attached_axes(self.hand[0]) @ self.hand_frame)
+
+    @property
+    def root(self) -> str | None:
+        """Name of the root link if it is fixed to the world; None if the robot has no such link."""
+        fixed = (frame for frame in self.frames if frame.body is None and not frame.p.any())
+        return next((frame.name for frame in fixed if np.array_equal(frame.R, np.eye(3))), None)
 
     @property
     def bodies(self) -> tuple[str, ...]:
@@ -650,12 +657,12 @@ class Robot:
                 q[k] = follow(couplings, float(positions.get(leader, min(max(0.0, low), high))))
         return q
 
-    @property
+    @cached_property
     def nq(self) -> int:
         """Number of coordinates: one for each angle or distance, four for a ball joint."""
         return sum(len(link.row.neutral) for link in self.links)
 
-    @property
+    @cached_property
     def position_index(self) -> tuple[int, ...]:
         """Index in q at which the coordinates of each link begin."""
         index, first, beyond = [], 0, 0

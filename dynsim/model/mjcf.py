@@ -24,7 +24,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from dynsim.errors import ModelError
-from dynsim.model.description import Array, Contact, Link, Robot
+from dynsim.model.description import WORLD, Array, Contact, Link, Robot
 from dynsim.model.drives import Drive, Servo, TorqueSource
 from dynsim.model.surfaces import Box, SolidPair
 from dynsim.record.quaternion import of_matrix
@@ -299,7 +299,7 @@ def _add_pairs(root: Element, pairs: Sequence[SolidPair], elements: Mapping[str 
         geoms, margin = list[str](), 0.0
         for solid in (first, second):
             if id(solid) not in names:
-                names[id(solid)] = f"solid_{solid.carrier}_{len(names) + 1}"
+                names[id(solid)] = f"solid_{solid.carrier or WORLD}_{len(names) + 1}"
                 geom = {"name": names[id(solid)], "group": "3"}
                 if isinstance(solid, Box):
                     half = np.maximum(solid.core, _LEAST_SIZE)

@@ -28,13 +28,15 @@ CORNERS = np.array(list(product((-1.0, 1.0), repeat=3)))
 class Quadric:
     """Surface C(r) = r·Q r/2 + b·r + c = 0, Q (3, 3) symmetric, b (3,); C > 0 is outside, where ∇C points.
 
-    Like all surfaces it is described in the axes of its ``carrier``, a body, or in the world if this is None.
+    Like all surfaces it is described in the axes of its ``carrier``, a body, or in the world if this is None. The part
+    of an infinite surface about ``middle``, (3,) [m], is drawn.
     """
 
     Q: Array
     b: Array
     c: float
     carrier: str | None = None
+    middle: Array | None = None
 
     def __post_init__(self) -> None:
         shapes = np.shape(self.Q), np.shape(self.b)
@@ -83,7 +85,12 @@ class Quadric:
     def shifted(self, by: Array) -> Quadric:
         """Return the surface moved by a vector [m]."""
         c = float(self.c - self.b @ by + 0.5 * by @ self.Q @ by)
-        return replace(self, b=self.b - self.Q @ by, c=c)
+        return replace(self, b=self.b - self.Q @ by, c=c, middle=None if self.middle is None else self.middle + by)
+
+    def turned(self, R: Array) -> Quadric:
+        """Return the surface turned about the origin."""
+        middle = None if self.middle is None else R @ self.middle
+        return replace(self, Q=R @ self.Q @ R.T, b=R @ self.b, middle=middle)
 
     def normal(self, position: Array) -> Array:
         """Return ∇C/|∇C| at a point, (3,); zero if ∇C vanishes, as at the centre of a sphere."""
@@ -153,6 +160,7 @@ class Box(_Shaped):
     edges: Array
     edge_radius: float
     carrier: str | None = None
+    is_sphere = False
 
     @property
     def core(self) -> Array:
@@ -168,6 +176,10 @@ class Box(_Shaped):
         """Return the box moved by a vector [m]."""
         return replace(self, centre=self.centre + by)
 
+    def turned(self, R: Array) -> Box:
+        """Return the box turned about the origin."""
+        return replace(self, centre=R @ self.centre, axes=self.axes @ R.T)
+
 
 @dataclass(frozen=True)
 class Capsule(_Shaped):
@@ -178,9 +190,18 @@ class Capsule(_Shaped):
     radius: float
     carrier: str | None = None
 
+    @property
+    def is_sphere(self) -> bool:
+        """Whether the axis has no length."""
+        return not self.axis.any()
+
     def shifted(self, by: Array) -> Capsule:
         """Return the capsule moved by a vector [m]."""
         return replace(self, start=self.start + by)
+
+    def turned(self, R: Array) -> Capsule:
+        """Return the capsule turned about the origin."""
+        return replace(self, start=R @ self.start, axis=R @ self.axis)
 
 
 @dataclass(frozen=True)
@@ -205,6 +226,12 @@ class HeightField(_Shaped):
     def shifted(self, by: Array) -> HeightField:
         """Return the field moved by a vector [m]."""
         return replace(self, origin=self.origin + by[:2], heights=self.heights + by[2])
+
+    def turned(self, R: Array) -> HeightField:
+        """Return the field itself; raise ModelError for any rotation, because heights are along z."""
+        if not np.array_equal(R, np.eye(3)):
+            raise ModelError("a height field cannot be on a link that is turned against the body to which it is fixed")
+        return self
 
     @cached_property
     def coefficients(self) -> Array:

@@ -6,30 +6,34 @@ import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 
 from dynsim.engine import named, simulate
-from dynsim.errors import ScenarioError, first_few
+from dynsim.errors import ScenarioError, SimulationInterrupted, first_few
 from dynsim.planner import planned_scenario
 from dynsim.planner.dense import Dense, nearest
-from dynsim.planner.problem import Candidate, Options, Task, task
-from dynsim.planner.search import Planned, Search, Tally
-from dynsim.planner.verify import Corner, Tolerances, Verdict, Verifier
+from dynsim.planner.problem import BraceSchedule, Candidate, Options, Task, task, without_objects
+from dynsim.planner.requirements import check, check_ratings, with_requirements
+from dynsim.planner.search import SEGMENTS, Planned, Search, Tally
+from dynsim.planner.verify import Corner, Requirement, Tolerances, Verdict, Verifier
 from dynsim.record import Record
 from dynsim.scenario import Scenario, require_scenario
 from dynsim.scenario.reading import largest_magnitude
 from dynsim.scenario.schema import Payload
+from dynsim.system import interruption
 from dynsim.system.arguments import names_wrong_types
 
-# Relative difference of the heats below which two search rounds agree.
-AGREE = 0.01
+# Sets whose planned heat is at most this multiple of the least heat of their size are ranked by their runs.
+RIVAL = 1.25
+# Clearance that plans keep beyond the error of the surfaces if a link touches [m].
+SPARE = 3e-3
 # Gain k_p of plans that are not verified or have no braces [V/rad].
 K_P = 500.0
 GAP = (
-    "statistical: best local optimum of independent search rounds, and number of rounds within 1 % of it; "
+    "statistical: best local optimum of independent searches, and number of searches within 2 % of it; "
     "not a proven bound"
 )
 
@@ -48,8 +52,8 @@ class Size:
         Brace set with its references; None if no plan was found (see ``reason``).
     verdict : Verdict or None
         Result of the verification; None if the plan was not verified.
-    agreed, rounds : int
-        Number of search rounds that found this heat, and total number of rounds.
+    agreed, searches : int
+        Number of searches that found the least heat within 2 %, and total number of searches.
     reason : str
         Reason why no plan was found or why the plan was rejected; otherwise empty.
     tolerance : tuple of float or None
@@ -57,16 +61,20 @@ class Size:
         if not requested, or if the nominal run is already rejected.
     cheaper : tuple
         Brace sets with less heat that were rejected, each with the reason.
+    bound : float
+        Mean over instants of the least heat at each instant over all paths with at most this number of braces [W]. More
+        changes of braces along these paths cannot save more. NaN if changing braces were not requested.
     """
 
     count: int
     planned: Planned | None
     verdict: Verdict | None = None
     agreed: int = 0
-    rounds: int = 0
+    searches: int = 0
     reason: str = ""
     tolerance: tuple[float | None, float | None] | None = None
     cheaper: tuple[tuple[str, str], ...] = ()
+    bound: float = math.nan
 
     @property
     def braces(self) -> tuple[Candidate, ...]:
@@ -97,8 +105,14 @@ class Size:
 
     @property
     def survives(self) -> bool | None:
-        """Whether all corner cases are accepted; None if the plan was not verified."""
-        return None if self.verdict is None else self.verdict.survives
+        """Whether all corner cases are accepted and all requirements met; None if the plan was not verified."""
+        verdict = self.verdict
+        return None if verdict is None or not (verdict.corners or verdict.reason) else verdict.survives
+
+    @property
+    def requirements(self) -> tuple[Requirement, ...]:
+        """Results of the requirements of the scenario."""
+        return () if self.verdict is None else self.verdict.requirements
 
     @property
     def k_p(self) -> float:
@@ -108,7 +122,7 @@ class Size:
     @property
     def label(self) -> str:
         """Names of the brace points and surfaces, or "none"."""
-        return ", ".join(brace.label for brace in self.braces) or "none"
+        return "none" if self.planned is None else self.planned.label
 
     @property
     def variant(self) -> str:
@@ -140,9 +154,9 @@ class BracePlan:
     --------
     >>> import dynsim
     >>> scenario = dynsim.load_scenario("pressing")
-    >>> plan = dynsim.plan_braces(scenario, candidates=["link_6"], count=(0, 1), starts=1, verify=False)
+    >>> plan = dynsim.plan_braces(scenario, candidates=["link_6"], count=(0, 1), budget_s=0.0, verify=False)
     >>> plan
-    <BracePlan pressing (plain): 2 sizes, best: link_6 on floor, 19.88 W>
+    <BracePlan pressing (plain): 2 sizes, best: link_6 on floor, 19.87 W>
     >>> [(count, round(heat)) for count, heat in plan.pareto]
     [(0, 473), (1, 20)]
     """
@@ -191,7 +205,7 @@ class BracePlan:
         --------
         >>> import dynsim
         >>> scenario = dynsim.load_scenario("pressing")
-        >>> plan = dynsim.plan_braces(scenario, candidates=["link_6"], count=(1, 1), starts=1, verify=False)
+        >>> plan = dynsim.plan_braces(scenario, candidates=["link_6"], count=(1, 1), budget_s=0.0, verify=False)
         >>> plan.size(1).label
         'link_6 on floor'
         """
@@ -206,7 +220,16 @@ class BracePlan:
     @cached_property
     def table(self) -> list[dict[str, Any]]:
         """Rows with the main results for each number of braces; the keys contain the units."""
-        return [_row(self.task, size) for size in self.sizes]
+        return [
+            _row(self.task, size) | {"no_gain_over": None if (fewer := self.no_gain(size)) is None else fewer.count}
+            for size in self.sizes
+        ]
+
+    def no_gain(self, size: Size) -> Size | None:
+        """Return the best plan with fewer braces if it needs no more heat than this plan; otherwise None."""
+        fewer = [each for each in self.answered if each.count < size.count and each.survives is not False]
+        best = min(fewer, key=lambda each: each.expected, default=None)
+        return best if best is not None and best.expected <= size.expected else None
 
     @property
     def pareto(self) -> list[tuple[int, float]]:
@@ -239,7 +262,7 @@ class BracePlan:
         --------
         >>> import dynsim
         >>> scenario = dynsim.load_scenario("pressing")
-        >>> plan = dynsim.plan_braces(scenario, candidates=["link_6"], count=(1, 1), starts=1, verify=False)
+        >>> plan = dynsim.plan_braces(scenario, candidates=["link_6"], count=(1, 1), budget_s=0.0, verify=False)
         >>> plan.scenario(1)
         <Scenario pressing_plan (braces_1): serial_arm, joint_pd, 10 s, contacts link_6>
         """
@@ -270,7 +293,7 @@ class BracePlan:
         --------
         >>> import dynsim
         >>> scenario = dynsim.load_scenario("pressing")
-        >>> plan = dynsim.plan_braces(scenario, candidates=["link_6"], count=(1, 1), starts=1, verify=False)
+        >>> plan = dynsim.plan_braces(scenario, candidates=["link_6"], count=(1, 1), budget_s=0.0, verify=False)
         >>> record = plan.record(1)
         >>> record["q"].shape, round(record.summary["joule_heat_J"])
         ((2001, 10), 199)
@@ -300,12 +323,15 @@ class BracePlan:
             "pareto": [{"count": count, "heat_W": heat} for count, heat in self.pareto],
             "best": None if self.best is None else self.best.count,
             "search": {
+                "ended": tally.ended,
                 "local_solves": tally.solves,
                 "postures_drawn": tally.drawn,
                 "postures_on_path": tally.drawn_on,
                 "sets_reached": len(tally.reached),
                 "sets_not_found": sorted(" + ".join(b.label for b in braces) for braces in tally.missed),
-                "sets_refused": {" + ".join(b.label for b in braces): why for braces, why in tally.refused.items()},
+                "sets_refused": {
+                    BraceSchedule.of(braces).label.replace(", ", " + "): why for braces, why in tally.refused.items()
+                },
                 "single_braces_W": self.singles,
             },
             "sizes": [_size_json(self.task, size) for size in self.sizes],
@@ -319,7 +345,7 @@ def _row(task: Task, size: Size) -> dict[str, Any]:
         return row | {"reason": size.reason}
     dense = size.planned.dense
     nominal = size.nominal or Corner(1.0, 0.0)
-    distance, part, _ = nearest(task, size.braces, dense.times, dense.q)
+    distance, part, _ = nearest(task, dense.schedule, dense.times, dense.q)
     greatest = task.arm.tables.greatest
     share = (np.abs(dense.torques) / greatest).max()
     links = [task.arm.model.robot.links[i] for i in task.arm.links]
@@ -329,6 +355,7 @@ def _row(task: Task, size: Size) -> dict[str, Any]:
         "simulated_W": _number(nominal.heat_W),
         "electrical_energy_J": _number(nominal.electrical_energy_J),
         "joint_rate_max": _number(nominal.joint_rate_max),
+        "hand_error_m": None if size.verdict is None else _number(size.verdict.hand_m),
         "closed_least": min(nominal.closed_fraction.values(), default=None),
         "peak_torque_N_m": dense.peak_torque,
         "peak_force_N": dense.peak_force,
@@ -339,10 +366,12 @@ def _row(task: Task, size: Size) -> dict[str, Any]:
         "clearance_of": part,
         "joint_limit_distance": _number(min((dense.q - lower).min(), (upper - dense.q).min())),
         "k_p_V_per_rad": size.k_p,
-        "found_in_rounds": f"{size.agreed}/{size.rounds}",
+        "found_in_searches": f"{size.agreed}/{size.searches}",
         "survives": size.survives,
         "reason": size.reason,
     }
+    for r in size.requirements:
+        row |= {r.key: _number(r.value), f"{r.key}_margin": _number(r.margin), f"{r.key}_met": not r.reason}
     if size.tolerance is not None:
         row |= {"holds_surface_m": size.tolerance[0], "holds_friction": size.tolerance[1]}
     return row
@@ -359,7 +388,7 @@ def _size_json(task: Task, size: Size) -> dict[str, Any]:
     dense = size.planned.dense
     forces = np.array([np.interp(dense.times, dense.fine, column) for column in dense.forces.T]).T
     corners = () if size.verdict is None else size.verdict.corners
-    distance, part, when = nearest(task, size.braces, dense.times, dense.q)
+    distance, part, when = nearest(task, dense.schedule, dense.times, dense.q)
     return {
         **entry,
         "heat_W": dense.heat,
@@ -370,17 +399,23 @@ def _size_json(task: Task, size: Size) -> dict[str, Any]:
         "survives": size.survives,
         "reason": size.reason,
         "k_p_V_per_rad": size.k_p,
+        "phases": [
+            {"from_s": start, "to_s": end, "braces": [brace.label for brace in braces]}
+            for start, end, braces in task.phases(dense.schedule)
+        ],
+        "bound_W": _number(size.bound),
         "heat_at_knots_W": size.planned.local.heat,
         "peak_torque_N_m": dense.peak_torque,
         "peak_force_N": dense.peak_force,
         "clearance": {"distance_m": _number(distance), "of": part, "at_s": when},
-        "rounds": size.rounds,
-        "rounds_that_found_it": size.agreed,
+        "searches": size.searches,
+        "searches_that_found_it": size.agreed,
         "cheaper_refused": [{"braces": label, "reason": why} for label, why in size.cheaper],
         "corners": [
             {key: _number(value) if isinstance(value, float) else value for key, value in vars(corner).items()}
             for corner in corners
         ],
+        "requirements": [vars(r) | {"value": _number(r.value), "margin": _number(r.margin)} for r in size.requirements],
         **(
             {} if size.tolerance is None else {"holds": {"surface_m": size.tolerance[0], "friction": size.tolerance[1]}}
         ),
@@ -407,7 +442,9 @@ def plan_braces(
     verify: bool = True,
     explain: bool = False,
     exhaustive: bool = False,
-    starts: int = 8,
+    phases: tuple[int, int] = (1, 1),
+    starts: int = 4,
+    budget_s: float = 30.0,
     seed: int = 0,
     jobs: int = 1,
     tolerances: Tolerances | None = None,
@@ -447,8 +484,14 @@ def plan_braces(
         If True, find by bisection the largest error that rejected plans tolerate.
     exhaustive : bool, optional
         If True, try every set of candidates instead of growing sets from the best smaller sets (slow).
+    phases : tuple of int, optional
+        Minimum and maximum number of brace sets along the path, one after the other; a path there and back uses them in
+        reverse order on the way back.
     starts : int, optional
-        Number of independent search rounds.
+        Number of rounds of each search.
+    budget_s : float, optional
+        Time after which no further search starts or continues [s]; 0: one search. Searches end when the best heat of
+        each number of braces was found twice.
     seed : int, optional
         Seed of the random start postures.
     jobs : int, optional
@@ -474,72 +517,143 @@ def plan_braces(
     --------
     >>> import dynsim
     >>> scenario = dynsim.load_scenario("pressing")
-    >>> plan = dynsim.plan_braces(scenario, candidates=["link_6"], count=(0, 1), starts=1, verify=False)
+    >>> plan = dynsim.plan_braces(scenario, candidates=["link_6"], count=(0, 1), budget_s=0.0, verify=False)
     >>> plan.best.label, round(plan.best.heat, 1)
     ('link_6 on floor', 19.9)
     """
     require_scenario(scenario)
-    least, most = count
-    if not 0 <= least <= most:
-        raise ScenarioError(f"count = {least}:{most}: the minimum must not exceed the maximum, and both must be ≥ 0")
-    for key, number, smallest in (("starts", starts, 1), ("seed", seed, 0), ("jobs", jobs, 1)):
-        if number < smallest:
-            raise ScenarioError(f"{key} = {number}: must be at least {smallest}")
-    tolerances = tolerances or Tolerances()
-    positive = {"radius_m": radius_m, "peak_W_per_N_m": peak_W_per_N_m, "clearance_m": clearance_m, "min_N": min_N}
-    for key, value in (positive | {"shift_m": max(map(abs, tolerances.shift_m), default=0.0)}).items():
-        largest = largest_magnitude(key)
-        if value is not None and not 0.0 <= value <= largest:
-            raise ScenarioError(f"{key} = {value}: must be between 0 and {largest:g}")
-    if any(not 0.0 < share <= 1.0 for share in along):
-        raise ScenarioError(f"along = {list(along)}: must be fractions of the link length, above 0 and at most 1")
     options = Options(
-        tuple(candidates), tuple(along), radius_m, (least, most), tuple(surfaces), peak_W_per_N_m, clearance_m, min_N,
-        starts, seed, exhaustive,
+        tuple(candidates), tuple(along), radius_m, count, tuple(surfaces), peak_W_per_N_m, clearance_m, min_N, starts,
+        seed, budget_s, exhaustive, phases,
     )  # fmt: skip
+    return plan_with(scenario, options, tolerances or Tolerances(), verify, explain, jobs, tell)
+
+
+def plan_with(
+    scenario: Scenario,
+    options: Options,
+    tolerances: Tolerances,
+    verify: bool = True,
+    explain: bool = False,
+    jobs: int = 1,
+    tell: Tell | None = None,
+) -> BracePlan:
+    """Return :func:`plan_braces` with the arguments as options."""
+    check_arguments(options, tolerances, jobs)
     tell = tell or (lambda text, share: None)
     with named(scenario):
-        problem = task(scenario, options)
-        if problem.without_radius and most > 0:
-            warnings.warn(
-                f"plan: candidates {', '.join(problem.without_radius)} have radius 0 (links from URDF have no radius, "
-                "even with <visual>); braces would put the joint axis on the surface; set --radius, or list "
-                "contacts.points with radius_m in --candidates",
-                stacklevel=2,
-            )
-        if unplanned := [name for name, load in scenario.config.loads.items() if not isinstance(load, Payload)]:
-            warnings.warn(
-                f"plan: loads.{first_few(unplanned)}: ignored by the planner, which supports only payloads; simulated "
-                "runs include these loads and reject plans whose heat they raise; define a constant weight as "
-                "`type: payload`",
-                stacklevel=2,
-            )
-        if not np.any(problem.arm.model.robot.gravity):
-            raise ScenarioError("plant.gravity_m_s2 = [0, 0, 0]: must not be zero; braces are useless without gravity")
-        search = Search(problem, tell)
-        ranked = search.run()
-        sizes = [_answered(search, size, ranked[size]) for size in range(least, most + 1)]
-        if verify:
-            sizes = _verified(problem, search, sizes, ranked, tolerances, jobs, explain, tell)
-    known = search.single_heats
-    singles = {brace.label: known[brace,] for brace in problem.candidates if (brace,) in known}
-    heats = {size.count: _ranked(size, ranked[size.count]) for size in sizes}
-    return BracePlan(problem, tuple(sizes), search.tally, singles, heats, tolerances)
+        return answered(searched(scenario, options, tell), tolerances, verify, explain, jobs, tell)
+
+
+def check_arguments(options: Options, tolerances: Tolerances, jobs: int) -> None:
+    """Raise ScenarioError if an option of the planner is out of range."""
+    least, most = options.count
+    if not 0 <= least <= most:
+        raise ScenarioError(f"count = {least}:{most}: the minimum must not exceed the maximum, and both must be ≥ 0")
+    fewest, largest = options.phases
+    if not 1 <= fewest <= largest <= SEGMENTS:
+        raise ScenarioError(f"phases = {fewest}:{largest}: must be 1 to {SEGMENTS}, with minimum ≤ maximum")
+    for key, number, smallest in (("starts", options.starts, 1), ("seed", options.seed, 0), ("jobs", jobs, 1)):
+        if number < smallest:
+            raise ScenarioError(f"{key} = {number}: must be at least {smallest}")
+    positive = {
+        "radius_m": options.radius_m, "peak_W_per_N_m": options.peak, "clearance_m": options.clearance_m,
+        "min_N": options.min_N, "budget_s": options.budget_s, "shift_m": tolerances.most_shift,
+    }  # fmt: skip
+    for key, value in positive.items():
+        limit = largest_magnitude(key)
+        if value is not None and not 0.0 <= value <= limit:
+            raise ScenarioError(f"{key} = {value}: must be between 0 and {limit:g}")
+    if any(not 0.0 < share <= 1.0 for share in options.along):
+        raise ScenarioError(
+            f"along = {list(options.along)}: must be fractions of the link length, above 0 and at most 1"
+        )
+
+
+@dataclass(frozen=True)
+class Searched:
+    """Search of one problem, and the best plans of each number of braces, sorted by heat."""
+
+    search: Search
+    ranked: dict[int, list[Planned]]
+
+    def add(self, other: Searched) -> None:
+        """Continue the plans of a similar problem, from their postures, and keep those with less heat."""
+        for count, plans in self.ranked.items():
+            for plan in map(self.search.continued, other.ranked[count]):
+                if plan is None:
+                    continue
+                others = [p for p in plans if p.dense.schedule != plan.dense.schedule]
+                if all(plan.heat < p.heat for p in plans if p.dense.schedule == plan.dense.schedule):
+                    plans[:] = sorted([*others, plan], key=lambda p: p.heat)
+
+
+def searched(scenario: Scenario, options: Options, tell: Tell) -> Searched:
+    """Search the plans of a scenario, see :func:`plan_braces`."""
+    problem = task(scenario, options)
+    if problem.without_radius and options.count[1] > 0:
+        warnings.warn(
+            f"plan: candidates {', '.join(problem.without_radius)} have radius 0 (links from URDF have no radius, "
+            "even with <visual>); braces would put the joint axis on the surface; set --radius, or list "
+            "contacts.points with radius_m in --candidates",
+            stacklevel=3,
+        )
+    if objects := tuple(scenario.config.objects):
+        warnings.warn(
+            f"plan: objects.{first_few(objects)}: not in plan.yaml and not in the simulated runs, because planned "
+            "voltages require a motor on every joint; for the planner, objects are obstacles at their initial pose "
+            "(with contacts.between, those that it lists)",
+            stacklevel=3,
+        )
+    loads = without_objects(scenario).config.loads
+    if unplanned := [name for name, load in loads.items() if not isinstance(load, Payload)]:
+        warnings.warn(
+            f"plan: loads.{first_few(unplanned)}: ignored by the planner, which supports only payloads; simulated "
+            "runs include these loads and reject plans whose heat they raise; define a constant weight as "
+            "`type: payload`",
+            stacklevel=3,
+        )
+    if not np.any(problem.arm.model.robot.gravity):
+        raise ScenarioError("plant.gravity_m_s2 = [0, 0, 0]: must not be zero; braces are useless without gravity")
+    check_ratings(problem)
+    search = Search(problem, tell)
+    return Searched(search, search.run())
+
+
+def answered(known: Searched, tolerances: Tolerances, verify: bool, explain: bool, jobs: int, tell: Tell) -> BracePlan:
+    """Choose the plan of each number of braces, see :func:`plan_braces`."""
+    search, ranked = known.search, known.ranked
+    problem, (least, most) = search.task, search.task.options.count
+    tolerances = with_requirements(tolerances, problem.scenario.config.requirements)
+    sizes = [_answered(search, size, ranked[size]) for size in range(least, most + 1)]
+    verify = verify and search.tally.ended != "interrupted"
+    if verify or problem.scenario.config.requirements is not None:
+        try:
+            sizes = _verified(problem, search, sizes, ranked, tolerances, jobs if verify else 0, explain, tell)
+        except (KeyboardInterrupt, SimulationInterrupted):
+            # The plans are kept without their runs.
+            interruption.answered()
+            search.tally.ended = "interrupted"
+    heats = search.single_heats
+    singles = {brace.label: heats[brace,] for brace in problem.candidates if (brace,) in heats}
+    sets = {size.count: _ranked(size, ranked[size.count]) for size in sizes}
+    return BracePlan(problem, tuple(sizes), search.tally, singles, sets, tolerances)
 
 
 def _ranked(size: Size, planned: Sequence[Planned]) -> list[tuple[str, float]]:
     """Return the sets with the same number of braces and their heat, starting with the chosen set."""
-    names = [(", ".join(b.label for b in plan.braces) or "none", plan.heat) for plan in planned]
+    names = [(plan.label, plan.heat) for plan in planned]
     return sorted(names, key=lambda item: (item[0] != size.label, item[1]))
 
 
 def _answered(search: Search, count: int, ranked: Sequence[Planned]) -> Size:
     """Return the best plan for a number of braces before verification, or the reason why there is no plan."""
-    heats = search.tally.heats.get(count, [])
+    tally = search.tally
+    agreed, searches = tally.agreed(count), len(tally.heats.get(count, []))
     if ranked:
-        best = min([*heats, search.least_heat.get(count, math.inf)])
-        return Size(count, ranked[0], None, sum(heat <= best * (1.0 + AGREE) for heat in heats), len(heats))
-    return Size(count, None, reason=_failure(search, count), rounds=search.task.options.starts)
+        agreed = 0 if ranked[0].dense.schedule.borders else agreed
+        return Size(count, ranked[0], None, agreed, searches, bound=search.bounds.get(count, math.nan))
+    return Size(count, None, reason=_failure(search, count), searches=searches)
 
 
 def _failure(search: Search, count: int) -> str:
@@ -555,6 +669,8 @@ def _failure(search: Search, count: int) -> str:
     refused = [why for braces, why in tally.refused.items() if len(braces) == count]
     if refused:
         return refused[0]
+    if options.phases[0] > 1:
+        return "no plan with changing braces was found; try --phases 1:2, other --candidates or a slower path"
     points = len({candidate.location for candidate in search.task.candidates})
     if count > points:
         return f"only {points} candidates exist"
@@ -578,20 +694,42 @@ def _verified(
     explain: bool,
     tell: Tell,
 ) -> list[Size]:
-    """Verify the best set for each number of braces; if it is rejected, choose the next set that survives."""
-    verifier = Verifier(problem, tolerances, jobs)
+    """Choose the set whose run needs the least heat for each number of braces, among the sets that survive.
+
+    If a set is rejected because a link touches, it is planned again with the clearance that the errors require.
+    Without ``jobs``, only the requirements of the scenario are checked that need no simulation.
+    """
+    require = partial(check, problem, tolerances.heat)
+    verifier = Verifier(problem, tolerances, jobs, require)
     open_ = {size.count: list(ranked[size.count]) for size in sizes if size.planned is not None}
+    tell("verifying", 0.0)
+    rival = RIVAL if jobs else 0.0
+    rivals = [
+        (count, search.finest(plan))
+        for count, plans in open_.items()
+        for plan in plans
+        if plan.heat <= rival * plans[0].heat
+    ]
+    open_ = {count: [plan for plan in plans if plan.heat > rival * plans[0].heat] for count, plans in open_.items()}
+    nominal = verifier.nominal([(plan.braces, plan.dense) for _, plan in rivals])
+    # Runs that ended early come last.
+    order = sorted(zip(rivals, nominal, strict=True), key=lambda run: (np.isnan(run[1].heat_W), run[1].heat_W))
+    for (count, plan), _ in reversed(order):
+        open_[count].insert(0, plan)
     verdicts: dict[int, list[tuple[Planned, Verdict]]] = {count: [] for count in open_}
     turn = 0
     while open_:
-        tell("verifying", min(turn / 3.0, 0.95))
+        tell("verifying", min((turn + 1) / 4.0, 0.95))
         turn += 1
-        batch = [(count, waiting[0]) for count, waiting in open_.items()]
-        judged = verifier.verify([(planned.braces, planned.dense) for _, planned in batch])
+        batch = [(count, search.finest(waiting.pop(0))) for count, waiting in open_.items()]
+        made = [(planned.braces, planned.dense) for _, planned in batch]
+        judged = verifier.verify(made) if jobs else [Verdict(K_P, (), require(*each, K_P, ())) for each in made]
         for (count, planned), verdict in zip(batch, judged, strict=True):
             verdicts[count].append((planned, verdict))
-            open_[count].pop(0)
-            if verdict.survives or not open_[count] or count == 0:
+            if verdict.kind == "touch":
+                again = search.clearer(planned, tolerances.most_shift + SPARE)
+                open_[count][:0] = [] if again is None else [again]
+            if not verdict.reason or not open_[count]:
                 del open_[count]
     answered = []
     for size in sizes:
@@ -599,11 +737,11 @@ def _verified(
             answered.append(size)
             continue
         tried = verdicts[size.count]
-        chosen = next((k for k, (_, verdict) in enumerate(tried) if verdict.survives), 0)
+        chosen = next((k for k, (_, verdict) in enumerate(tried) if not verdict.reason), 0)
         planned, verdict = tried[chosen]
-        cheaper = tuple((", ".join(b.label for b in p.braces), v.reason) for p, v in tried[:chosen])
+        cheaper = tuple((p.label, v.reason) for p, v in tried[:chosen] if p.dense.schedule != planned.dense.schedule)
         tolerance = None
-        if explain and not verdict.survives and verdict.sound:
+        if explain and verdict.reason and verdict.sound:
             tell("bisecting", 0.95)
             tolerance = verifier.tolerance(planned.braces, planned.dense, verdict.k_p)
         answered.append(

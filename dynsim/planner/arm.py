@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, get_type_hints
 
@@ -18,8 +18,9 @@ from dynsim.jit.kernel import integers, reals
 from dynsim.model.description import WORLD, Array, Robot
 from dynsim.model.drives import Motor
 from dynsim.model.surfaces import Surface, shape_arrays
-from dynsim.planner import compiled
-from dynsim.planner.compiled import Arm, Course, Points, Work
+from dynsim.planner.compiled import retract, statics
+from dynsim.planner.compiled import solve as local
+from dynsim.planner.compiled.tables import Arm, Course, Points, Work
 
 # Distance that plans keep from joint limits [rad or m], and its maximum as a fraction of the joint range. It is a
 # margin for low gains.
@@ -59,6 +60,12 @@ class MovingArm:
         return len(self.links)
 
     @property
+    def motors(self) -> list[Motor]:
+        """Motors of the moving joints."""
+        known = {motor.joint: motor for motor in self.model.robot.motors}
+        return [motor for joint in self.joints if isinstance(motor := known[joint], Motor)]
+
+    @property
     def joints(self) -> tuple[str, ...]:
         """Names of the moving joints."""
         return tuple(self.model.robot.links[i].joint for i in self.links)
@@ -69,6 +76,11 @@ class MovingArm:
         if link not in self.links:
             raise ModelError(f"{body} is not moved by any joint and cannot be braced; remove it from the candidates")
         return self.links.index(link), on_link
+
+    def inertia(self, q: Array) -> Array:
+        """Return the inertia of the joints with their rotors, J_m + M(q), shape (n, n) [kg m²; kg m, kg]."""
+        whole = self.model.mass_matrix(self.coordinates(q[None])[0]) + np.diag(self.model.armature)
+        return whole[np.ix_(self.links, self.links)]
 
     def coordinates(self, q: Array) -> Array:
         """Return all coordinates of the robot, shape (T, nq), for joint positions of shape (T, n) [rad or m]."""
@@ -155,13 +167,14 @@ def with_pairs(arm: MovingArm, described: Robot, pairs: Sequence[tuple[Solid, So
     model, index, rows, names = Model(described), list[list[int]](), list[list[Array]](), list[tuple[str, str]]()
     joint = {arm.model.robot.links[i].name: k for k, i in enumerate(arm.links)}
     for pair in pairs:
-        bodies, solids = [solid.carrier or WORLD for solid in pair], [solid_row(solid) for solid in pair]
+        bodies = [solid.carrier or described.root or WORLD for solid in pair]
+        solids = [solid_row(solid) for solid in pair]
         joints = [joint.get(body, -1) for body in bodies]
         if max(joints) < 0:
             continue
-        for body, row, k in zip(bodies, solids, joints, strict=True):
-            if k < 0 and body != WORLD:
-                R, p = model.body_pose(body, described.initial)
+        for solid, row, k in zip(pair, solids, joints, strict=True):
+            if k < 0 and solid.carrier is not None:
+                R, p = model.body_pose(solid.carrier, described.initial)
                 row[:9] = (R @ row[:9].reshape(3, 3)).ravel()
                 row[9:12] = p + R @ row[9:12]
         index.append(joints)
@@ -219,6 +232,8 @@ class Problem:
         Minimum normal force of a brace [N].
     peak : float
         Cost of the maximum torque of revolute joints [W/(N m)].
+    inertia : callable or None
+        Function that returns the inertia J_m + M of a posture, shape (n, n); None: without inertia.
     """
 
     arm: Arm
@@ -227,24 +242,35 @@ class Problem:
     work: Work
     min_force: float
     peak: float = 0.0
+    inertia: Callable[[Array], Array] | None = None
 
     def evaluate(self, Q: Array, F: Array) -> None:
         """Compute torques, geometry and derivatives in the workspace."""
-        compiled.statics(self.arm, self.points, self.course, self.work, Q, F, self.min_force, False)
+        statics.statics(self.arm, self.points, self.course, self.work, Q, F, self.min_force, False)
 
     def forces(self, Q: Array) -> Array:
         """Return the normal forces of least heat, shape (E, c) [N]; the workspace contains the resulting torques."""
         F = np.zeros((len(self.course.knot), len(self.points.friction)))
-        compiled.statics(self.arm, self.points, self.course, self.work, Q, F, self.min_force, True)
+        statics.statics(self.arm, self.points, self.course, self.work, Q, F, self.min_force, True)
         return F
+
+    def freeze_inertia(self, Q: Array) -> None:
+        """Write the inertia of the postures between the knots to the workspace; solutions consider it as constant."""
+        course, work = self.course, self.work
+        if self.inertia is None or len(Q) == 1:
+            return
+        for e, knot in enumerate(course.knot):
+            again = e > 0 and knot == course.knot[e - 1]
+            work.inertia[e] = work.inertia[e - 1] if again else self.inertia(course.blend[e] @ Q)
+        work.jolt[:] = np.einsum("e,eij,j,ejk->ik", course.share, work.inertia, self.arm.heat, work.inertia)
 
     def heat(self) -> float:
         """Return the mean heat of the torques in the workspace [W]."""
         return float(self.course.share @ (self.work.torque**2 @ self.arm.heat))
 
-    def retract(self, Q: Array, steps: int = 12, tolerance: float = compiled.ON) -> float:
+    def retract(self, Q: Array, steps: int = 12, tolerance: float = retract.ON) -> float:
         """Project postures in place, so that the hand is on its path and the braces touch; return the residual [m]."""
-        return float(compiled.project(self.arm, self.points, self.course, self.work, Q, steps, tolerance))
+        return float(retract.project(self.arm, self.points, self.course, self.work, Q, steps, tolerance))
 
 
 @dataclass(frozen=True)
@@ -278,5 +304,6 @@ def solve(problem: Problem, start: Array, turns: int = 40, tolerance: float = 1e
     """Minimise the cost from start postures, (K, n); return None if they cannot be projected onto path and surfaces."""
     Q, F = reals(start), np.zeros((len(problem.course.knot), len(problem.points.friction)))
     tables = problem.arm, problem.points, problem.course, problem.work
-    cost, heat, steps = compiled.solve(*tables, Q, F, problem.min_force, problem.peak, turns, tolerance)
+    problem.freeze_inertia(Q)
+    cost, heat, steps = local.solve(*tables, Q, F, problem.min_force, problem.peak, turns, tolerance)
     return None if np.isnan(cost) else Local(Q, F, heat, cost, steps)

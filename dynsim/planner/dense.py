@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+from dynsim.compile.bracing import RAMP, PressingBrace
 from dynsim.compile.clearance import gaps
 from dynsim.compile.references.inverse_kinematics import pressing
 from dynsim.compile.references.splines import clamped_cubic, quintic_rates
@@ -15,17 +18,12 @@ from dynsim.dynamics.contact.braces import statics as kb
 from dynsim.errors import ModelError
 from dynsim.jit.kernel import reals
 from dynsim.model.description import Array, Contact
-from dynsim.planner.arm import axis_lines, axis_points
-from dynsim.planner.compiled import ON
-from dynsim.planner.problem import FINAL_SLIP_SCALE, Candidate, Clear, Task, key
+from dynsim.planner.compiled.retract import ON
+from dynsim.planner.problem import FINAL_SLIP_SCALE, LIFTING, BraceSchedule, BraceSet, Clear, Task, contact_names
 from dynsim.scenario import build
 
 # Minimum number of instants per pass along the path (at least two per knot), and maximum time between instants [s].
 INSTANTS, SPACING = 50, 0.1
-# Hand speed below which the hand counts as at rest [m/s].
-REST_SPEED = 1e-2
-# Number of instants at which links are checked for contact with each other.
-CHECKS = 11
 
 
 @dataclass(frozen=True)
@@ -52,6 +50,8 @@ class Dense:
         Maximum torque of revolute joints [N m]; None without such joints.
     peak_force : float or None
         Maximum force of prismatic joints [N]; None without such joints.
+    schedule : BraceSchedule
+        Braces of each phase.
     """
 
     times: Array
@@ -63,9 +63,19 @@ class Dense:
     heat: float
     peak_torque: float | None
     peak_force: float | None
+    schedule: BraceSchedule
+
+    def acting(self, t: int) -> NDArray[np.int64]:
+        """Return the indices of the braces that may press at waypoint ``t``."""
+        forces = self.forces[self.sample(t)]
+        return np.flatnonzero(forces > 0.0) if self.schedule.borders else np.arange(len(forces))
+
+    def sample(self, t: int) -> int:
+        """Return the index of the statics at waypoint ``t``."""
+        return min(round(self.times[t] / self.fine[1]), len(self.fine) - 1)
 
 
-def references(task: Task, braces: tuple[Candidate, ...], knots: Array, Q: Array, factor: int = 1) -> Dense | str:
+def references(task: Task, braces: BraceSet | BraceSchedule, knots: Array, Q: Array, factor: int = 1) -> Dense | str:
     """Compute dense references through postures at knots.
 
     The references are a spline through the knots that is projected onto path and surfaces at every instant. Their heat
@@ -76,7 +86,7 @@ def references(task: Task, braces: tuple[Candidate, ...], knots: Array, Q: Array
     ----------
     task : Task
         Planning problem.
-    braces : tuple of Candidate
+    braces : tuple of Candidate or BraceSchedule
         Braces of the plan.
     knots : (K,) ndarray
         Times of the knots [s].
@@ -90,22 +100,28 @@ def references(task: Task, braces: tuple[Candidate, ...], knots: Array, Q: Array
     Dense or str
         References with their statics, or the reason why they do not exist.
     """
-    span = task.span
+    span, schedule = task.span, BraceSchedule.of(braces)
     count = factor * max(INSTANTS, int(np.ceil(span / SPACING)), 2 * (len(knots) - 1))
     half = np.linspace(0.0, span, count + 1)
-    start, end = (np.linalg.norm(np.diff(task.targets(np.array(pair)), axis=0)) for pair in _ends(task.duration))
-    rests = bool(max(start, end) / 1e-4 < REST_SPEED)
     if task.kind == "closed":
         spline = CubicSpline(np.append(knots, span), np.vstack([Q, Q[:1]]), bc_type="periodic")
-    elif rests or task.kind == "there_and_back":
+    elif task.rests or task.kind == "there_and_back":
         spline = CubicSpline(knots, Q, bc_type="clamped")
     else:
         spline = CubicSpline(knots, Q, bc_type="not-a-knot")
     q = reals(spline(half))
-    single = task.problem(braces, 1)
+    single = task.problem(schedule, 1)
+    idle, near = np.maximum(task.idle_times(schedule, half) - RAMP, 0.0), LIFTING * span
     for k, target in enumerate(task.hand_targets(half)):
         single.course.target[0] = target
         row = q[k : k + 1]
+        if idle[k].any():
+            # Braces rise and land without a jump of their velocity.
+            rise = np.minimum(idle[k] / near, 1.0)
+            single.evaluate(row, np.zeros((1, len(rise))))
+            single.course.apart[0] = rise**2 * (3.0 - 2.0 * rise) * np.maximum(single.work.gap[0, : len(rise)], 0.0)
+            single.course.apart[0, rise == 1.0] = task.options.clearance_m
+        single.course.guided[0] = idle[k] < near
         if (left := single.retract(row, 20, 0.1 * ON)) > ON:
             return (
                 f"at t = {half[k]:.3g} s, between two knots, hand and braces cannot be kept on path and surfaces "
@@ -114,26 +130,21 @@ def references(task: Task, braces: tuple[Candidate, ...], knots: Array, Q: Array
     times = half
     if task.kind == "there_and_back":
         times, q = np.append(half, span + half[1:]), np.vstack([q, q[-2::-1]])
-    return statics(task, braces, times, q, rests)
+    return statics(task, schedule, times, q, task.rests)
 
 
-def _ends(duration: float) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return the first and last 0.1 ms of a path [s]."""
-    return (0.0, 1e-4), (duration - 1e-4, duration)
-
-
-def contacts(task: Task, braces: tuple[Candidate, ...]) -> Mapping[str, Contact]:
+def contacts(task: Task, braces: BraceSet) -> Mapping[str, Contact]:
     """Return the braces as named contacts."""
     surfaces = build.surfaces(task.scenario)
     return {
-        b.name: Contact(
-            b.name, b.body, np.array(b.point_m), surfaces[b.surface], b.surface, friction=task.friction, radius=b.radius
+        name: Contact(
+            name, b.body, np.array(b.point_m), surfaces[b.surface], b.surface, friction=task.friction, radius=b.radius
         )
-        for b in braces
+        for name, b in zip(contact_names(braces), braces, strict=True)
     }
 
 
-def statics(task: Task, braces: tuple[Candidate, ...], times: Array, q: Array, rests: bool) -> Dense | str:
+def statics(task: Task, schedule: BraceSchedule, times: Array, q: Array, rests: bool) -> Dense | str:
     """Compute the statics of references; see :func:`references`."""
     arm, model = task.arm, task.arm.model
     spacing = getattr(task.scenario.controller, "knot_spacing_s", 0.02)
@@ -146,14 +157,14 @@ def statics(task: Task, braces: tuple[Candidate, ...], times: Array, q: Array, r
         )
     else:
         rates, accelerations = quintic_rates(float(fine[1]), whole)
-    placed: dict[str, tuple[Contact, float | None]] = {
-        name: (contact, None) for name, contact in contacts(task, braces).items()
-    }
+    during = [task.intervals(schedule, b) if schedule.borders else None for b in schedule.braces]
+    named = contacts(task, schedule.braces).items()
+    placed = {name: PressingBrace(contact, None, times) for (name, contact), times in zip(named, during, strict=True)}
     try:
-        planner, tables = pressing(model, fine, whole, rates, placed, task.options.min_N, FINAL_SLIP_SCALE)
+        planner, tables, shares = pressing(model, fine, whole, rates, placed, task.options.min_N, FINAL_SLIP_SCALE)
     except ModelError as error:
         return f"the postures jump between knots: {error}"
-    torques, forces, solved = planner.least_heat(whole, rates, accelerations, tables)
+    torques, forces, solved = planner.least_heat(whole, rates, accelerations, tables, shares)
     if solved < len(fine):
         return f"at t = {fine[solved]:.3g} s the motion needs forces beyond the friction cones or the motor limits"
     weights = planner.arrays.motors[:, kb.HEAT]
@@ -161,21 +172,22 @@ def statics(task: Task, braces: tuple[Candidate, ...], times: Array, q: Array, r
     moved = torques[:, list(arm.links)]
     peaks = [np.abs(moved[:, arm.tables.prismatic == kind]) for kind in (0, 1)]
     peak_torque, peak_force = (float(peak.max()) if peak.size else None for peak in peaks)
-    return Dense(times, q, rests, fine, moved, forces, heat, peak_torque, peak_force)
+    return Dense(times, q, rests, fine, moved, forces, heat, peak_torque, peak_force, schedule)
 
 
 def nearest(
-    task: Task, braces: tuple[Candidate, ...], times: Array, q: Array, shift: Array | None = None
+    task: Task, braces: BraceSet | BraceSchedule, times: Array, q: Array, shift: Array | None = None
 ) -> tuple[float, str, float]:
     """Find the smallest distance of an unbraced point from a surface, or of two solids.
 
-    A link that is braced at both ends may rest on the surface.
+    A link that is braced at both ends may rest on the surface. Braces may be close to their surfaces before and after
+    their phases.
 
     Parameters
     ----------
     task : Task
         Planning problem.
-    braces : tuple of Candidate
+    braces : tuple of Candidate or BraceSchedule
         Braces of the plan.
     times : (T,) ndarray
         Times [s].
@@ -198,69 +210,28 @@ def nearest(
     surfaces = build.surfaces(task.scenario)
     if shift is not None and shift.any():
         surfaces = {name: surface.shifted(shift) for name, surface in surfaces.items()}
-    braced = {key(b.joint, arm.surfaces.index(b.surface), b.on_joint) for b in braces}
-    leaning = {(joint, surface) for joint, surface, _ in braced}
-    whole = arm.coordinates(q)
-    for index, name in enumerate(arm.surfaces):
-        free: dict[str, list[Clear]] = {}
-        for point in task.free(braces).values():
+    schedule = BraceSchedule.of(braces)
+    whole, near = arm.coordinates(q), LIFTING * task.span + RAMP
+    points = list(task.free(schedule.braces).values())
+    for phase, (index, name) in product(task.phases(schedule), enumerate(arm.surfaces)):
+        leaning = {(b.joint, arm.surfaces.index(b.surface)) for b in phase.braces}
+        during = np.flatnonzero((times >= phase.start) & (times <= phase.end))
+        free: dict[str, list[tuple[Clear, Array]]] = {}
+        for point in points:
             children = [(k, index) for k in range(arm.n) if arm.tables.parent[k] == point.joint]
             on_link = np.any(point.point) and (point.joint, index) in leaning and leaning.intersection(children)
             if point.surface == index and not on_link:
-                free.setdefault(robot.links[arm.links[point.joint]].name, []).append(point)
-        targets = {body: [(surfaces[name], point.point) for point in points] for body, points in free.items()}
-        for link, distances in gaps(robot, whole, targets):
-            for point, distance in zip(free[link.name], distances, strict=True):
-                k = int(np.argmin(distance))
-                if distance[k] - point.radius < best[0]:
-                    best = (float(distance[k] - point.radius), point.label, float(times[k]))
+                free.setdefault(robot.links[arm.links[point.joint]].name, []).append((point, np.zeros(len(during))))
+        for b in schedule.braces:
+            if b.surface == name and b not in phase.braces:
+                lifting = [(times >= t - near) & (times <= u + near) for t, u in task.intervals(schedule, b)]
+                ignored = np.where(np.any(lifting, axis=0), np.inf, 0.0)[during]
+                lifted = Clear(b.joint, b.on_joint, b.radius, 0.0, b.label, index)
+                free.setdefault(robot.links[arm.links[b.joint]].name, []).append((lifted, ignored))
+        targets = {body: [(surfaces[name], point.point) for point, _ in points] for body, points in free.items()}
+        for link, distances in gaps(robot, whole[during], targets):
+            for (point, ignored), distance in zip(free[link.name], distances, strict=True):
+                k = int(np.argmin(distance + ignored))
+                if distance[k] + ignored[k] - point.radius < best[0]:
+                    best = (float(distance[k] - point.radius), point.label, float(times[during[k]]))
     return best
-
-
-def touching_links(task: Task, times: Array, q: Array) -> str:
-    """Check whether pairs of solids touch each other; without pairs of links, whether links that are not neighbours do.
-
-    The latter is checked at some instants of the first pass. Returns a text with the links and the time; empty if no
-    links touch.
-    """
-    distance, bodies, time = task.nearest_pair(times, q)
-    if distance < 0.0:
-        return f"{bodies} touch each other at t = {time:.3g} s"
-    if task.self_contact:
-        return ""
-    chosen = np.unique(np.linspace(0, np.searchsorted(times, task.span), CHECKS).astype(int))
-    arm, links = task.arm, task.arm.model.robot.links
-    segments = axis_points(arm, (1.0,))
-    if len(segments) < 3:
-        return ""
-    lines = np.array([axis_lines(arm, row) for row in q[chosen]])
-    a, b = np.triu_indices(len(segments), 1)
-    first, second = lines[:, a], lines[:, b]
-    # Neighbours share a joint, possibly across a link of zero length.
-    apart = np.linalg.norm(first[:, :, :, None] - second[:, :, None], axis=-1).min(axis=(0, 2, 3)) > 1e-9
-    joints, radii = (np.array([segment[i] for segment in segments]) for i in (0, 2))
-    parents = arm.tables.parent[joints]
-    apart &= (parents[b] != joints[a]) & (parents[a] != joints[b])
-    touching = apart & (_segment_distances(first, second) < radii[a] + radii[b])
-    if not touching.any():
-        return ""
-    t = int(touching.any(axis=1).argmax())
-    pair = int(touching[t].argmax())
-    names = [links[arm.links[joints[side[pair]]]].name for side in (a, b)]
-    return f"{names[0]} and {names[1]} touch each other at t = {times[chosen[t]]:.3g} s"
-
-
-def _segment_distances(first: Array, second: Array) -> Array:
-    """Return the distances [m] between pairs of segments, (…, 2, 3) (Ericson, Real-Time Collision Detection, 5.1.9)."""
-    u, v, w = (
-        first[..., 1, :] - first[..., 0, :],
-        second[..., 1, :] - second[..., 0, :],
-        first[..., 0, :] - second[..., 0, :],
-    )
-    A, e, f, g, h = (np.sum(x * y, axis=-1) for x, y in ((u, u), (v, v), (v, w), (u, w), (u, v)))
-    den = A * e - h * h
-    oblique = den > 1e-12 * A * e
-    s = np.where(oblique, np.clip((h * f - g * e) / np.where(oblique, den, 1.0), 0.0, 1.0), 0.0)
-    t = (h * s + f) / e
-    s = np.where(t < 0.0, np.clip(-g / A, 0.0, 1.0), np.where(t > 1.0, np.clip((h - g) / A, 0.0, 1.0), s))
-    return np.asarray(np.linalg.norm(w + u * s[..., None] - v * np.clip(t, 0.0, 1.0)[..., None], axis=-1))

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from dynsim.draw.figures import style
 from dynsim.draw.figures.look import Look
-from dynsim.draw.figures.plan import CornerRun, PlanPicture, Pose, draw_plan_figures
+from dynsim.draw.figures.plan import CornerRun, PlanPicture, Pose, VariedPlans, draw_plan_figures
 from dynsim.draw.figures.style import spaced
 from dynsim.draw.geometry.meshes import Meshes
 from dynsim.draw.geometry.projection import UP, Array, Projection
@@ -17,9 +21,11 @@ from dynsim.errors import ModelError, SimulationStopped
 from dynsim.planner.answer import BracePlan, Size
 from dynsim.planner.arm import axis_lines
 from dynsim.planner.problem import Task
+from dynsim.planner.vary import Variation
 from dynsim.planner.verify import Corner, Tolerances
 from dynsim.record import Record
 from dynsim.scenario import build
+from dynsim.scenario.quantities import quantity
 
 # Number of instants of the first pass at which the arm is drawn.
 POSES = 3
@@ -29,15 +35,32 @@ GRID, BEYOND = 240, 0.3
 INSIDE, CLOSED = 1e-3, 1e-6
 
 
-def draw_plan(plan: BracePlan, folder: Path, kind: str, look: Look | None = None) -> None:
+def draw_plan(
+    plan: BracePlan, folder: Path, kind: str, look: Look | None = None, variation: Variation | None = None
+) -> None:
     """Draw the figures to ``figures/``, and write ``view.html``."""
     shown = _records(plan)
     best = plan.best
-    draw_plan_figures(picture(plan, shown.get(best.variant) if best else None), folder / "figures", kind, look)
+    drawn = picture(plan, shown.get(best.variant) if best else None)
+    if variation is not None:
+        drawn = replace(drawn, varied=_varied(variation))
+    draw_plan_figures(drawn, folder / "figures", kind, look)
     from dynsim.draw.page import content
 
     if shown:
         content.write(shown, folder / "view.html")
+
+
+def _varied(variation: Variation) -> VariedPlans:
+    """Return the data for the figure of plans for several values."""
+    first, *others = variation.axes
+    series: dict[str, list[Mapping[str, Any]]] = {}
+    for row in variation.table:
+        known = [(quantity(axis.key, variation.scenario).fitted(axis.values), row[axis.key]) for axis in others]
+        label = ", ".join(f"{q.name} {style.number(q.scale * value)} {q.unit}".strip() for q, value in known)
+        series.setdefault(label, []).append(row)
+    axis = quantity(first.key, variation.scenario).fitted(first.values)
+    return VariedPlans(first.key, axis, series, variation.limits)
 
 
 def _records(plan: BracePlan) -> dict[str, Record]:
@@ -88,10 +111,11 @@ def picture(plan: BracePlan, record: Record | None = None) -> PlanPicture:
         survives={count: size.survives for count, size in answered.items()},
         singles=dict(sorted(plan.singles.items(), key=lambda single: along_arm[single[0]])),
         corners={
-            count: [_corner(c, size.heat, plan.tolerances) for c in size.verdict.corners]
+            count: [_corner(c, size.expected, plan.tolerances) for c in size.verdict.corners]
             for count, size in answered.items()
             if size.verdict is not None
         },
+        simulated={count: size.nominal.heat_W for count, size in answered.items() if size.nominal is not None},
     )
 
 
@@ -114,16 +138,12 @@ def _base(record: Record | None, view: Projection) -> list[Array]:
     return [view.project(corners) for corners, _ in solids]
 
 
-def _corner(corner: Corner, planned: float, tolerances: Tolerances) -> CornerRun:
-    """Return a run with the limits that it must meet."""
-    errors = {
-        f"friction × {corner.friction_factor:g}": corner.friction_factor != 1.0,
-        f"surfaces {1e3 * corner.surface_shift_m:+g} mm".replace("-", "−"): corner.surface_shift_m != 0.0,
-    }
-    label = ", ".join(text for text, differs in errors.items() if differs) or "as planned"
-    most = tolerances.heat if any(errors.values()) else 1.0 + tolerances.nominal
-    allowed = 1e3 * (abs(corner.surface_shift_m) + tolerances.hand_m)
-    return CornerRun(label, corner.heat_W / planned, most, 1e3 * corner.hand_rms_m, allowed, corner.reason)
+def _corner(corner: Corner, nominal: float, tolerances: Tolerances) -> CornerRun:
+    """Return a run with the limits that it must meet, relative to the heat of the nominal run; NaN: no limit."""
+    label = corner.label.replace("-", "−")
+    most = np.nan if label == "as planned" else tolerances.heat
+    allowed = np.nan if tolerances.hand_m is None else 1e3 * (abs(corner.surface_shift_m) + tolerances.hand_m)
+    return CornerRun(label, corner.heat_W / nominal, most, 1e3 * corner.hand_rms_m, allowed, corner.reason)
 
 
 def _view(task: Task) -> Projection:
@@ -147,7 +167,7 @@ def _poses(task: Task, size: Size, view: Projection) -> list[Pose]:
         q = arm.coordinates(dense.q[t : t + 1])[0]
         lines = list(view.project(axis_lines(arm, dense.q[t])))
         centres, points, forces = np.zeros((3, len(size.braces), 3))
-        now = min(round(dense.times[t] / dense.fine[1]), len(dense.fine) - 1)
+        now = dense.sample(t)
         for k, brace in enumerate(size.braces):
             centres[k] = model.point_position(brace.body, np.array(brace.point_m), q)
             normal = surfaces[brace.surface].normal(centres[k])

@@ -10,7 +10,7 @@ import numpy as np
 from dynsim.compile.control import MovedPath
 from dynsim.model.description import Array
 from dynsim.planner.dense import Dense
-from dynsim.planner.problem import Candidate, Task
+from dynsim.planner.problem import OF_OBJECTS, Candidate, Task, contact_names, without_objects
 from dynsim.record.urdf_text import roll_pitch_yaw
 from dynsim.scenario import Scenario
 from dynsim.scenario.reading import scenario_from_resolved
@@ -63,11 +63,17 @@ def stiffness_gains(task: Task, braces: tuple[Candidate, ...], dense: Dense, k_p
         return np.full(task.arm.n, k_p)
     problem, none = task.problem(braces, 1), np.zeros((1, len(braces)))
     pressing = np.zeros(task.arm.n)
-    for row in dense.q[:: max(len(dense.q) // SAMPLES, 1)]:
-        problem.evaluate(row[None].copy(), none)
-        rates = np.abs(problem.work.gap_rate[0, : len(braces)])
-        pressing = np.maximum(pressing, (rates / rates.max(axis=1, keepdims=True)).max(axis=0))
+    for t in range(0, len(dense.q), max(len(dense.q) // SAMPLES, 1)):
+        problem.evaluate(dense.q[t : t + 1].copy(), none)
+        rates = np.abs(problem.work.gap_rate[0, dense.acting(t)])
+        pressing = np.maximum(pressing, (rates / rates.max(axis=1, keepdims=True)).max(axis=0, initial=0.0))
     return np.where(pressing > FREE, k_p, max(k_p, STIFF))
+
+
+def stiffness(task: Task, braces: tuple[Candidate, ...], dense: Dense, k_p: float) -> Array:
+    """Return the stiffness of each moved joint under PD control, K_m k_p/R, shape (n,) [N m/rad or N/m]."""
+    constants = [motor.joint_constant / motor.resistance for motor in task.arm.motors]
+    return stiffness_gains(task, braces, dense, k_p) * np.array(constants)
 
 
 def shared_sections(task: Task) -> dict[str, Any]:
@@ -75,9 +81,11 @@ def shared_sections(task: Task) -> dict[str, Any]:
 
     Objects are omitted, because planned voltages require a motor on every joint.
     """
-    data = dict(task.scenario.resolved)
+    data, alone = dict(task.scenario.resolved), without_objects(task.scenario).config
     links = {"self", "links", *task.arm.model.robot.bodies}
     data.pop("objects", None)
+    for section in OF_OBJECTS.keys() & data.keys():
+        data[section] = {name: part for name, part in data[section].items() if name in getattr(alone, section)}
     data["name"] = f"{task.scenario.name}_plan"
     data.pop("variant", None)
     hand = {key: value for key, value in data["controller"]["hand"].items() if key in ("path", "orientation")}
@@ -123,21 +131,23 @@ def plan_sections(task: Task, braces: tuple[Candidate, ...], dense: Dense, k_p: 
         "k_d_V_s_per_rad": damping if len(set(damping)) > 1 else damping[0],
         "joints": joints,
     }
-    names = [brace.name for brace in braces]
+    names, schedule = contact_names(braces), dense.schedule
     initial: dict[str, Any] = {"on_references": True}
     if braces:
-        controller |= {"brace": "optimal", "min_N": task.options.min_N}
-        initial["on_surface"] = names
+        during = [task.intervals(schedule, brace) for brace in braces]
+        times = {name: {"during_s": np.round(part, DIGITS).tolist()} for name, part in zip(names, during, strict=True)}
+        controller |= {"brace": times if schedule.borders else "optimal", "min_N": task.options.min_N}
+        initial["on_surface"] = [name for name, part in zip(names, during, strict=True) if part[0][0] == 0.0]
     else:
         controller["feed_forward"] = "dynamics"
     points = {
-        brace.name: {
+        name: {
             "body": brace.body,
             "point_m": list(brace.point_m),
             "surface": brace.surface,
             **({"radius_m": brace.radius} if brace.radius else {}),
         }
-        for brace in braces
+        for name, brace in zip(names, braces, strict=True)
     }
     return {"controller": controller, "contacts": {"points": points}, "initial": initial}
 

@@ -5,28 +5,33 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import product
 from typing import Any, Literal, NamedTuple, TypeVar, cast
 
 import numpy as np
 
+from dynsim.compile.bracing import RAMP
 from dynsim.compile.control import HandPath
 from dynsim.compile.model import Model
 from dynsim.compile.protocols import BuildContext
-from dynsim.compile.solids import fixed_solids, solids_of
+from dynsim.compile.solids import Solid, solids_of
 from dynsim.errors import ModelError
 from dynsim.jit.kernel import integers, reals
 from dynsim.model.description import WORLD, Array, Robot
 from dynsim.model.surfaces import Capsule, Quadric
 from dynsim.planner.arm import MovingArm, Problem, axis_points, moving_arm, with_pairs, workspace
-from dynsim.planner.compiled import Course, Points
+from dynsim.planner.compiled.tables import Course, Points
 from dynsim.scenario import Scenario, build
-from dynsim.scenario.between import LINKS, OBJECTS, solid_pairs
+from dynsim.scenario.between import LINKS, OBJECTS, SELF, solid_pairs
 from dynsim.scenario.schema import BodyPair
 
 # Weight of the curvature of the postures along the path [W/rad²]. It makes the solution unique and is excluded from the
 # reported cost.
 SMOOTHNESS = 1e-3
+# Weight of the squared difference of the accelerations of two neighbouring knots. With the square of their mean, it is
+# the mean square acceleration of the cubic spline through the knots, up to the fourth order of ω h.
+RIPPLE = 5.0 / 12.0
+# Hand speed below which the hand counts as at rest [m/s], and the time over which it is measured [s].
+REST_SPEED, INSTANT = 1e-2, 1e-4
 # Points along links that must keep a clearance, in addition to the ends, as fractions of the link length.
 ALONG = (0.33, 0.67)
 # Clearance of these points [m].
@@ -35,8 +40,13 @@ LINK_CLEARANCE = 2e-3
 # friction. Planned voltages use smoother friction, so that they do not oscillate. The search starts with larger values,
 # which allow long steps and have few local optima.
 FINAL_SLIP_SCALE, FINE_SLIP_SCALE, COARSE_SLIP_SCALE = 1e-3, 3e-3, 1e-2
+# Fraction of the time that the knots cover, within which braces may be close to their surfaces before and after they
+# touch.
+LIFTING = 0.13
 # Distance below which two targets count as equal [m].
 SAME = 1e-6
+# Sections with parts on bodies, and the keys that name the bodies.
+OF_OBJECTS = {"surfaces": ("on",), "loads": ("body",), "ties": ("body", "other")}
 
 Kind = Literal["there_and_back", "closed", "open"]
 T = TypeVar("T")
@@ -81,6 +91,59 @@ class Candidate:
     def label(self) -> str:
         """Name of point and surface."""
         return f"{self.name} on {self.surface}"
+
+
+BraceSet = tuple[Candidate, ...]
+
+
+@dataclass(frozen=True)
+class BraceSchedule:
+    """Sets of braces along a path, one after the other.
+
+    Attributes
+    ----------
+    sets : tuple of tuple of Candidate
+        Set of braces of each phase.
+    borders : tuple of float
+        Ends of all phases but the last, as fractions of the time that the knots cover, increasing. At a border, the
+        braces of both phases are on their surfaces.
+    """
+
+    sets: tuple[BraceSet, ...]
+    borders: tuple[float, ...] = ()
+
+    @classmethod
+    def of(cls, braces: Sequence[Candidate] | BraceSchedule) -> BraceSchedule:
+        """Return the schedule with a single phase for a set of braces; a schedule is returned itself."""
+        return braces if isinstance(braces, BraceSchedule) else cls((tuple(braces),))
+
+    @cached_property
+    def braces(self) -> BraceSet:
+        """Braces of all phases."""
+        return tuple(dict.fromkeys(brace for braces in self.sets for brace in braces))
+
+    def __len__(self) -> int:
+        """Return the largest number of braces at a time."""
+        return max(map(len, self.sets))
+
+    @property
+    def label(self) -> str:
+        """Names of the braces of each phase, with their surfaces."""
+        return " → ".join(", ".join(brace.label for brace in braces) or "none" for braces in self.sets)
+
+
+def contact_names(braces: Sequence[Candidate]) -> list[str]:
+    """Return names of braces as contact points; points that use several surfaces are named with their surface."""
+    names = [brace.name for brace in braces]
+    return [f"{b.name}_{b.surface}" if names.count(b.name) > 1 else b.name for b in braces]
+
+
+class Phase(NamedTuple):
+    """Part of a path with one set of braces, from ``start`` to ``end`` [s]."""
+
+    start: float
+    end: float
+    braces: BraceSet
 
 
 class Clear(NamedTuple):
@@ -146,9 +209,13 @@ class Options:
     min_N : float
         Minimum normal force of a brace [N].
     starts, seed : int
-        Number of search rounds, and seed of the random postures.
+        Number of rounds of a search, and seed of the random postures.
+    budget_s : float
+        Time after which no search starts or continues, except for the first [s].
     exhaustive : bool
         Whether to try every set of candidates.
+    phases : tuple of int
+        Minimum and maximum number of sets of braces along the path.
     """
 
     candidates: tuple[str, ...] = ()
@@ -159,14 +226,19 @@ class Options:
     peak: float = 0.0
     clearance_m: float = 0.01
     min_N: float = 0.5
-    starts: int = 8
+    starts: int = 4
     seed: int = 0
+    budget_s: float = 30.0
     exhaustive: bool = False
+    phases: tuple[int, int] = (1, 1)
 
 
 @dataclass(frozen=True)
 class Task:
-    """Planning problem of a scenario; ``turn`` is the target rotation of the hand in the world, or None."""
+    """Planning problem of a scenario.
+
+    ``turn`` is the target rotation of the hand in the world, or None; ``link_m`` is the clearance of links [m].
+    """
 
     scenario: Scenario
     options: Options
@@ -176,6 +248,7 @@ class Task:
     kind: Kind
     candidates: tuple[Candidate, ...]
     friction: float
+    link_m: float = LINK_CLEARANCE
 
     @property
     def without_radius(self) -> list[str]:
@@ -195,6 +268,11 @@ class Task:
         if key not in self._known:
             self._known[key] = make()
         return cast("T", self._known[key])
+
+    def clearer(self, clearance_m: float) -> Task:
+        """Return the task with at least this clearance of links and unbraced joints [m]."""
+        options = replace(self.options, clearance_m=max(self.options.clearance_m, clearance_m))
+        return replace(self, options=options, link_m=max(self.link_m, clearance_m))
 
     @property
     def duration(self) -> float:
@@ -218,6 +296,12 @@ class Task:
         """Time that the knots cover [s], which is half of the duration for a path there and back."""
         return 0.5 * self.duration if self.kind == "there_and_back" else self.duration
 
+    @cached_property
+    def rests(self) -> bool:
+        """Whether the hand is at rest at the start and at the end of the path."""
+        ends = ((0.0, INSTANT), (self.duration - INSTANT, self.duration))
+        return all(np.linalg.norm(np.diff(self.targets(np.array(end)), axis=0)) < REST_SPEED * INSTANT for end in ends)
+
     def times(self, count: int) -> Array:
         """Return the times of ``count`` knots [s]."""
         if count == 1:
@@ -226,15 +310,11 @@ class Task:
             return np.linspace(0.0, self.span, count, endpoint=False)
         return np.linspace(0.0, self.span, count)
 
-    @property
-    def self_contact(self) -> bool:
-        """Whether there are pairs of links that must stay clear of each other."""
-        return any(WORLD not in pair and self._own.issuperset(pair) for pair in self.arm.pairs)
-
     @cached_property
     def _own(self) -> set[str]:
-        """Names of the robot's links and of the world; other bodies are objects."""
-        return {WORLD, *(link.name for link in self.arm.model.robot.links)}
+        """Names of the robot's links and of its root; other bodies are objects."""
+        robot = self.arm.model.robot
+        return {robot.root or WORLD, *(link.name for link in robot.links)}
 
     @cached_property
     def clear(self) -> dict[Key, Clear]:
@@ -253,10 +333,12 @@ class Task:
         hand, hand_point = robot.attach(*robot.hand)
         ends.append((arm.links.index(hand), hand_point, robot.links[hand].radius, margin, "hand"))
         middles = [
-            (k, point, radius, LINK_CLEARANCE, f"{robot.links[arm.links[k]].name} at {share:g}")
+            (k, point, radius, self.link_m, f"{robot.links[arm.links[k]].name} at {share:g}")
             for k, point, radius, share in axis_points(arm, ALONG)
         ]
-        solids = [(k, *entry) for k, i in enumerate(arm.links) for entry in solid_points(robot, robot.links[i].name)]
+        shaped = [k for k, i in enumerate(arm.links) if robot.links[i].solids and not robot.links[i].radius]
+        own = solids_of(robot) if shaped else {}
+        solids = [(k, *at) for k in shaped for at in solid_points(own[robot.links[arm.links[k]].name])]
         surfaces = build.surfaces(self.scenario)
         for index, name in enumerate(arm.surfaces):
             surface = surfaces[name]
@@ -268,7 +350,7 @@ class Task:
                 if (edge or not flat) and moves(arm.links[k], point):
                     at = key(k, index, point)
                     label = f"{robot.links[arm.links[k]].name} on {name}"
-                    made = Clear(k, point, radius, LINK_CLEARANCE, label, index, solid=True)
+                    made = Clear(k, point, radius, self.link_m, label, index, solid=True)
                     if (joint := points.get(at)) is not None:
                         made = joint._replace(radius=max(radius, joint.radius))
                     points[at] = made
@@ -301,7 +383,7 @@ class Task:
         }
         rows = [*braced.values(), *self.free(braces).values()]
         for m, pair in enumerate(self.arm.pairs):
-            least = LINK_CLEARANCE if self._own.issuperset(pair) else self.options.clearance_m
+            least = self.link_m if self._own.issuperset(pair) else self.options.clearance_m
             rows.append(Clear(0, np.zeros(3), 0.0, least, "", -1 - m))
         return Points(
             body=integers([row.joint for row in rows]),
@@ -344,31 +426,117 @@ class Task:
         blend = [0.5 * ends.sum(axis=0) for _, ends, _ in instants] or [np.ones(1)]
         chord = [sign / spacing * (ends[1] - ends[0]) for _, ends, sign in instants] or [np.zeros(1)]
         if count < 3:
-            bend = np.diff(np.eye(count), axis=0)
+            curve = np.diff(np.eye(count), axis=0)
         elif closed:
-            bend = np.roll(np.eye(count), 1, axis=1) - 2.0 * np.eye(count) + np.roll(np.eye(count), -1, axis=1)
+            curve = np.roll(np.eye(count), 1, axis=1) - 2.0 * np.eye(count) + np.roll(np.eye(count), -1, axis=1)
         else:
-            bend = np.diff(np.eye(count), 2, axis=0)
+            curve = np.diff(np.eye(count), 2, axis=0)
+        at_knots = self._accelerations(count, spacing)
+        first, second = (at_knots[[pair[side] for pair in pairs]] for side in range(2))
+        jerk, bend = second - first, np.repeat(0.5 * (first + second), len(signs), axis=0)
+        if not pairs:
+            bend = np.zeros((1, count))
         return Course(
             target=reals(self.hand_targets(times)),
             knot=integers(knot),
             blend=reals(blend),
             chord=reals(chord),
+            bend=reals(bend),
             share=reals(np.full(len(knot), 1.0 / len(knot))),
-            smooth=reals(SMOOTHNESS * bend.T @ bend),
+            smooth=reals(SMOOTHNESS * curve.T @ curve),
+            ripple=reals(RIPPLE / max(len(pairs), 1) * jerk.T @ jerk),
             slip_scale=reals([COARSE_SLIP_SCALE]),
+            guided=integers(np.zeros((count, 0))),
+            apart=reals(np.zeros((count, 0))),
+            acting=integers(np.zeros((len(knot), 0))),
         )
 
-    def problem(self, braces: Sequence[Candidate], count: int, slip_scale: float = COARSE_SLIP_SCALE) -> Problem:
-        """Return the problem for one brace set and ``count`` knots.
+    def _accelerations(self, count: int, spacing: float) -> Array:
+        """Return the matrix of the accelerations at knots from three knots each, shape (K, K) [1/s²].
 
-        Each problem has its own targets, but shares its workspace with all sets of the same size.
+        Paths that start and end at rest, or turn back, continue as their mirror images. On other open paths, the
+        acceleration at an end is that of its neighbour.
         """
+        if count < 2:
+            return np.zeros((count, count))
+        index = np.arange(-1, count + 1)
+        if self.kind == "closed":
+            index %= count
+        elif self.kind == "there_and_back" or self.rests:
+            index = np.abs(index)
+            index[-1] = count - 2
+        else:
+            index = np.clip(index, 0, count - 1)
+        rows = np.diff(np.eye(count)[index], 2, axis=0) / spacing**2
+        if self.kind == "open" and not self.rests:
+            rows[[0, -1]] = rows[[1, -2]] if count > 2 else 0.0
+        return rows
+
+    def phases(self, schedule: BraceSchedule) -> list[Phase]:
+        """Return the phases over the whole duration; on a path there and back they recur in reverse order."""
+        ends = [self.span * share for share in (0.0, *schedule.borders, 1.0)]
+        phases = [Phase(*part) for part in zip(ends[:-1], ends[1:], schedule.sets, strict=True)]
+        if self.kind != "there_and_back":
+            return phases
+        back = [Phase(self.duration - p.end, self.duration - p.start, p.braces) for p in reversed(phases[:-1])]
+        return [*phases[:-1], phases[-1]._replace(end=self.duration - phases[-1].start), *back]
+
+    def intervals(self, schedule: BraceSchedule, brace: Candidate) -> tuple[tuple[float, float], ...]:
+        """Return the intervals in which a brace is on its surface [s]; at a border, those of both phases overlap."""
+        joined: list[tuple[float, float]] = []
+        for start, end, braces in self.phases(schedule):
+            if brace in braces:
+                first, last = max(start - RAMP, 0.0), min(end + RAMP, self.duration)
+                if joined and joined[-1][1] >= first:
+                    first = joined.pop()[0]
+                joined.append((first, last))
+        return tuple(joined)
+
+    def shares(self, schedule: BraceSchedule) -> list[float]:
+        """Return the fraction of the duration that the phases of each brace take."""
+        phases = self.phases(schedule)
+        return [sum(p.end - p.start for p in phases if b in p.braces) / self.duration for b in schedule.braces]
+
+    def idle_times(self, schedule: BraceSchedule, times: Array) -> Array:
+        """Return how far times of the first pass are from the phases of each brace, shape (T, c) [s]; 0 within."""
+        phases = self.phases(schedule)
+        if self.kind == "closed":
+            phases = [
+                p._replace(start=p.start + t, end=p.end + t) for p in phases for t in (-self.span, 0.0, self.span)
+            ]
+        idle = np.full((len(times), len(schedule.braces)), np.inf)
+        for start, end, braces in phases:
+            on = [schedule.braces.index(brace) for brace in braces]
+            idle[:, on] = np.minimum(idle[:, on], np.maximum(np.maximum(start - times, times - end), 0.0)[:, None])
+        return idle
+
+    def problem(
+        self, braces: Sequence[Candidate] | BraceSchedule, count: int, slip_scale: float = COARSE_SLIP_SCALE,
+        target: Array | None = None,
+    ) -> Problem:  # fmt: skip
+        """Return the problem for one brace set, or a schedule of sets, and ``count`` knots.
+
+        Each problem has its own targets, but shares its workspace with all sets of the same size. In a problem with
+        one knot, all braces are on their surfaces, and the hand is at ``target`` or in the middle of the path.
+        """
+        schedule = BraceSchedule.of(braces)
+        braces = schedule.braces
         course = self._cached(count, lambda: self.course(count))
         points = self._cached(tuple(braces), lambda: self.points(braces))
         work = self._cached((len(braces), len(points.body), count), lambda: workspace(self.arm.n, points, course))
-        course = course._replace(target=course.target.copy(), slip_scale=reals([slip_scale]))
-        return Problem(self.arm.tables, points, course, work, self.options.min_N, self.options.peak)
+        guided, acting = np.ones((count, len(braces))), np.ones((len(course.knot), len(braces)))
+        apart = np.zeros((count, len(braces)))
+        if count > 1 and schedule.borders:
+            times = self.times(count)
+            idle = self.idle_times(schedule, times)
+            guided = np.where(idle <= SAME, 1.0, 0.0)
+            apart[idle > LIFTING * self.span] = self.options.clearance_m
+            # Instants are halfway between knots.
+            acting = np.where(self.idle_times(schedule, times[course.knot] + 0.5 * times[1]) == 0.0, 1.0, 0.0)
+        wanted = course.target.copy() if target is None else reals(target[None])
+        course = course._replace(target=wanted, slip_scale=reals([slip_scale]), acting=integers(acting))
+        course = course._replace(guided=integers(guided), apart=reals(apart))
+        return Problem(self.arm.tables, points, course, work, self.options.min_N, self.options.peak, self.arm.inertia)
 
 
 def task(scenario: Scenario, options: Options) -> Task:
@@ -379,8 +547,13 @@ def task(scenario: Scenario, options: Options) -> Task:
     ModelError
         If the scenario has no arm with DC motors, no hand path or no surface, or a candidate does not exist.
     """
+    # Plans and their controllers do not know errors of masses; the verification adds its own.
+    scenario = replace(scenario, config=scenario.config.model_copy(update={"mass_error": None}))
     described = build.robot(scenario)
-    model = Model(build.robot(_without_objects(scenario)) if scenario.config.objects else described)
+    model = Model(described)
+    if scenario.config.objects:
+        alone = build.unposed(without_objects(scenario))
+        model = Model(replace(alone, q0=described.initial[: alone.nq]))
     surfaces = {name: surface for name, surface in build.surfaces(scenario).items() if surface.carrier is None}
     if not surfaces and options.count[1] > 0:
         raise ModelError("plan: the scenario has no surfaces; add one, or use --count 0:0")
@@ -408,50 +581,56 @@ def task(scenario: Scenario, options: Options) -> Task:
     return _with_pairs(made, described)
 
 
-def _without_objects(scenario: Scenario) -> Scenario:
-    """Return the scenario of the arm alone."""
+def without_objects(scenario: Scenario) -> Scenario:
+    """Return the scenario of the arm alone, without the surfaces, loads and ties of objects."""
     config = scenario.config
-    contacts = config.contacts.model_copy(update={"between": []})
-    return replace(scenario, config=config.model_copy(update={"objects": {}, "contacts": contacts}))
+
+    def own(part: Any, key: str) -> bool:
+        body = getattr(part, key, None) or ""
+        return body not in config.objects and body.rpartition(".")[0] not in config.objects  # box, box.wheel
+
+    kept: dict[str, Any] = {
+        section: {name: part for name, part in getattr(config, section).items() if all(own(part, key) for key in keys)}
+        for section, keys in OF_OBJECTS.items()
+    }
+    kept |= {"objects": {}, "contacts": config.contacts.model_copy(update={"between": []})}
+    return replace(scenario, config=config.model_copy(update=kept))
 
 
 def _with_pairs(made: Task, described: Robot) -> Task:
     """Return the task with the pairs of ``contacts.between``.
 
-    Without that key, links with collision shapes stay clear of each other, except for shapes that overlap in the
-    initial posture, and all links stay clear of the objects and of the shapes of the root link.
+    Without that key, links stay clear of each other, of the root link and of the objects, except for solids that
+    overlap in the initial posture.
     """
     arm, config = made.arm, made.scenario.config
-    entries, stated = list(config.contacts.between), bool(config.contacts.between)
+    entries, stated, solids = list(config.contacts.between), bool(config.contacts.between), solids_of(described)
     moving = {arm.model.robot.links[i].name for i in arm.links}
     if not stated:
-        if any(link.solids and not link.radius for link in arm.model.robot.links):
-            entries.append(BodyPair(bodies="self"))
-        if config.objects and moving & solids_of(described).keys():
+        if moving & solids.keys():
+            entries.append(BodyPair(bodies=SELF))
+        if config.objects and moving & solids.keys():
             entries.append(BodyPair(bodies=[LINKS, OBJECTS]))
-    pairs = [(a, b) for a, b, _ in solid_pairs(entries, described, config.objects)]
-    if not stated:
-        others = [s for name, own in solids_of(described).items() if name in moving for s in own]
-        pairs += list(product(others, fixed_solids(described)))
+    pairs = [(a, b) for a, b, _ in solid_pairs(entries, described, config.objects, solids)]
+    pairs.sort(key=lambda pair: pair[1].carrier is None)
     made = replace(made, arm=with_pairs(arm, described, pairs))
     if stated or not made.arm.pairs:
         return made
     start = made.pair_gaps(arm.model.robot.initial[None, list(arm.columns)])[0]
     touching = {pair for pair, gap in zip(made.arm.pairs, start, strict=True) if gap <= 0.0}
-    pairs = [(a, b) for a, b in pairs if (a.carrier or WORLD, b.carrier or WORLD) not in touching]
+    pairs = [(a, b) for a, b in pairs if (a.carrier, b.carrier or described.root or WORLD) not in touching]
     return replace(made, arm=with_pairs(arm, described, pairs)) if touching else made
 
 
-def solid_points(robot: Robot, body: str) -> list[tuple[Array, float, bool]]:
-    """Return spheres of the collision shapes of a link: centre [m], radius [m], and whether it is at a corner or end.
+def solid_points(solids: Sequence[Solid]) -> list[tuple[Array, float, bool]]:
+    """Return spheres of solids: centre [m], radius [m], and whether it is at a corner or end.
 
-    The corners suffice for planes. Links with a radius have no collision shapes.
+    The corners suffice for planes.
     """
-    link = next(link for link in robot.links if link.name == body)
     points: list[tuple[Array, float, bool]] = []
-    for solid in solids_of(robot).get(body, ()) if link.solids and not link.radius else ():
+    for solid in solids:
         if isinstance(solid, Capsule):
-            shares = (0.0, 1.0, *ALONG) if solid.axis.any() else (0.0,)
+            shares = (0.0,) if solid.is_sphere else (0.0, 1.0, *ALONG)
             points += [(solid.start + share * solid.axis, solid.radius, share in (0.0, 1.0)) for share in shares]
         else:
             points += [(corner, solid.edge_radius, True) for corner in solid.corners]

@@ -3,23 +3,37 @@
 For each number of braces, all sets are solved at one posture of the path without slip, then the best sets are solved at
 a few knots with slip. The best of these are extended by one more brace. A set without a solution is "not found", not
 "impossible", because the solver starts from postures of other sets.
+
+Independent searches, each with several rounds, exchanges of braces and kicks of postures, are repeated until the best
+heat of each number of braces was found twice.
 """
 
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from itertools import combinations
+from dataclasses import dataclass, field, replace
+from itertools import combinations, pairwise, product
 from typing import NamedTuple
 
 import numpy as np
 
+from dynsim.compile.bracing import RAMP
 from dynsim.jit.kernel import reals
 from dynsim.model.description import Array
-from dynsim.planner.arm import Local, solve
-from dynsim.planner.dense import Dense, references, touching_links
-from dynsim.planner.problem import COARSE_SLIP_SCALE, FINAL_SLIP_SCALE, FINE_SLIP_SCALE, Candidate, Task
+from dynsim.planner.arm import Local, Problem, solve
+from dynsim.planner.dense import Dense, references
+from dynsim.planner.problem import (
+    COARSE_SLIP_SCALE,
+    FINAL_SLIP_SCALE,
+    FINE_SLIP_SCALE,
+    BraceSchedule,
+    BraceSet,
+    Candidate,
+    Task,
+)
+from dynsim.system import interruption
 
 # Number of sets with the same number of braces that continue to the next stage and to the next number of braces.
 BEAM = 3
@@ -29,36 +43,59 @@ POSTURES, DRAWS = 4, 60
 SPREAD, PRISMATIC_SPREAD = (0.3, 1.5), 0.2
 # Number of sets of each size that are solved along the whole path in each round, and number of sets of each size that
 # are refined at the end.
-PATHS, KEPT = 4, 3
+PATHS, KEPT = 4, 5
 # Number of sets of each size whose neighbours are tried along the whole path.
 NEIGHBOURS = 5
 # Maximum ratio of a neighbour's cost to the least cost of all sets of its size.
 PROMISING = 1.25
+# Number of sets of each size whose postures are kicked, number of kicks in a row without success after which a set is
+# left, and range of their standard deviation [rad or m].
+KICKED, KICKS, KICK = 2, 12, (0.1, 1.2)
 # Relative difference below which two costs of a set belong to the same path; maximum ratio of a path's cost to the
 # least cost up to which the path is refined further; maximum number of refined paths per set.
 SAME_COST, NEAR, ALTERNATIVES = 1e-3, 1.1, 6
-# Number of knots of closed paths and of other whole paths. The number of knots is doubled up to the third number for
-# the sets that are kept, and up to the fourth for the best set, or until the dense references cost less than the last
-# factor times the cost at the knots.
-CLOSED_KNOTS, PATH_KNOTS, FINE_KNOTS, MOST_KNOTS, CONVERGED = 24, 17, 30, 60, 1.01
+# Relative difference of the heats at the knots below which two searches agree, number of searches that must agree, and
+# minimum number of local problems. In small problems, two searches may agree on a frequent local optimum.
+AGREE, TWICE, EFFORT = 0.02, 2, 2000
+# Number of knots of closed paths and of other whole paths. For sets that may be the best, their number is doubled until
+# it exceeds the third number, or the dense references cost less than the last factor times the cost at the knots.
+CLOSED_KNOTS, PATH_KNOTS, MOST_KNOTS, CONVERGED = 24, 17, 100, 1.01
 
-Set = tuple[Candidate, ...]
+# Changing braces: number of segments of the path; number of sets per segment in schedules of two and of more phases;
+# number of schedules that are optimised; shortest phase [s], for two hand-overs.
+SEGMENTS, WIDEST, NARROW, OPTIMISED, SHORTEST = 4, 5, 3, 60, 4.0 * RAMP
+
 Tell = Callable[[str, float], None]
 
 
 @dataclass(frozen=True)
 class Planned:
-    """Set of braces with its best postures along the whole path."""
+    """Set of braces, or schedule of sets, with its best postures along the whole path.
 
-    braces: Set
+    ``finest``: more knots were tried; ``clearer``: the path keeps the clearance that the verification subtracts.
+    """
+
+    braces: BraceSet
     times: Array
     local: Local
     dense: Dense
+    finest: bool = False
+    clearer: bool = False
+
+    @property
+    def label(self) -> str:
+        """Names of the braces, or "none"."""
+        return self.dense.schedule.label
 
     @property
     def heat(self) -> float:
         """Mean heat along the dense references [W]."""
         return self.dense.heat
+
+    @property
+    def converged(self) -> bool:
+        """Whether the dense references cost about the same as the knots."""
+        return self.heat <= CONVERGED * self.local.heat
 
 
 class PosturePath(NamedTuple):
@@ -81,7 +118,9 @@ class Tally:
     reached, missed : set
         Sets for which a posture was found, and sets for which none was found.
     heats : dict
-        Best heat of each round along the path, at the knots [W], by number of braces; inf if no path was found.
+        Best heat of each search along the path, at the knots [W], by number of braces; inf if no path was found.
+    ended : str
+        Reason why no more searches started: ``agreed``, ``budget`` or ``interrupted``.
     refused : dict
         Rejected sets, each with the reason.
     """
@@ -89,10 +128,16 @@ class Tally:
     solves: int = 0
     drawn: int = 0
     drawn_on: int = 0
-    reached: set[Set] = field(default_factory=set)
-    missed: set[Set] = field(default_factory=set)
+    reached: set[BraceSet] = field(default_factory=set)
+    missed: set[BraceSet] = field(default_factory=set)
     heats: dict[int, list[float]] = field(default_factory=dict)
-    refused: dict[Set, str] = field(default_factory=dict)
+    refused: dict[BraceSet | BraceSchedule, str] = field(default_factory=dict)
+    ended: str = "agreed"
+
+    def agreed(self, size: int) -> int:
+        """Return the number of searches that found the best heat with a number of braces."""
+        heats = self.heats.get(size, [])
+        return sum(heat <= min(heats) * (1.0 + AGREE) for heat in heats if heat < math.inf)
 
 
 class Search:
@@ -101,19 +146,21 @@ class Search:
     def __init__(self, task: Task, tell: Tell | None = None) -> None:
         self.task, self.tally, self.kept = task, Tally(), KEPT
         self._tell = tell or (lambda text, share: None)
-        self.single_heats: dict[Set, float] = {}
-        # Least heat of a whole path at its knots [W] over rounds and exchanges, by number of braces.
-        self.least_heat: dict[int, float] = {}
+        self.single_heats: dict[BraceSet, float] = {}
+        # Mean over instants of the least instant heat over all whole paths [W], by number of braces.
+        self.bounds: dict[int, float] = {}
         self._rng = np.random.default_rng(task.options.seed)
+        self._began, self._budget = time.monotonic(), max(task.options.budget_s, 1e-9)
         self.coarse = 4 if task.kind == "closed" else 3
         self.path = CLOSED_KNOTS if task.kind == "closed" else PATH_KNOTS
 
     def solve(
-        self, braces: Set, start: Array, count: int, turns: int = 40, slip_scale: float = COARSE_SLIP_SCALE
-    ) -> Local | None:
+        self, braces: BraceSet | BraceSchedule, start: Array, count: int, turns: int = 40,
+        slip_scale: float = COARSE_SLIP_SCALE, target: Array | None = None,
+    ) -> Local | None:  # fmt: skip
         """Find the local optimum, starting from postures at other knots or from one posture."""
         self.tally.solves += 1
-        return solve(self.task.problem(braces, count, slip_scale), self.spread(start, count), turns)
+        return solve(self.task.problem(braces, count, slip_scale, target), self.spread(start, count), turns)
 
     def spread(self, start: Array, count: int) -> Array:
         """Interpolate postures, shape (n,) or (K, n), linearly at ``count`` knots."""
@@ -125,12 +172,12 @@ class Search:
             times, known = np.append(times, self.task.span), np.vstack([known, known[:1]])
         return reals(np.stack([np.interp(wanted, times, column) for column in known.T], axis=1))
 
-    def _starts(self, first: bool) -> list[Array]:
-        """Return random postures that are clear of all surfaces, with the hand at the middle of the path.
+    def _starts(self, first: bool, target: Array | None = None) -> list[Array]:
+        """Return random postures that are clear of all surfaces, with the hand at a target or the middle of the path.
 
         The first round also tries the initial posture.
         """
-        problem, postures = self.task.problem((), 1), list[Array]()
+        problem, postures = self.task.problem((), 1, target=target), list[Array]()
         arm = self.task.arm
         initial = arm.model.robot.initial[list(arm.columns)]
         for draw in range(DRAWS):
@@ -163,51 +210,125 @@ class Search:
         return [text for text, gap, least in zip(texts, greatest, problem.points.margin, strict=True) if gap < least]
 
     def run(self) -> dict[int, list[Planned]]:
-        """Run the search and return the best sets of each size, sorted by heat along their dense references.
+        """Run searches and return the best sets of each size, sorted by heat along their dense references.
 
-        The list of a size may be empty. Rounds are independent searches from different postures. The number of rounds
-        that agree is the only indication of how close the result is to the optimum.
+        The list of a size may be empty. Searches are independent, from different postures. They are repeated until two
+        of them agree for each size, the time budget ends, or an interrupt (Ctrl-C) ends the search; the best paths so
+        far are then used. Agreement is the only indication of how close the result is to the optimum.
         """
-        least, most = self.task.options.count
-        paths: dict[Set, list[PosturePath]] = {}
-        rounds = self.task.options.starts
-        for number in range(rounds):
-            self._tell("searching", number / (rounds + 1))
-            for size, ranked in self._round(number, most).items():
-                heats = [self._path(paths.setdefault(item[1], []), *item) for item in ranked[:PATHS]]
-                self.tally.heats.setdefault(size, []).append(min(heats, default=math.inf))
-        self._exchange(paths, most)
-        for size in range(most + 1):
-            self.least_heat[size] = min((local.heat for local, _ in self._best(paths, size)), default=math.inf)
+        (least, most), tally = self.task.options.count, self.tally
+        sizes, number, self._began = range(least, most + 1), 0, time.monotonic()
+        paths: dict[BraceSet, list[PosturePath]] = {}
+        searched: dict[BraceSet, list[PosturePath]] = {}
+        try:
+            while True:
+                agreed = sum(min(tally.agreed(size), TWICE) for size in sizes) / (TWICE * len(sizes))
+                self._tell(f"search {number + 1}", 0.8 * max(agreed, min(self._elapsed / self._budget, 1.0)))
+                self._search(searched, number, most)
+                number += 1
+                self._merge(searched, paths)
+                searched = {}
+                if number >= TWICE and tally.solves >= EFFORT and all(self._agreed(size) for size in sizes):
+                    break
+                if self._late:
+                    tally.ended = "budget"
+                    break
+        except KeyboardInterrupt:
+            if searched:
+                self._merge(searched, paths)
+            if not any(path.local for some in paths.values() for path in some):
+                raise
+            interruption.answered()
+            tally.ended = "interrupted"
         planned: dict[int, list[Planned]] = {}
         for size in range(least, most + 1):
-            self._tell("refining", (rounds + size / (most + 1)) / (rounds + 1))
-            planned[size] = self._refined({braces: some for braces, some in paths.items() if len(braces) == size})
+            self._tell("refining", 0.8 + 0.2 * size / (most + 1))
+            chosen: dict[BraceSet | BraceSchedule, list[PosturePath]] = {
+                braces: some for braces, some in paths.items() if len(braces) == size
+            }
+            planned[size] = [] if self.task.options.phases[0] > 1 else self._refined(chosen)
+            if tally.ended != "interrupted" and (changing := self._changing(paths, size)):
+                planned[size] = sorted(planned[size] + self._refined(changing), key=_heat)
         return planned
 
-    def _path(self, known: list[PosturePath], cost: float, braces: Set, Q: Array) -> float:
-        """Solve a whole path from postures at few knots, add it to the known paths of its set, and return its heat [W].
+    def _merge(self, searched: Mapping[BraceSet, list[PosturePath]], paths: dict[BraceSet, list[PosturePath]]) -> None:
+        """Add the paths of a search to the paths of all searches, and note its best heats."""
+        for size in range(self.task.options.count[1] + 1):
+            heats = [local.heat for local, _ in self._best(searched, size)]
+            self.tally.heats.setdefault(size, []).append(min(heats, default=math.inf))
+        for braces, some in searched.items():
+            known = paths.setdefault(braces, [])
+            known += [path for path in some if not any(_same(path.coarse, other.coarse) for other in known)]
+
+    def _search(self, paths: dict[BraceSet, list[PosturePath]], number: int, most: int) -> None:
+        """Run one search, which starts anew from random postures; add the paths of its sets."""
+        rounds = self.task.options.starts
+        for k in range(number * rounds, (number + 1) * rounds):
+            if number and self._late:
+                return
+            for ranked in self._round(k, most).values():
+                for item in ranked[:PATHS]:
+                    self._path(paths.setdefault(item[1], []), *item)
+        changed: set[tuple[BraceSet, int, float]] = set()
+        self._exchange(paths, most, changed, number > 0)
+        self._kick(paths, most, number > 0)
+        self._exchange(paths, most, changed, number > 0)
+
+    def _kick(self, paths: dict[BraceSet, list[PosturePath]], most: int, limited: bool) -> None:
+        """Solve the best paths of each size again from randomly displaced postures, until this stops to improve them.
+
+        All knots are displaced by the same random angles of some joints.
+        """
+        n, rng = self.task.arm.n, self._rng
+        for size in range(most + 1):
+            for best, braces in self._best(paths, size)[:KICKED]:
+                failed = 0
+                while failed < KICKS and not (limited and self._late):
+                    failed += 1
+                    kick = rng.uniform(*KICK) * rng.normal(size=n) * (rng.random(n) < rng.uniform(0.2, 1.0))
+                    local = self._whole(braces, best.Q + kick, best.cost)
+                    if local is not None and local.cost < (1.0 - SAME_COST) * best.cost:
+                        best, failed = local, 0
+                        paths[braces].append(PosturePath(local.cost, local))
+
+    def _agreed(self, size: int) -> bool:
+        """Return whether enough searches found the best heat with a number of braces, or none found any path."""
+        return self.tally.agreed(size) >= TWICE or min(self.tally.heats[size]) == math.inf
+
+    @property
+    def _elapsed(self) -> float:
+        """Time since the start of the searches [s]."""
+        return time.monotonic() - self._began
+
+    @property
+    def _late(self) -> bool:
+        """Whether the time budget has ended."""
+        return self._elapsed >= self._budget
+
+    def _path(self, known: list[PosturePath], cost: float, braces: BraceSet, Q: Array) -> None:
+        """Solve a whole path from postures at few knots, and add it to the known paths of its set.
 
         Nearly equal costs at few knots belong to the same path. A path whose cost is far above the least cost is
-        ignored (inf).
+        ignored.
         """
-        if cost > NEAR * min((path.coarse for path in known), default=math.inf):
-            return math.inf
-        for path in known:
-            if _same(path.coarse, cost):
-                return math.inf if path.local is None else path.local.heat
-        local = self._whole(braces, Q)
-        known.append(PosturePath(cost, local))
-        return math.inf if local is None else local.heat
+        least = min((path.coarse for path in known), default=math.inf)
+        if cost <= NEAR * least and not any(_same(path.coarse, cost) for path in known):
+            known.append(PosturePath(cost, self._whole(braces, Q)))
 
-    def _exchange(self, paths: dict[Set, list[PosturePath]], most: int) -> None:
+    def _exchange(
+        self,
+        paths: dict[BraceSet, list[PosturePath]],
+        most: int,
+        changed: set[tuple[BraceSet, int, float]],
+        limited: bool,
+    ) -> None:
         """Solve whole paths for the neighbours of the best sets, with one brace less or more, until no new sets remain.
 
         This is useful because the ranking of sets along the path differs from their ranking at few knots, and because
         few sets are close to a random posture.
         """
         changes = [*((size, -1) for size in range(most, 1, -1)), *((size, 1) for size in range(most))]
-        changed, going_on = set[tuple[Set, int, float]](), True
+        going_on = True
         while going_on:
             going_on = False
             for size, change in changes:
@@ -215,6 +336,8 @@ class Search:
                 for near, braces in self._best(paths, size)[:NEIGHBOURS]:
                     if (braces, change, near.cost) in changed:
                         continue
+                    if limited and self._late:
+                        return
                     changed.add((braces, change, near.cost))
                     going_on = True
                     for other in self._grown(braces) if change > 0 else combinations(braces, size - 1):
@@ -223,7 +346,7 @@ class Search:
                             known.append(PosturePath(local.cost, local))
                             least = min(least, local.cost)
 
-    def _best(self, paths: Mapping[Set, list[PosturePath]], size: int) -> list[tuple[Local, Set]]:
+    def _best(self, paths: Mapping[BraceSet, list[PosturePath]], size: int) -> list[tuple[Local, BraceSet]]:
         """Return the best path of each set with ``size`` braces, sorted by cost."""
         best = [
             (min((path.local for path in some if path.local is not None), key=_cost), braces)
@@ -232,16 +355,16 @@ class Search:
         ]
         return sorted(best, key=lambda item: item[0].cost)
 
-    def _round(self, number: int, most: int) -> dict[int, list[tuple[float, Set, Array]]]:
+    def _round(self, number: int, most: int) -> dict[int, list[tuple[float, BraceSet, Array]]]:
         """Search from new start postures; return the sets of each size with cost and posture, sorted by cost."""
         starts = self._starts(first=number == 0)
-        best: dict[int, list[tuple[float, Set, Array]]] = {}
+        best: dict[int, list[tuple[float, BraceSet, Array]]] = {}
         unbraced = [r for q in starts if (r := self.solve((), q, 1)) is not None]
         if not unbraced:
             return best
         unbraced.sort(key=_cost)
         best[0] = [(r.cost, (), r.Q) for r in unbraced]
-        front: list[tuple[Set, list[Array]]] = [((), [*starts, unbraced[0].Q])]
+        front: list[tuple[BraceSet, list[Array]]] = [((), [*starts, unbraced[0].Q])]
         for size in range(1, most + 1):
             cheap = self._cheap(self._sets(size, front), number % 2 == 0)
             slipping = self._slipping(cheap, 2 * BEAM)
@@ -257,23 +380,28 @@ class Search:
             ]
         return best
 
-    def _cheap(self, sets: Mapping[Set, list[Array]], best: bool) -> dict[Set, Local]:
-        """Solve sets at one posture without slip from start postures; keep the best or a random solution of each."""
-        reached: dict[Set, Local] = {}
+    def _cheap(
+        self, sets: Mapping[BraceSet, list[Array]], best: bool, target: Array | None = None
+    ) -> dict[BraceSet, Local]:
+        """Solve sets at one posture without slip from start postures; keep the best or a random solution of each.
+
+        The hand is at a target, or in the middle of the path.
+        """
+        reached: dict[BraceSet, Local] = {}
         for braces, postures in sets.items():
-            tried = [r for q in postures if (r := self.solve(braces, q, 1, 25)) is not None]
+            tried = [r for q in postures if (r := self.solve(braces, q, 1, 25, target=target)) is not None]
             if tried:
                 chosen = min(tried, key=_cost) if best else tried[self._rng.integers(len(tried))]
                 reached[braces] = chosen
                 self.tally.missed.discard(braces)
-                if len(braces) == 1:
+                if len(braces) == 1 and target is None:
                     self.single_heats[braces] = min(reached[braces].heat, self.single_heats.get(braces, math.inf))
                 self.tally.reached.add(braces)
             elif braces not in self.tally.reached:
                 self.tally.missed.add(braces)
         return reached
 
-    def _slipping(self, cheap: Mapping[Set, Local], count: int) -> list[tuple[float, Set, Array]]:
+    def _slipping(self, cheap: Mapping[BraceSet, Local], count: int) -> list[tuple[float, BraceSet, Array]]:
         """Solve the best ``count`` sets at few knots with slip; return them sorted by cost."""
         ranked = sorted(cheap.items(), key=lambda item: item[1].cost)[:count]
         solved = [
@@ -283,7 +411,7 @@ class Search:
         ]
         return sorted(solved, key=lambda item: item[0])
 
-    def _grown(self, braces: Set) -> list[Set]:
+    def _grown(self, braces: BraceSet) -> list[BraceSet]:
         """Return the sets with one more brace."""
         sets = [
             tuple(brace for brace in self.task.candidates if brace in braces or brace == new)
@@ -292,14 +420,14 @@ class Search:
         ]
         return [grown for grown in sets if _fits(grown)]
 
-    def _swaps(self, braces: Set) -> list[Set]:
+    def _swaps(self, braces: BraceSet) -> list[BraceSet]:
         """Return the sets with one brace exchanged for another candidate."""
         left = combinations(braces, len(braces) - 1)
         return list(dict.fromkeys(grown for some in left for grown in self._grown(some) if grown != braces))
 
-    def _sets(self, size: int, front: Sequence[tuple[Set, list[Array]]]) -> dict[Set, list[Array]]:
+    def _sets(self, size: int, front: Sequence[tuple[BraceSet, list[Array]]]) -> dict[BraceSet, list[Array]]:
         """Return the sets that grow from smaller sets, with start postures."""
-        sets: dict[Set, list[Array]] = {}
+        sets: dict[BraceSet, list[Array]] = {}
         if self.task.options.exhaustive:
             for chosen in combinations(self.task.candidates, size):
                 if _fits(chosen):
@@ -310,7 +438,7 @@ class Search:
                 sets.setdefault(grown, []).extend(postures)
         return sets
 
-    def _whole(self, braces: Set, Q: Array, most: float = math.inf) -> Local | None:
+    def _whole(self, braces: BraceSet, Q: Array, most: float = math.inf) -> Local | None:
         """Solve a whole path from postures at few knots, first with smooth friction, which has fewer local optima.
 
         Returns None if there is no path, or if its cost with smooth friction exceeds ``most`` [W].
@@ -321,7 +449,7 @@ class Search:
             return None
         return self.solve(braces, local.Q, self.path, 30, FINE_SLIP_SCALE) or local
 
-    def _refined(self, paths: Mapping[Set, list[PosturePath]]) -> list[Planned]:
+    def _refined(self, paths: Mapping[BraceSet | BraceSchedule, list[PosturePath]]) -> list[Planned]:
         """Refine the best paths of the best sets with more knots; return them sorted by heat along dense references."""
         whole = {braces: sorted((p.local for p in some if p.local), key=_cost) for braces, some in paths.items()}
         reached = {braces: some for braces, some in whole.items() if some}
@@ -332,56 +460,228 @@ class Search:
                 if len(good) == ALTERNATIVES or local.cost > near:
                     break
                 plan = self._finer(braces, local, self.path)
+                if isinstance(plan, str) or not plan.converged:
+                    # Fewer knots are better if the postures of neighbouring knots are on different branches.
+                    fewer = self._finer(braces, local, (self.path + 1) // 2)
+                    if not isinstance(fewer, str) and (isinstance(plan, str) or fewer.heat < plan.heat):
+                        plan = fewer
                 if isinstance(plan, str):
                     self.tally.refused.setdefault(braces, plan)
                 else:
                     good.append(plan)
                     near = min(near, NEAR * plan.heat)
             if good:
-                planned.append(self._finest(min(good, key=lambda plan: plan.heat), FINE_KNOTS))
+                planned.append(min(good, key=_heat))
                 self.tally.refused.pop(braces, None)
         for braces in (braces for braces, some in paths.items() if some and braces not in reached):
             self.tally.refused[braces] = "no solution along the whole path, only single postures"
-        planned.sort(key=lambda plan: plan.heat)
-        return [self._finest(plan, MOST_KNOTS) for plan in planned[:1]] + planned[1:]
+        planned.sort(key=_heat)
+        least, finest = math.inf, list[Planned]()
+        for plan in planned:
+            # More knots hardly ever reduce the heat below the heat at the knots.
+            finest.append(self.finest(plan) if plan.local.heat < least else plan)
+            least = min(least, finest[-1].heat)
+        return sorted(finest, key=_heat)
 
-    def _finer(self, braces: Set, coarse: Local, count: int) -> Planned | str:
+    def _finer(self, braces: BraceSet | BraceSchedule, coarse: Local, count: int) -> Planned | str:
         """Solve a path with more knots and its dense references; if they are infeasible, return the reason as text."""
         local = self.solve(braces, coarse.Q, count, 20, FINAL_SLIP_SCALE) or coarse
         times = self.task.times(len(local.Q))
         dense = references(self.task, braces, times, local.Q)
         if isinstance(dense, str):
             return dense
-        return touching_links(self.task, dense.times, dense.q) or Planned(braces, times, local, dense)
+        distance, bodies, when = self.task.nearest_pair(dense.times, dense.q)
+        if distance < 0.0:
+            return f"{bodies} touch each other at t = {when:.3g} s"
+        return Planned(dense.schedule.braces, times, local, dense)
 
-    def _finest(self, plan: Planned, most: int) -> Planned:
-        """Double the number of knots, up to ``most``, until the dense references cost the same as the knots."""
-        while plan.heat > CONVERGED * plan.local.heat and len(plan.times) < most:
-            finer = self._finer(plan.braces, plan.local, 2 * len(plan.times) - (self.task.kind != "closed"))
-            if isinstance(finer, str) or finer.heat >= plan.heat:
+    def finest(self, plan: Planned) -> Planned:
+        """Double the number of knots, until the dense references cost the same as the knots."""
+        best = plan
+        while not best.finest and not plan.converged and len(plan.times) < MOST_KNOTS:
+            finer = self._finer(plan.dense.schedule, plan.local, 2 * len(plan.times) - (self.task.kind != "closed"))
+            if isinstance(finer, str):
                 break
             plan = finer
-        return plan
+            best = min(best, plan, key=_heat)
+        return replace(best, finest=True)
 
-    def _walked(self, braces: Set, Q: Array, count: int) -> Local | None:
+    def clearer(self, plan: Planned, clearance_m: float) -> Planned | None:
+        """Plan the same set again from its path with more clearance [m]; None if this was done or does not work."""
+        if plan.clearer:
+            return None
+        again = Search(self.task.clearer(clearance_m))
+        made = again._finer(plan.dense.schedule, plan.local, len(plan.times))
+        return None if isinstance(made, str) else replace(again.finest(made), clearer=True)
+
+    def continued(self, plan: Planned) -> Planned | None:
+        """Return the plan of a similar problem, continued from its postures; None if this does not work.
+
+        Plans whose braces change are not continued.
+        """
+        if plan.dense.schedule.borders:
+            return None
+        own = {(c.name, c.surface): c for c in self.task.candidates}
+        braces = tuple(own[at] for brace in plan.braces if (at := (brace.name, brace.surface)) in own)
+        if len(braces) < len(plan.braces):
+            return None
+        local = self.solve(braces, plan.local.Q, len(plan.times), 30, FINE_SLIP_SCALE)
+        finer = None if local is None else self._finer(braces, local, len(plan.times))
+        return None if isinstance(finer, str) else finer
+
+    def _walked(self, braces: BraceSet, Q: Array, count: int) -> Local | None:
         """Solve a path knot by knot, starting from a posture in the middle; used if solving all knots at once fails."""
         whole = self.task.problem(braces, count)
-        targets, middle = whole.course.target, count // 2
-        single = self.task.problem(braces, 1)
-        out = np.zeros((count, self.task.arm.n))
-        for knots in (range(middle, count), range(middle, -1, -1)):
-            q = reals(np.atleast_2d(Q)[len(np.atleast_2d(Q)) // 2])[None]
-            for k in knots:
-                single.course.target[0] = targets[k]
-                if single.retract(q, 60) > 1e-7:
-                    return None
-                out[k] = q[0]
+        out = self._walk(whole, braces, np.atleast_2d(Q)[len(np.atleast_2d(Q)) // 2], count // 2)
+        if out is None:
+            return None
         self.tally.solves += 1
         return solve(whole, out, 30)
+
+    def _walk(self, whole: Problem, braces: BraceSet | BraceSchedule, q: Array, start: int) -> Array | None:
+        """Return postures at all knots, each projected from its neighbour, from posture q at knot ``start`` on."""
+        course, single = whole.course, self.task.problem(braces, 1)
+        out = np.zeros((len(course.target), self.task.arm.n))
+        for knots in (range(start, len(out)), range(start, -1, -1)):
+            row = reals(q)[None].copy()
+            for k in knots:
+                single.course.target[0], single.course.apart[0] = course.target[k], course.apart[k]
+                single.course.guided[0] = course.guided[k]
+                if single.retract(row, 60) > 1e-7:
+                    return None
+                out[k] = row[0]
+        return out
+
+    def _changing(
+        self, paths: Mapping[BraceSet, list[PosturePath]], size: int
+    ) -> dict[BraceSet | BraceSchedule, list[PosturePath]]:
+        """Return paths with at most ``size`` braces at a time that change on the way, the best of each schedule.
+
+        Segments of the path, with the best sets for one posture in their middle, are joined to schedules with borders
+        between segments. Postures walk from the middles of the phases to all knots; the schedules with the least heat
+        along these walks are optimised. Then borders move by one knot, as long as the cost decreases.
+        """
+        most, knots = self.task.options.phases[1], self.path
+        if size == 0 or most < 2:
+            return {}
+        closed = self.task.kind == "closed"
+        edges = np.linspace(0, knots - (not closed), SEGMENTS + 1).round().astype(int).tolist()
+        middles = [(first + last) // 2 for first, last in pairwise(edges)]
+        best = {braces: local for some in range(size + 1) for local, braces in self._best(paths, some)}
+        profiles = {braces: self._profile(braces, local) for braces, local in best.items()}
+        segments = []
+        for middle in middles:
+            postures = self._at(middle, size)
+            for braces, local in best.items():
+                k = round(middle * len(local.Q) / knots)
+                heat = float(profiles[braces][min(middle, len(profiles[braces]) - 1)])
+                if braces not in postures or heat < postures[braces][0]:
+                    postures[braces] = heat, local.Q[k]
+            ranked = sorted(postures.items(), key=lambda item: item[1][0])
+            segments.append([(braces, q) for braces, (_, q) in ranked])
+        walks = list[tuple[float, BraceSchedule, Array]]()
+        for count in range(2, most + 1):
+            for inner in combinations(range(1, SEGMENTS), count - 1):
+                parts = list(pairwise((0, *inner, SEGMENTS)))
+                borders = tuple(edges[k] / edges[-1] for k in inner)
+                width = WIDEST if count == 2 else NARROW
+                pools = [
+                    {braces: (q, middles[m]) for m in range(*part) for braces, q in segments[m][:width]}
+                    for part in parts
+                ]
+                for sets in product(*pools):
+                    schedule = BraceSchedule(sets, borders)
+                    if len(schedule) == size and self._changes(schedule):
+                        starts = [pool[braces] for pool, braces in zip(pools, sets, strict=True)]
+                        walks += self._walks(schedule, starts)
+        walks.sort(key=lambda walk: walk[0])
+        done = dict[BraceSchedule, PosturePath]()
+        for _, schedule, Q in walks[:OPTIMISED]:
+            self._keep(done, schedule, Q)
+        improved = True
+        while improved:
+            improved = False
+            for schedule, path in sorted(done.items(), key=lambda item: item[1].coarse)[:KEPT]:
+                for moved in self._moved(schedule, edges[-1]):
+                    if moved not in done and path.local is not None:
+                        improved |= self._keep(done, moved, path.local.Q, path.coarse)
+        reached = {schedule: path.local for schedule, path in done.items() if path.local is not None}
+        heats = [*profiles.values(), *(self._profile(schedule, local) for schedule, local in reached.items())]
+        self.bounds[size] = float(np.mean(np.min(heats, axis=0))) if heats else math.nan
+        return {schedule: [PosturePath(local.cost, local)] for schedule, local in reached.items()}
+
+    def _changes(self, schedule: BraceSchedule) -> bool:
+        """Return whether neighbouring phases have different sets and all phases have time for two hand-overs."""
+        different = all(first != second for first, second in pairwise(schedule.sets))
+        return different and all(p.end - p.start >= SHORTEST for p in self.task.phases(schedule))
+
+    def _moved(self, schedule: BraceSchedule, intervals: int) -> list[BraceSchedule]:
+        """Return the schedules with one border moved by one knot."""
+        moved = []
+        for k, border in enumerate(schedule.borders):
+            for change in (-1, 1):
+                borders = list(schedule.borders)
+                borders[k] = (round(border * intervals) + change) / intervals
+                other = BraceSchedule(schedule.sets, tuple(borders))
+                if all(a < b for a, b in pairwise((0.0, *borders, 1.0))) and self._changes(other):
+                    moved.append(other)
+        return moved
+
+    def _keep(
+        self, done: dict[BraceSchedule, PosturePath], schedule: BraceSchedule, Q: Array, least: float = math.inf
+    ) -> bool:
+        """Optimise a schedule from postures at all knots, add it to ``done``; return whether it is below ``least``."""
+        coarse = self.solve(schedule, Q, self.path)
+        fine = None if coarse is None else self.solve(schedule, coarse.Q, self.path, 40, FINE_SLIP_SCALE)
+        local = fine or coarse
+        cost = math.inf if local is None else local.cost
+        if schedule not in done or cost < done[schedule].coarse:
+            done[schedule] = PosturePath(cost, local)
+        return cost < (1.0 - SAME_COST) * least
+
+    def _walks(
+        self, schedule: BraceSchedule, starts: Sequence[tuple[Array, int]]
+    ) -> list[tuple[float, BraceSchedule, Array]]:
+        """Return the walk of least heat from postures at knots, with its heat [W]; empty if none reaches all knots."""
+        whole, best = self.task.problem(schedule, self.path), list[tuple[float, BraceSchedule, Array]]()
+        for q, start in starts:
+            if (Q := self._walk(whole, schedule, q, start)) is not None:
+                whole.freeze_inertia(Q)
+                whole.forces(Q)
+                best.append((whole.heat(), schedule, Q))
+        return sorted(best, key=lambda walk: walk[0])[:1]
+
+    def _profile(self, braces: BraceSet | BraceSchedule, local: Local) -> Array:
+        """Return the heat between the knots of a whole path [W], at the number of intervals of all whole paths."""
+        problem = self.task.problem(braces, len(local.Q), FINE_SLIP_SCALE)
+        problem.freeze_inertia(local.Q)
+        problem.forces(local.Q)
+        heat, knot = problem.work.torque**2 @ self.task.arm.tables.heat, problem.course.knot
+        means = np.array([heat[knot == k].mean() for k in np.unique(knot)])
+        count = self.path - (self.task.kind != "closed")
+        return np.asarray(means[np.arange(count) * len(means) // count])
+
+    def _at(self, knot: int, size: int) -> dict[BraceSet, tuple[float, Array]]:
+        """Return the sets of at most ``size`` braces that are best in one posture at a knot, with heat and posture."""
+        target = self.task.problem((), self.path).course.target[knot]
+        best: dict[BraceSet, tuple[float, Array]] = {}
+        front: list[tuple[BraceSet, list[Array]]] = [((), self._starts(False, target))]
+        for number in range(1, size + 1):
+            cheap = self._cheap(self._sets(number, front), True, target)
+            reached = sorted(
+                ((local.cost, braces, local.Q[0]) for braces, local in cheap.items()), key=lambda item: item[0]
+            )
+            best |= {braces: (cost, q) for cost, braces, q in reached}
+            front = [(braces, [q]) for _, braces, q in reached[:NEIGHBOURS]]
+        return best
 
 
 def _cost(local: Local) -> float:
     return local.cost
+
+
+def _heat(plan: Planned) -> float:
+    return plan.heat
 
 
 def _fits(braces: Sequence[Candidate]) -> bool:

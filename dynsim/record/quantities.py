@@ -37,11 +37,14 @@ _NAMES = {
     "method": "integration method",
     "integration_wall": "integration",
     "real_time_factor": "speed, times real time",
+    "rating_share": "rms torque / rating",
+    "payload_error": "heat with payload error / planned",
+    "mass_error": "heat with mass error / planned",
 }
 _SYMBOLS = {"normal_force": "f_n", "torque": "τ", "current": "i"}
 _SIDES = ("left", "right", "caster")
 # Lengths that are always shown in millimetres.
-_IN_MILLIMETRES = ("hand_error", "sinking", "gap_min")
+_IN_MILLIMETRES = ("hand_error", "hand_sag", "sinking", "gap_min")
 # Results of a sweep in its table and figures, unless the user selects others: energy, and the first error that the runs
 # have.
 ENERGY, ERRORS = "electrical_energy_J", ("hand_error_rms_m", "final_position_error_m")

@@ -18,7 +18,7 @@ from dynsim.compile.solids import Solid, solids_of
 from dynsim.config.problems import suggest
 from dynsim.dynamics.contact.solids import SLOTS
 from dynsim.errors import ModelError, first_few
-from dynsim.model.description import Array, Contact, Robot
+from dynsim.model.description import WORLD, Array, Contact, Robot
 from dynsim.model.surfaces import CORNERS, Box, Capsule
 from dynsim.scenario.candidates import THINNER, unused
 from dynsim.scenario.schema import BodyPair, SceneObject
@@ -52,7 +52,7 @@ def contacts_between(
     names : set of str
         Names of other contacts; extended by those of the result.
     stepped : bool
-        True for time stepping: pairs without a sphere have the contacts of two solids, see
+        True for time stepping: pairs without a moving sphere have the contacts of two solids, see
         :mod:`dynsim.dynamics.contact.solids`. False: points and axes of each solid against the other.
 
     Raises
@@ -62,28 +62,40 @@ def contacts_between(
     """
     result = []
     for a, b, entry in solid_pairs(pairs, robot, objects):
-        for contact in _slots(a, b) if stepped and not (_is_sphere(a) or _is_sphere(b)) else _candidates(a, b):
-            name = unused(f"{contact.body}-{contact.surface.carrier}", names)
-            result.append(replace(contact, name=name, surface_name=str(contact.surface.carrier), **law(entry)))
+        slots = stepped and not (a.is_sphere or (b.is_sphere and b.carrier))
+        for contact in _slots(a, b) if slots else _candidates(a, b):
+            on = contact.surface.carrier or robot.root or WORLD
+            name = unused(f"{contact.body}-{on}", names)
+            result.append(replace(contact, name=name, surface_name=on, **law(entry)))
     if not stepped and len(result) > MOST_CANDIDATES:
+        other = "spheres" if robot.base else "integrator: {method: time_stepping}"  # which has no mobile base
         raise ModelError(
             f"contacts.between: {len(result)} candidates between bodies are more than the {MOST_CANDIDATES} for which "
-            "this method locates events; use integrator: {method: time_stepping}, or fewer pairs",
+            f"this method locates events; use {other}, or fewer pairs",
             keys=("contacts", "between"),
         )
     return result
 
 
 def solid_pairs(
-    pairs: Sequence[BodyPair], robot: Robot, objects: Mapping[str, SceneObject]
+    pairs: Sequence[BodyPair],
+    robot: Robot,
+    objects: Mapping[str, SceneObject],
+    solids: Mapping[str, list[Solid]] | None = None,
 ) -> list[tuple[Solid, Solid, BodyPair]]:
-    """Return the pairs of solids that can touch, each with its entry; see :func:`contacts_between`."""
-    solids = solids_of(robot)
+    """Return the pairs of solids that can touch, each with its entry; see :func:`contacts_between`.
+
+    The first solid of a pair is on a body that moves; the second one may be fixed to the world. ``solids`` defaults to
+    the solids of the robot.
+    """
+    solids = solids_of(robot) if solids is None else solids
     chosen: dict[tuple[str, str], BodyPair] = {}
     for k, entry in enumerate(pairs):
+        ignored = set(map(frozenset, entry.ignore))
         for first, second in _bodies(k, entry, robot, objects, solids):
-            chosen.pop((second, first), None)
-            chosen[first, second] = entry
+            if frozenset((first, second)) not in ignored:
+                chosen.pop((second, first), None)
+                chosen[first, second] = entry
     touching = set(itertools.chain.from_iterable(chosen))
     if left_out := [text for link in robot.links if link.name in touching and not link.radius for text in link.omitted]:
         log.warning(
@@ -97,51 +109,67 @@ def solid_pairs(
     ]
 
 
+def idle_entries(scenario: Any, robot: Robot) -> list[str]:
+    """Return a warning for each entry without pairs, and for pairs in ``ignore`` that its entry does not have."""
+    warnings, entries, objects = [], scenario.config.contacts.between, scenario.config.objects
+    solids = solids_of(robot) if entries else {}
+    for k, entry in enumerate(entries):
+        pairs = set(map(frozenset, _bodies(k, entry, robot, objects, solids)))
+        ignored, where = set(map(frozenset, entry.ignore)), scenario.location(("contacts", "between", k))
+        if pairs <= ignored:
+            why = "no pair remains without neighbours on joints and `ignore`"
+            warnings.append(f"contacts.between.{k} has no effect: {why} ({where})")
+        elif idle := ["-".join(pair) for pair in entry.ignore if frozenset(pair) not in pairs]:
+            warnings.append(
+                f"contacts.between.{k}.ignore has no effect: the entry does not contain {first_few(idle)} ({where})"
+            )
+    return warnings
+
+
 def _bodies(
     k: int, entry: BodyPair, robot: Robot, objects: Mapping[str, SceneObject], solids: Mapping[str, list[Solid]]
 ) -> Iterator[tuple[str, str]]:
-    """Yield the pairs of bodies of entry k, without neighbours on a joint and without ignored pairs."""
+    """Yield the pairs of bodies of entry k, including ignored pairs, without neighbours on a joint; the root last."""
     of_objects = {link.name for name, body in objects.items() for link in body.links(name)}
     keys: tuple[str | int, ...] = ("contacts", "between", k)
-    groups = {LINKS: [b for b in solids if b not in of_objects], OBJECTS: [b for b in solids if b in of_objects]}
+    apart = of_objects | ({robot.base.body} if robot.base else set())  # the arm is mounted within the mobile base
+    groups = {LINKS: [b for b in solids if b not in apart], OBJECTS: [b for b in solids if b in of_objects]}
+    root, fixed = robot.root or WORLD, {frame.name: frame.body or robot.root for frame in robot.frames}
+    bodies = [*robot.bodies, *([root] if robot.root else ())]
 
     def members(name: str, key: str) -> list[str]:
         if name in groups:
             if not groups[name]:
                 raise ModelError(f"contacts.between: no {name} with a solid; set radius_m", keys=(*keys, key))
             return groups[name]
-        if name not in robot.bodies:
-            known = [*robot.bodies, *groups]
-            raise ModelError(
-                f"contacts.between: unknown body {name!r}{suggest(name, known)}; bodies: {', '.join(known)}",
-                keys=(*keys, key),
-            )
-        if name not in solids:
-            (omitted,) = (link.omitted for link in robot.links if link.name == name)
-            reason = f" ({first_few(omitted)})" if omitted else ""
-            raise ModelError(
-                f"contacts.between: body {name!r} has no solid{reason}; set its radius_m", keys=(*keys, key)
-            )
-        return [name]
+        known = [*bodies, *groups]
+        text = f"unknown body {name!r}{suggest(name, known)}; bodies: {', '.join(known)}"
+        if name in solids:
+            return [name]
+        if name in bodies:
+            omitted = [text for link in robot.links if link.name == name for text in link.omitted]
+            fix = "add a <collision> box, sphere or cylinder" if name == robot.root else "set its radius_m"
+            text = f"body {name!r} has no solid{f' ({first_few(omitted)})' if omitted else ''}; {fix}"
+        elif name in fixed:
+            text = f"{name!r} is fixed to {fixed[name]!r}; use {fixed[name]!r}, which has the solids of both"
+        raise ModelError(f"contacts.between: {text}", keys=(*keys, key))
 
     for name in itertools.chain.from_iterable(entry.ignore):
-        if name not in robot.bodies:
+        if name not in bodies:
             members(name, "ignore")
-    if names := {LINKS, OBJECTS, SELF} & set(robot.bodies):
+    if names := {LINKS, OBJECTS, SELF} & set(bodies):
         raise ModelError(f"contacts.between: {min(names)!r} is a group and a body; rename the body", keys=keys)
-    ignored = {frozenset(pair) for pair in entry.ignore} | _neighbours(robot)
+    neighbours = _neighbours(robot, of_objects)
     sides = [LINKS, LINKS] if entry.bodies == SELF else list(entry.bodies)
     seen = set[frozenset[str]]()
     for first, second in itertools.product(*(members(side, "bodies") for side in sides)):
         pair = frozenset((first, second))
-        if len(pair) == 2 and pair not in ignored and pair not in seen:
+        if len(pair) == 2 and pair not in neighbours and pair not in seen:
             seen.add(pair)
-            yield first, second
-    if not seen:
-        log.warning("contacts.between.%d has no effect: no pair remains without neighbours on joints and `ignore`", k)
+            yield (second, first) if first == root else (first, second)
 
 
-def _neighbours(robot: Robot) -> set[frozenset[str]]:
+def _neighbours(robot: Robot, of_objects: set[str]) -> set[frozenset[str]]:
     """Return the pairs of bodies that a joint connects; a wheel also ignores the neighbours of its axle."""
     parents = {link.name: link.parent for link in robot.links}
     pairs = set[frozenset[str]]()
@@ -149,15 +177,11 @@ def _neighbours(robot: Robot) -> set[frozenset[str]]:
         parent = parents[name]
         while parent is not None and parent in robot.carriers:
             parent = parents[parent]
-        if parent is not None:
-            pairs.add(frozenset((name, parent)))
+        if parent is not None or name not in of_objects:  # joints of objects are not on the root link
+            pairs.add(frozenset((name, parent or robot.root or WORLD)))
     wheels = {foot.body for foot in robot.feet if foot.radius and not foot.point.any()}
     beside = {frozenset((wheel, body)) for wheel in wheels for pair in pairs if parents[wheel] in pair for body in pair}
     return pairs | beside
-
-
-def _is_sphere(solid: Solid) -> bool:
-    return isinstance(solid, Capsule) and not solid.axis.any()
 
 
 def _slots(a: Solid, b: Solid) -> Iterator[Contact]:
@@ -168,35 +192,43 @@ def _slots(a: Solid, b: Solid) -> Iterator[Contact]:
 
 def _candidates(a: Solid, b: Solid) -> Iterable[Contact]:
     """Yield points, spheres and axes of each of two solids against the other."""
-    if isinstance(a, Box) and isinstance(b, Box):
+    if b.carrier is None:
+        if isinstance(a, Box):
+            raise ModelError(
+                f"contacts.between: {a.carrier} is a box, and its partner is fixed to the world, for which this method "
+                "has no contacts; use integrator: {method: time_stepping}",
+                keys=("contacts", "between"),
+            )
+        yield from _along(a, b)
+    elif isinstance(a, Box) and isinstance(b, Box):
         yield from (*_corners(a, b), *_corners(b, a), *_edges(a, b))
     elif isinstance(a, Box):
         yield from _candidates(b, a)
     elif isinstance(b, Box):
         # The distance of a sphere from a box covers corners, too.
-        yield from (*_along(a, b), *(_corners(b, a) if a.axis.any() else ()))
-    elif not a.axis.any() or b.axis.any():
-        yield from (*_along(a, b), *(_ends(b, a) if b.axis.any() and a.axis.any() else ()))
+        yield from (*_along(a, b), *(() if a.is_sphere else _corners(b, a)))
+    elif a.is_sphere or not b.is_sphere:
+        yield from (*_along(a, b), *(() if a.is_sphere or b.is_sphere else _ends(b, a)))
     else:
         yield from _along(b, a)
 
 
 def _contact(body: Solid, point: Array, surface: Solid, radius: float, tip: Array | None = None) -> Contact:
     assert body.carrier is not None
-    return Contact("", body.carrier, point, surface, radius=radius, tip=tip)
+    return Contact("", body.carrier, point, surface, radius=radius, tip=tip, is_between_bodies=True)
 
 
 def _ends(a: Capsule, b: Solid) -> Iterator[Contact]:
     """Yield the end spheres of a capsule, one of a sphere, against a solid."""
     yield _contact(a, a.start, b, a.radius)
-    if a.axis.any():
+    if not a.is_sphere:
         yield _contact(a, a.start + a.axis, b, a.radius)
 
 
 def _along(a: Capsule, b: Solid) -> Iterator[Contact]:
     """Yield the ends and the axis of a capsule against a solid; the axis is thinner, so that no point counts twice."""
     yield from _ends(a, b)
-    if a.axis.any():
+    if not a.is_sphere:
         yield _contact(a, a.start, b, max(a.radius - THINNER, 0.0), a.start + a.axis)
 
 

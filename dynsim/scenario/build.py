@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import product
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -15,15 +16,16 @@ from dynsim.compile.mobility import immobile
 from dynsim.compile.model import Model
 from dynsim.compile.posture import on_surfaces
 from dynsim.compile.protocols import BuildContext
-from dynsim.compile.touching import gap_at
+from dynsim.compile.solids import solids_of
+from dynsim.compile.touching import gap_at, separation
 from dynsim.config.base import BodyPoint
 from dynsim.config.problems import dotted, errors_at, suggest
 from dynsim.errors import ModelError, ScenarioError, brief
 from dynsim.library import families
 from dynsim.model.description import WORLD, Array, Contact, Foot, Inertia, Load, Robot
-from dynsim.model.surfaces import SolidPair, Surface
+from dynsim.model.surfaces import Box, Capsule, SolidPair, Surface
 from dynsim.scenario import between
-from dynsim.scenario.candidates import candidates
+from dynsim.scenario.candidates import candidates, unused
 from dynsim.scenario.schema import ContactLaw, ContactPoint, Contacts, LinkSensorConfig, Payload, Scenario
 from dynsim.system.arguments import names_wrong_types
 from dynsim.system.memo import recall
@@ -75,7 +77,7 @@ def unposed(scenario: Scenario) -> Robot:
     """Build the robot in the posture of its plant, before ``initial`` is applied."""
     config = scenario.config
     beside = (config.objects, config.surfaces, config.contacts) if config.objects else ()
-    known = config.plant, config.duration_s, config.loads, config.ties, *beside
+    known = config.plant, config.duration_s, config.loads, config.ties, config.mass_error, *beside
     return recall("plant", lambda: _loaded(scenario), *known)
 
 
@@ -84,13 +86,23 @@ def _loaded(scenario: Scenario) -> Robot:
     if scenario.engine == "kinematic":
         raise ModelError(f"plant {scenario.plant.type!r} is kinematic and has no rigid-body model")
     bare = families.build("plant", scenario.plant, BuildContext(scenario.duration_s), Robot)
+    factor = 1.0
+    if (error := scenario.config.mass_error) is not None:
+        factor = error.payload_factor
+        bare = replace(
+            bare,
+            links=tuple(replace(link, inertia=link.inertia.times(error.robot_factor)) for link in bare.links),
+            motors=tuple(replace(motor, mass=error.robot_factor * motor.mass) for motor in bare.motors),
+        )
     inertias: dict[int, list[Inertia]] = {}
     for name, config in scenario.config.loads.items():
         if isinstance(config, Payload):
             body, point, axes = _attached(bare, name, config)
             # A massless payload leaves the data of its link bit-identical.
             if config.mass_kg > 0.0:
-                inertias.setdefault(body, [bare.links[body].inertia]).append(_payload(name, config, point, axes))
+                inertias.setdefault(body, [bare.links[body].inertia]).append(
+                    _payload(name, config, point, axes).times(factor)
+                )
     links = list(bare.links)
     for body, parts in inertias.items():
         links[body] = replace(links[body], inertia=Inertia.merged(parts))
@@ -176,15 +188,19 @@ def disabled_points(scenario: Scenario, described: Robot) -> list[Contact]:
 def _posed(scenario: Scenario, built: Robot, touching: Sequence[Contact]) -> Robot:
     """Return the robot in the posture that ``initial`` requires."""
     initial = scenario.config.initial
-    first = _first_references(scenario, built)
-    if first is not None:
-        built = replace(built, q0=first)
+    references = _first_references(scenario, built)
+    if references is not None:
+        built = replace(built, q0=references)
     if initial is None or not initial.on_surface:
         return built
     points = {contact.name: contact for contact in touching}
     for name in initial.on_surface:
         if name in points:
             check_body(scenario, built, points[name])
+            if points[name].slot:
+                first = touching[[*points].index(name) - points[name].slot]
+                text = f"initial.on_surface: {name!r} is a further contact of a pair; use {first.name!r}"
+                raise ModelError(text, keys=("initial", "on_surface"))
     try:
         return replace(built, q0=on_surfaces(Model(built), points, initial.on_surface, initial.keep))
     except ModelError as error:
@@ -299,6 +315,10 @@ def controller(
         # The controller plans with the nominal surfaces, not with the simulated ones.
         nominal = replace(scenario, config=scenario.config.model_copy(update={"surface_error": None}))
         touching, start = None, robot_and_contacts(nominal)[0].initial
+    if scenario.config.mass_error is not None:
+        # The same for masses.
+        alone = replace(scenario, config=scenario.config.model_copy(update={"mass_error": None}))
+        machine = Model(replace(unposed(alone), q0=machine.robot.initial))
     touching = contacts(nominal, machine.robot) if touching is None else touching
     points = {contact.name: contact for contact in touching}
     declared = [
@@ -350,18 +370,25 @@ def surfaces(scenario: Scenario) -> dict[str, Surface]:
     """Return all named surfaces, whether used or not, at their simulated positions."""
     context, configs = BuildContext(scenario.duration_s), scenario.config.surfaces
     error = scenario.config.surface_error
+    carried = any(getattr(config, "on", None) for config in configs.values()) and scenario.engine != "kinematic"
+    frames = {frame.name: frame for frame in unposed(scenario).frames} if carried else {}
 
     def built() -> dict[str, Surface]:
-        nominal: dict[str, Surface] = {
-            name: replace(families.build("surface", config, context, Surface), carrier=getattr(config, "on", None))
-            for name, config in configs.items()
-        }
+        nominal: dict[str, Surface] = {}
+        for name, config in configs.items():
+            surface: Surface = families.build("surface", config, context, Surface)
+            on: str | None = getattr(config, "on", None)
+            if (frame := frames.get(on or "")) is not None:
+                with errors_at("surfaces", name, "on"):
+                    surface = surface.turned(frame.R).shifted(frame.p)
+                on = frame.body
+            nominal[name] = replace(surface, carrier=on)
         if error is None or not any(error.shift_m):
             return nominal
         by = np.array(error.shift_m)  # of what stands in the world
         return {name: s if s.carrier is not None else s.shifted(by) for name, s in nominal.items()}
 
-    return recall("surfaces", built, scenario.duration_s, configs, error)
+    return recall("surfaces", built, scenario.duration_s, configs, error, frames)
 
 
 def contacts(scenario: Scenario, described: Robot | None = None) -> list[Contact]:
@@ -388,6 +415,9 @@ def contacts(scenario: Scenario, described: Robot | None = None) -> list[Contact
         for foot in described.feet
         if foot.surface not in known or known[foot.surface].carrier != foot.body
     ]
+    # Corner 1 of a box b and a sphere b1 would have the same name.
+    used = set[str]()
+    result = [replace(contact, name=unused(contact.name, used)) for contact in result]
     for name, point in options.points.items():
         if not point.enabled:
             continue
@@ -413,6 +443,13 @@ def contacts(scenario: Scenario, described: Robot | None = None) -> list[Contact
         pairs, names = options.between, {contact.name for contact in result}
         laws = partial(_law, options)
         stepped = scenario.config.integrator.method == "time_stepping"
+        for k, entry in enumerate(pairs):
+            for name in {*entry.bodies} & {*known} - {*described.bodies} if entry.bodies != between.SELF else ():
+                raise ModelError(
+                    f"contacts.between: {name!r} is a surface, not a body; objects touch all surfaces, links with "
+                    "contacts.points or contacts.candidates; remove this entry",
+                    keys=("contacts", "between", k, "bodies"),
+                )
         result += between.contacts_between(pairs, described, scenario.config.objects, laws, names, stepped)
     if result:
         places = [contact.geometry for contact in result]
@@ -566,6 +603,9 @@ def check_start(
         declared, keys = _keys_of(scenario, contact)
         check_body(scenario, model.robot, contact)
         gap = gap_at(model, contact, q)
+        if isinstance(contact.solid, Box | Capsule) and isinstance(contact.surface, Box | Capsule) and not contact.slot:
+            # A bar through a box has no corner or edge in it, so the gap alone does not show the overlap.
+            gap = min(gap, -float(np.linalg.norm(separation(model, contact.solid, contact.surface, q))) or gap)
         if scenario.config.contacts.law == "unilateral" and gap > (-PRESSED if contact.stiffness > 0.0 else 0.0):
             continue
         if not -depth <= gap <= START_TOLERANCE:
@@ -573,7 +613,15 @@ def check_start(
     if off:
         contact, declared, keys, gap = off[0]
         if contact.is_between_bodies:
-            raise _overlap(scenario, contact, gap)
+            raise _overlap(scenario, contact, model, q)
+        if own and gap < 0.0 and (name := _object_of(scenario, contact)) is not None:
+            same = contact.body, contact.surface_name
+            gap = min(its for other, *_, its in off if (other.body, other.surface_name) == same)
+            raise ModelError(
+                f"objects.{name}.position_m: {name} starts {-gap:.4g} m inside surface {contact.surface_name!r} (limit "
+                f"{depth:g} m); move the object along the normal of the surface by at least {-gap:.4g} m",
+                keys=("objects", name, "position_m"),
+            )
         position = model.point_position(contact.body, contact.point, q)
         remedy = "start from another posture, change the surface"
         if own and scenario.plant.type == "snake":  # `initial` does not place its joints
@@ -594,13 +642,28 @@ def check_start(
         )
 
 
-def _overlap(scenario: Scenario, contact: Contact, gap: float) -> ModelError:
+def _object_of(scenario: Scenario, contact: Contact) -> str | None:
+    """Return the object whose solid has a contact that the scenario does not declare; None for others."""
+    if contact.name in scenario.config.contacts.points:
+        return None
+    bodies = ((name, link.name) for name, body in scenario.config.objects.items() for link in body.links(name))
+    return next((name for name, link in bodies if link == contact.body), None)
+
+
+def _overlap(scenario: Scenario, contact: Contact, model: Model, q: Array) -> ModelError:
     """Return the error about two bodies that overlap at the start."""
-    bodies = contact.body, contact.surface_name
-    movable = [name for name in bodies if name in scenario.config.objects]
-    remedy = f"move {movable[0]} (objects.{movable[0]}.position_m)" if movable else "start from another posture"
+    bodies, solids = (contact.body, contact.surface_name), solids_of(model.robot)
+    pairs = product(*(solids[body] for body in bodies))
+    by = max((separation(model, a, b, q) for a, b in pairs), key=lambda push: float(np.linalg.norm(push)))
+    movable = next((name for name in bodies if name in scenario.config.objects), None)
+    remedy = "start from another posture"
+    if movable is not None:
+        # Components are rounded away from zero, so that the bodies do not overlap afterwards.
+        steps = (by if movable == bodies[0] else -by) / 1e-5
+        x, y, z = 1e-5 * np.copysign(np.ceil(np.abs(steps) - 1e-3), steps) + 0.0
+        remedy = f"move {movable} by ({x:.6g}, {y:.6g}, {z:.6g}) m (objects.{movable}.position_m)"
     return ModelError(
-        f"contacts.between: {bodies[0]} and {bodies[1]} overlap by {-gap:.4g} m at the start (limit "
+        f"contacts.between: {bodies[0]} and {bodies[1]} overlap by {np.linalg.norm(by):.4g} m at the start (limit "
         f"{START_TOLERANCE:g} m); {remedy}, or list the pair in `ignore`",
         keys=("contacts", "between"),
     )

@@ -70,7 +70,7 @@ def _of_kinematics(config: Any) -> Iterator[tuple[Keys, str]]:
         part = getattr(config, section)
         for key in () if part is None else type(part).model_fields:
             yield (section, key), f"plant {config.plant.type} is kinematic"
-    for section in ("loads", "ties", "sensors"):
+    for section in ("loads", "ties", "mass_error", "sensors"):
         yield (section,), f"plant {config.plant.type} is kinematic"
     if hasattr(config.plant, "dynamics"):
         yield ("plant", "dynamics"), "plant.level is kinematic"
@@ -97,8 +97,15 @@ def _of_contacts(config: Any) -> Iterator[tuple[Keys, str]]:
         for key in type(contacts).model_fields:
             if key not in ("law", "candidates", "points", "between", "reference_tolerance_m"):
                 yield ("contacts", key), "contacts.points is empty, and contacts.candidates is points"
-    if contacts.candidates != "points" and not config.surfaces:
-        yield ("contacts", "candidates"), "the scenario has no surfaces"
+    carried = {name: body for name, part in config.surfaces.items() if (body := getattr(part, "on", None)) is not None}
+    if contacts.candidates != "points" and len(carried) == len(config.surfaces):
+        yield ("contacts", "candidates"), f"the scenario has no surfaces{' in the world' if carried else ''}"
+    touched = {point.surface for point in contacts.points.values()}
+    for name, body in carried.items():
+        # Free objects touch all surfaces that they do not carry.
+        feet = touches and any(part.joint is None and key != body for key, part in config.objects.items())
+        if name not in touched and not (has_feet or feet):
+            yield ("surfaces", name), f"no contact point and no free object can touch a surface on {body}"
     for name, point in contacts.points.items():
         if point.grip is not None and point.grip.ratio == 1.0:
             yield ("contacts", "points", name, "grip"), "ratio 1 means equal friction in all directions"

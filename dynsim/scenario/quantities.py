@@ -37,6 +37,7 @@ _NAMED = (
 )  # fmt: skip
 _GENERAL = (
     "plant", "arm", "controller", "contacts", "integrator", "record", "metrics", "motor", "link", "surface_error",
+    "mass_error", "requirements",
 )  # fmt: skip
 # Keys of an entry of a chain that belong to the link; all others belong to the joint.
 _OF_LINK = ("length", "radius", "mass", "com", "inertia", "count")

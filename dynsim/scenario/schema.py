@@ -841,6 +841,53 @@ class SurfaceError(StrictConfig):
     friction_factor: NonNegative = default(1.0, "factor on all coefficients of friction")
 
 
+class MassError(StrictConfig):
+    """Difference between the simulated masses and the masses that the controller assumes."""
+
+    robot_factor: NonNegative = default(1.0, "factor on masses and moments of inertia of all links and motors")
+    payload_factor: NonNegative = default(1.0, "factor on masses and moments of inertia of all payloads")
+
+
+class Requirements(StrictConfig):
+    """Requirements that a plan of braces must meet; simulations do not use them."""
+
+    hand_sag_m: Positive | None = default(
+        None, "maximum displacement of the hand under hand_force_N, with the gains of the plan"
+    )
+    hand_force_N: Vector3 | None = default(None, "additional force on the hand, in the world, for hand_sag_m")
+    gear_stiffness_N_m_per_rad: Positive | None = default(
+        None,
+        "stiffness of every gear, in series with the gains, for hand_sag_m; N/m at a prismatic joint; default: rigid",
+    )
+    rating_share: Positive | None = default(
+        None, "maximum rms torque of every motor, as a fraction of its continuous rating"
+    )
+    hand_error_m: Positive | None = default(
+        None, "maximum rms error of the hand in simulated runs, in addition to the error of the surfaces"
+    )
+    heat_ratio: float | None = default(
+        None,
+        "maximum heat of the simulated runs, as a multiple of the heat of the run without errors; default: 1.5",
+        gt=1.0,
+    )
+    payload_error: float | None = default(
+        None, "relative error of the masses of all payloads that a plan must tolerate", gt=0.0, lt=1.0
+    )
+    mass_error: float | None = default(
+        None, "relative error of the masses of all links and motors that a plan must tolerate", gt=0.0, lt=1.0
+    )
+
+    @model_validator(mode="after")
+    def _check_force(self) -> Self:
+        if self.hand_sag_m is not None and not any(self.hand_force_N or ()):
+            raise error_at("hand_sag_m", "requires hand_force_N, such as [0, 0, -30]; add a force")
+        if self.hand_sag_m is None:
+            for key in ("hand_force_N", "gear_stiffness_N_m_per_rad"):
+                if getattr(self, key) is not None:
+                    raise error_at(key, "requires hand_sag_m, such as 0.001; add it, or remove this key")
+        return self
+
+
 class Integrator(StrictConfig):
     """Time integration."""
 
@@ -920,6 +967,10 @@ class ScenarioConfig(StrictConfig):
     surface_error: SurfaceError | None = default(
         None, "difference between the surfaces and the controller's assumptions; default: none"
     )
+    mass_error: MassError | None = default(
+        None, "difference between the masses and the controller's assumptions; default: none"
+    )
+    requirements: Requirements | None = default(None, "requirements for plans of braces; default: none")
     initial: Initial | None = default(
         None, "changes to the initial posture and motor currents; default: as in the plant"
     )
@@ -944,6 +995,9 @@ class ScenarioConfig(StrictConfig):
     @model_validator(mode="after")
     def _check_combinations(self) -> Self:
         check_keys(self)
+        payloads = any(isinstance(load, Payload) for load in self.loads.values())
+        if self.requirements is not None and self.requirements.payload_error is not None and not payloads:
+            raise error_at("requirements.payload_error", "requires a load of type payload; add it, or remove this key")
         return self
 
     @field_validator("name", "variant")

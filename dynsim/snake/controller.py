@@ -95,20 +95,24 @@ def new_work(model: SnakeModel) -> ControlWork:
 
 
 @internal_kernel
-def append_row(k, row, tolerance, lower, reflector, beta):
-    """Extend M = L Q^T by ``row``, which is overwritten; write row k of L and reflector k.
+def reflect(j, reflector, beta, vector):
+    """Apply reflection j to a vector, in place."""
+    s = 0.0
+    for i in range(j, vector.shape[0]):
+        s += reflector[j, i] * vector[i]
+    s *= beta[j]
+    for i in range(j, vector.shape[0]):
+        vector[i] -= s * reflector[j, i]
+
+
+@internal_kernel
+def add_row(k, row, tolerance, lower, reflector, beta):
+    """Extend M = L Q^T by ``row`` after all earlier reflections; write row k of L and reflector k.
 
     Returns False and keeps k rows if the part of ``row`` that is independent of the earlier rows is shorter than
     ``tolerance``. With tolerance 0 even a dependent row is accepted; its pivot is tiny, and damping must handle it.
     """
     n = row.shape[0]
-    for j in range(k):
-        s = 0.0
-        for i in range(j, n):
-            s += reflector[j, i] * row[i]
-        s *= beta[j]
-        for i in range(j, n):
-            row[i] -= s * reflector[j, i]
     norm = 0.0
     for i in range(k, n):
         norm += row[i] * row[i]
@@ -128,17 +132,6 @@ def append_row(k, row, tolerance, lower, reflector, beta):
         square += reflector[k, i] * reflector[k, i]
     beta[k] = 2.0 / square
     return True
-
-
-@internal_kernel
-def reflect(j, reflector, beta, vector):
-    """Apply reflection j to a vector, in place."""
-    s = 0.0
-    for i in range(j, vector.shape[0]):
-        s += reflector[j, i] * vector[i]
-    s *= beta[j]
-    for i in range(j, vector.shape[0]):
-        vector[i] -= s * reflector[j, i]
 
 
 @internal_kernel
@@ -180,15 +173,21 @@ def smallest_singular_value(count, tolerance, lower, u, y):
 
 
 @internal_kernel
-def factor_rows(B, rows, count, shape_joints, scale, row, lower, reflector, beta):
-    """Factorise B~ diag(scale) = L Q^T for a mode; B~ is ``rows[:count]`` of B, then S. Return the number of rows."""
+def factor_rows(B, rows, count, shape_joints, scale, lower, reflector, beta):
+    """Factorise B~ diag(scale) = L Q^T for a mode; B~ is ``rows[:count]`` of B, then S. Return the number of rows.
+
+    Each reflection is applied to all later rows at once, because the processor overlaps their independent sums.
+    """
     total = count + shape_joints.shape[0]
     for k in range(total):
-        for i in range(row.shape[0]):
-            row[i] = B[rows[k], i] * scale[i] if k < count else 0.0
+        for i in range(scale.shape[0]):
+            reflector[k, i] = B[rows[k], i] * scale[i] if k < count else 0.0
         if k >= count:
-            row[shape_joints[k - count]] = scale[shape_joints[k - count]]
-        append_row(k, row, 0.0, lower, reflector, beta)
+            reflector[k, shape_joints[k - count]] = scale[shape_joints[k - count]]
+    for j in range(total):
+        add_row(j, reflector[j], 0.0, lower, reflector, beta)
+        for k in range(j + 1, total):
+            reflect(j, reflector, beta, reflector[k])
     return total
 
 
@@ -197,7 +196,7 @@ def sigma_min(model, law, work, grounded):
     """Return the smallest singular value of the unweighted B~ of a mode; ``work.B`` must be up to date."""
     lower = work.lower
     count = active_rows(model, grounded, work.rows)
-    k = factor_rows(work.B, work.rows, count, law.shape_joints, work.ones, work.row, lower, work.reflector, work.beta)
+    k = factor_rows(work.B, work.rows, count, law.shape_joints, work.ones, lower, work.reflector, work.beta)
     return smallest_singular_value(k, 1e-6, lower, work.singular, work.solution)
 
 
@@ -283,7 +282,7 @@ def control_input(model, law, work, w, phi, w_target, velocity, mode, null_gain)
     walk_chain(model, w, phi, work.frame, chain)
     constraint_matrices(model, chain, w, A, B)
     count = active_rows(model, grounded, kept)
-    rows = factor_rows(B, kept, count, shape_joints, root, row, lower, reflector, beta)
+    rows = factor_rows(B, kept, count, shape_joints, root, lower, reflector, beta)
 
     for i in range(6):
         deviation = w[i] - w_target[i]
@@ -323,8 +322,10 @@ def control_input(model, law, work, w, phi, w_target, velocity, mode, null_gain)
             for i in range(row.shape[0]):
                 row[i] = 0.0
             row[joint] = root[joint]
+            for j in range(rows):
+                reflect(j, reflector, beta, row)
             # If almost only this joint can perform the task, the other joints would need 1/tolerance times its rate.
-            if append_row(rows, row, 1e-3 * root[joint], lower, reflector, beta):
+            if add_row(rows, row, 1e-3 * root[joint], lower, reflector, beta):
                 rhs[rows] = bound
                 rows += 1
                 at_limit[joint] = 1

@@ -12,7 +12,6 @@ sample and are computed before any motion starts.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -99,14 +98,6 @@ def wheels_of(scene: Scene, pair: str) -> list[WheelOfPair]:
 # Kinematics of the base part with lifted wheel pairs: pitch angles of the plates that are hinged at the axles.
 
 
-Coefficients = tuple[float, float, float]
-NEWTON_STEPS = 12
-# Minimum change of height per pitch angle [m/rad]; if it is less, the height is out of reach.
-FLAT = 1e-12
-# Size of the last Newton step of a pitch angle [rad]; the height of the wheel is then accurate to 2e-10 m.
-CONVERGED = 1e-9
-
-
 @dataclass(frozen=True)
 class Fold:
     """Base part folded about its axles, at T instants.
@@ -174,48 +165,16 @@ class BasePart:
         ArithmeticError
             If a height is out of reach; the exception's arguments are the indices of the instant and of the pair.
         """
-        hinge, lower, tilt = np.zeros_like(yaw), np.zeros_like(height), np.zeros_like(height)
-        before, behind, half_track = self.before.tolist(), self.behind.tolist(), self.half_track.tolist()
-        for row in range(len(yaw)):
-            ux, uy, uz = 0.0, 0.0, 1.0  # e_z in the frame of the plate
-            z = self.radius
-            for j, (angle, above) in enumerate(zip(yaw[row].tolist(), height[row, 1:].tolist(), strict=True)):
-                cos, sin, half = math.cos(angle), math.sin(angle), half_track[j + 1]
-                x, y = -before[j] - behind[j] * cos, -behind[j] * sin
-                # Coefficients of 1, cos psi, sin psi in up . Ry(psi) vector, for the vector to the next axle and for
-                # the axle's direction.
-                rise, slope = (uy * y, ux * x, -uz * x), (uy * cos, -ux * sin, uz * sin)
-                needed = [self._angle(z - above, rise, slope, lever) for lever in (half, -half)]
-                if any(map(math.isnan, needed)):
-                    raise ArithmeticError(row, j + 1)
-                psi = max(needed)
-                c, s = math.cos(psi), math.sin(psi)
-                z += rise[0] + rise[1] * c + rise[2] * s
-                incline = slope[0] + slope[1] * c + slope[2] * s
-                hinge[row, j], tilt[row, j + 1] = psi, 2.0 * half * abs(incline)
-                lower[row, j + 1] = z - half * abs(incline) - self.radius * math.sqrt(1.0 - incline**2)
-                x, uz = c * ux - s * uz, s * ux + c * uz  # Ry(psi)^T up, then Rz(theta)^T of it
-                ux, uy = cos * x + sin * uy, cos * uy - sin * x
-        return Fold(hinge, lower, tilt)
+        # Imported here because the commands for servos must not import numba.
+        from dynsim.jit.kernel import reals
+        from dynsim.snake.fold import fold_rows
 
-    def _angle(self, above: float, rise: Coefficients, slope: Coefficients, lever: float) -> float:
-        """Solve above + rise + lever slope - r sqrt(1 - slope^2) = 0 for psi by Newton's method; NaN if it fails."""
-        psi = 0.0
-        for _ in range(NEWTON_STEPS):
-            c, s = math.cos(psi), math.sin(psi)
-            incline, rate = slope[0] + slope[1] * c + slope[2] * s, slope[2] * c - slope[1] * s
-            if not abs(incline) < 1.0:
-                break
-            disc = math.sqrt(1.0 - incline**2)
-            change = rise[2] * c - rise[1] * s + lever * rate + self.radius * incline * rate / disc
-            if not abs(change) > FLAT:
-                break
-            step = (above + rise[0] + rise[1] * c + rise[2] * s + lever * incline - self.radius * disc) / change
-            psi -= step
-            # Convergence is quadratic, so the next step would be of the order of this step squared.
-            if abs(step) < CONVERGED:
-                return psi
-        return math.nan
+        hinge, lower, tilt = np.zeros(yaw.shape), np.zeros(height.shape), np.zeros(height.shape)
+        arrays = map(reals, (self.before, self.behind, self.half_track, yaw, height))
+        row, pair = fold_rows(*arrays, float(self.radius), hinge, lower, tilt)
+        if pair > 0:
+            raise ArithmeticError(row, pair)
+        return Fold(hinge, lower, tilt)
 
 
 def base_part(record: Record, pairs: tuple[str, ...]) -> BasePart:
@@ -414,15 +373,15 @@ def refuse_short_lift(lifts: Lifts, name: str, up: float, down: float, blends: i
         )
 
 
-def height_of(time: Array, up: Array | float, down: Array | float, lifts: Lifts) -> Array:
+def height_of(time: Array | float, up: Array | float, down: Array | float, lifts: Lifts) -> Array:
     """Return the height [m] at ``time`` of a pair that is lifted from ``up`` to ``down`` [s], which may be infinite."""
-    since, until = (time - up) / lifts.blend_s, (down - time) / lifts.blend_s
-    return 1e-3 * lifts.clearance_mm * _smooth(since) * _smooth(until)
+    from dynsim.jit.kernel import reals
+    from dynsim.snake.fold import lift_heights
 
-
-def _smooth(u: Array) -> Array:
-    u = np.clip(u, 0.0, 1.0)
-    return u**3 * (10.0 + u * (-15.0 + 6.0 * u))
+    times = [reals(x) for x in np.broadcast_arrays(np.atleast_1d(time), up, down)]
+    height = np.zeros(times[0].shape)
+    lift_heights(*times, 1e-3 * lifts.clearance_mm, lifts.blend_s, height)
+    return height
 
 
 def _refuse_twist(tilt: Array, lifts: Lifts, pairs: tuple[str, ...], time: Array) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 from dynsim.jit.kernel import internal_kernel, kernel
 from dynsim.snake import controller
 from dynsim.snake.controller import ControlWork, control_input, estimate_from_joints, new_work, sigma_min
+from dynsim.snake.fold import OUT_OF_REACH, add_lift, lift_rates
 from dynsim.snake.kinematics import (
     SnakeModel,
     constraint_matrices,
@@ -39,6 +40,8 @@ PATH_SLOWED = WAITED_FOR + ATTITUDE + 1  # ticks in which the target moved slowe
 STILL = PATH_SLOWED + 1  # ticks since the target started to wait
 STILL_FOR = STILL + 1  # reason for the last wait
 COUNTS_SIZE = STILL_FOR + 1
+# Result of a control period whose commanded positions are no longer finite, see also OUT_OF_REACH.
+NOT_FINITE = -2
 # Indices of SnakeState.progress
 DONE = 0  # executed part of the current row of commands, 0 to 1
 LATE = 1  # delay of a slowed target [control periods]
@@ -523,27 +526,93 @@ def record_command(schedule, state, ws, r, trace):
         trace.w_hat[r, i] -= schedule.period * ws.rate[i]
 
 
-@kernel
-def command_tick(model, law, schedule, state, velocity, moving, slows, ws, r, trace):
-    """Run one control period of an externally simulated robot; joints and wheels of ``state`` are commanded positions.
+@internal_kernel
+def command_tick(model, law, schedule, state, velocity, moving, slows, ws, r, trace, lines):
+    """Run one control period of a robot that is simulated elsewhere, and write the references of joints and wheels.
 
-    For the parameters see :func:`command`. Commands and estimates at the beginning of the period are written to
-    row r of the trace unless r is -1. Returns True if the command was not executed.
+    Commands and estimates at the beginning of the period are written to row r of the trace unless r is -1. Returns
+    whether the command was executed, and whether the commanded positions are finite.
     """
+    phi, rho, u, period = state.phi, state.rho, ws.work.u, schedule.period
+    joints, first, total = phi.shape[0], lines.shape[0] - rho.shape[0], 0.0
     if r >= 0:
         trace.mode[r] = state.counts[MODE]
         copy(state.w_target, trace.w_target[r])
-        copy(state.phi, trace.phi[r])
+        copy(phi, trace.phi[r])
     reason, commanded, speed = command(model, law, schedule, state, velocity, moving, slows, ws)
     blocked = settle(schedule, state, moving, reason, commanded, speed, ws)
     if r >= 0:
         record_command(schedule, state, ws, r, trace)
-    joints = state.phi.shape[0]
     for j in range(joints):
-        state.phi[j] += schedule.period * ws.work.u[j]
-    for j in range(state.rho.shape[0]):
-        state.rho[j] += schedule.period * ws.work.u[joints + j]
-    return blocked
+        lines[j, 0], lines[j, 1] = phi[j], u[j]
+        phi[j] += period * u[j]
+        total += phi[j]
+    for j in range(rho.shape[0]):
+        lines[first + j, 0], lines[first + j, 1] = 0.0, u[joints + j]
+        rho[j] += period * u[joints + j]
+    return blocked, math.isfinite(total)
+
+
+@kernel
+def command_ticks(
+    model, law, schedule, state, velocity, moving, slows, ws, stride, trace,
+    lifting, up, down, added, added_rate, update, count, lines,
+):  # fmt: skip
+    """Run control periods of a robot that is simulated elsewhere, in the current mode.
+
+    Joints and wheels of ``state`` are commanded positions. The function returns after a period whose command was not
+    executed.
+
+    Parameters
+    ----------
+    model, law, schedule, state, velocity, moving, slows, ws
+        See :func:`command`.
+    stride, trace
+        See :func:`run_ticks`.
+    lifting : LiftTables
+        Lifting of the wheel pairs.
+    up, down : (pairs,) ndarray
+        Times between which the pairs are lifted [s].
+    added, added_rate : (pairs - 1,) ndarray
+        Angles that lifting adds to the pitch joints on the axles [rad], and their rates [rad/s].
+    update : int
+        Tick at which these rates are updated.
+    count : int
+        Number of control periods.
+    lines : (count, motors, 2) ndarray
+        Output: positions and rates of the references of joints, pitch joints that only lift, and wheels.
+
+    Returns
+    -------
+    done : int
+        Number of completed periods.
+    blocked : bool
+        Whether the last command was not executed.
+    update : int
+        Tick of the next update; OUT_OF_REACH if no pitch angles can lift the pairs, NOT_FINITE if the commanded
+        positions are no longer finite.
+    """
+    joints, head, period = state.phi.shape[0], model.head_joints, schedule.period
+    done, blocked = 0, False
+    while done < count and not blocked:
+        now, line = state.counts[TICKS], lines[done]
+        r = now // stride if now % stride == 0 else -1
+        blocked, finite = command_tick(model, law, schedule, state, velocity, moving, slows, ws, r, trace, line)
+        if not finite:
+            return done, blocked, NOT_FINITE
+        if now >= update:
+            yaw, rate = state.phi[head:], ws.work.u[head:joints]
+            ticks = lift_rates(lifting, up, down, now * period, period, yaw, rate, added, added_rate)
+            if ticks == OUT_OF_REACH:
+                return done, blocked, OUT_OF_REACH
+            update = now + ticks
+        for k in range(added.shape[0]):
+            row = joints + k - 1 if k > 0 else head - 1  # the joint on the axle of pair 1 carries the head
+            if k > 0:
+                line[row, 0], line[row, 1] = 0.0, 0.0
+            add_lift(line[row], added, added_rate, period, k)
+        done += 1
+    return done, blocked, update
 
 
 @kernel
@@ -566,6 +635,18 @@ def record_row(model, law, state, ws, r, trace):
     copy(state.w_target, trace.w_target[r])
     copy(phi, trace.phi[r])
     copy(rho, trace.rho[r])
+
+
+@kernel
+def record_rows(model, law, state, ws, trace):
+    """Complete the rows of a trace that have base, joints, wheels, target and mode; ``state`` is workspace."""
+    for r in range(trace.mode.shape[0]):
+        copy(trace.base[r], state.base)
+        copy(trace.phi[r], state.phi)
+        copy(trace.rho[r], state.rho)
+        copy(trace.w_target[r], state.w_target)
+        state.counts[MODE] = trace.mode[r]
+        record_row(model, law, state, ws, r, trace)
 
 
 @kernel

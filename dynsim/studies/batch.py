@@ -12,7 +12,6 @@ from dynsim.errors import DynsimError, ScenarioError, SimulationInterrupted, Sim
 from dynsim.scenario import Scenario, require_scenario
 from dynsim.studies.outcome import RunResult
 from dynsim.studies.processes import WorkerInterrupted, WorkerLost, run_in_processes
-from dynsim.system import interruption
 from dynsim.system.arguments import names_wrong_types
 from dynsim.system.memo import Memo, remembering
 
@@ -43,7 +42,7 @@ def simulate_batch(
     scenarios : iterable of Scenario
         Scenarios to simulate; their plants may differ.
     jobs : int, optional
-        Number of worker processes; 1 (default) simulates in this process.
+        Number of processes, including this process while runs are short; default: 1.
     keep_records : {"none", "failed", "all"}, optional
         Results that keep their record: none (default), only the results of runs that stopped early, or all.
     scheduler : str, optional
@@ -181,29 +180,15 @@ def run_all(
         from dynsim.studies.cluster import run_on_cluster
 
         return run_on_cluster(work, tasks, take, scheduler)
-    if jobs > 1:
 
-        def take_late(task: Task, result: Callable[[], RunResult | None]) -> None:
-            try:
-                ended = result()
-            except (SimulationInterrupted, WorkerInterrupted):
-                return
-            except WorkerLost as lost:
-                ended = RunResult({}, str(lost), lost=True)
-            if ended is not None:
-                take(task, ended)
+    def take_late(task: Task, result: Callable[[], RunResult | None]) -> None:
+        try:
+            ended = result()
+        except (SimulationInterrupted, WorkerInterrupted):
+            return
+        except WorkerLost as lost:
+            ended = RunResult({}, str(lost), lost=True)
+        if ended is not None:
+            take(task, ended)
 
-        return run_in_processes(work, tasks, jobs, take_late, attempts=ATTEMPTS)
-    try:
-        for task in tasks:
-            result = work(task, None)
-            interruption.keep()
-            take(task, result)
-            interruption.heed()
-            interruption.check()
-    except SimulationInterrupted:
-        return True
-    except KeyboardInterrupt:
-        interruption.answered()
-        return True
-    return False
+    return run_in_processes(work, tasks, jobs, take_late, attempts=ATTEMPTS, here=lambda task: None)

@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
-from dynsim.engine import SIMULATION, simulate
+from dynsim.engine import SIMULATION, Progress, simulate
 from dynsim.errors import ScenarioError, SimulationInterrupted, SimulationStopped, brief
 from dynsim.record import Record
 from dynsim.record.csv_rows import csv_table
@@ -16,6 +16,21 @@ from dynsim.studies.processes import WorkerInterrupted, WorkerLost, run_in_proce
 from dynsim.studies.sweep import FAILED, OK, flat
 from dynsim.system.arguments import names_wrong_types
 from dynsim.system.files import json_text, replace_together
+from dynsim.system.memo import Memo, remembering
+
+
+class _Sharing:
+    """Function object that simulates scenarios; in each process, the runs share intermediate results."""
+
+    def __init__(self) -> None:
+        self._memo = Memo()
+
+    def __call__(self, scenario: Scenario, look: Progress | None) -> Record:
+        with remembering(self._memo):
+            return simulate(scenario, look)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), ()
 
 
 class VariantProgress(Protocol):
@@ -43,7 +58,7 @@ def compare(
     overrides : mapping, optional
         Values by dotted key, for all variants.
     jobs : int, optional
-        Number of worker processes; 1 (default) simulates in this process.
+        Number of processes, including this process while runs are short; default: 1.
     progress : callable, optional
         See :class:`VariantProgress`. With several processes, it is called only when a variant ends.
     finished : callable, optional
@@ -83,7 +98,7 @@ def compare(
     records: dict[str, Record] = {}
     stops: dict[str, SimulationStopped] = {}
 
-    def take(name: str, result: Callable[[], Record | None]) -> None:
+    def take_record(name: str, result: Callable[[], Record | None]) -> None:
         try:
             record = result()
         except WorkerInterrupted:
@@ -101,22 +116,16 @@ def compare(
         if name in stops and stopped is not None:
             stopped(name, stops[name])
 
-    if jobs > 1:
+    def take(scenario: Scenario, result: Callable[[], Record | None]) -> None:
+        name = scenario.variant
+        take_record(name, result)
+        if progress is not None and name in records:
+            progress(name, scenario.duration_s)
 
-        def take_late(scenario: Scenario, result: Callable[[], Record | None]) -> None:
-            name = scenario.variant
-            take(name, result)
-            if progress is not None and name in records:
-                progress(name, scenario.duration_s)
+    def here(scenario: Scenario) -> Progress | None:
+        return None if progress is None or jobs > 1 else partial(progress, scenario.variant)
 
-        interrupted = run_in_processes(simulate, scenarios.values(), jobs, take_late)
-    else:
-        interrupted = False
-        for name, scenario in scenarios.items():
-            take(name, partial(simulate, scenario, None if progress is None else partial(progress, name)))
-            if isinstance(stops.get(name), SimulationInterrupted):
-                interrupted = True
-                break
+    interrupted = run_in_processes(_Sharing(), scenarios.values(), jobs, take, here=here)
     if stops or interrupted:
         left = [name for name in names if name not in records and name not in stops]
         raise _combined_stop({name: stops[name] for name in names if name in stops}, left, interrupted)

@@ -33,36 +33,39 @@ LAWS = {"normal": "mean, standard deviation", "uniform": "minimum, maximum"}
 
 @dataclass(frozen=True)
 class Axis:
-    """Scenario key and the values that it takes one after the other."""
+    """Scenario key and the values that it takes one after the other, from an option of the command line."""
 
     key: str
     values: tuple[Any, ...]
+    option: str = "--grid"
 
     @classmethod
-    def parse(cls, text: str) -> Axis:
-        """Parse ``KEY=start:stop:count``, both ends included, or ``KEY=a,b,…``.
+    def parse(cls, text: str, option: str = "--grid", default: int | None = None) -> Axis:
+        """Parse ``KEY=start:stop:count``, both ends included, or ``KEY=a,b,…``; ``default`` is used without a count.
 
         Raises
         ------
         ScenarioError
             If the text has neither form, or its values are invalid.
         """
-        key, value = _split(text, "--grid", "contacts.friction=0:1:5 or contacts.friction=0,0.1")
+        key, value = _split(text, option, "contacts.friction=0:1:5 or contacts.friction=0,0.1")
+        if default is not None and (match := _HALF_RANGE.fullmatch(value)) and match[3] is None:
+            value = f"{value}:{default}"
         if match := _RANGE.fullmatch(value):
             start, stop, count = float(match[1]), float(match[2]), int(match[3])
             if not 2 <= count <= MAX_RUNS:
-                raise ScenarioError(f"--grid {text}: count must be between 2 (both ends are included) and {MAX_RUNS}")
+                raise ScenarioError(f"{option} {text}: count must be between 2 (both ends are included) and {MAX_RUNS}")
             # Round to twelve digits, to get 0.3 instead of 0.30000000000000004.
-            return cls(key, tuple(float(f"{x:.12g}") for x in np.linspace(start, stop, count)))
+            return cls(key, tuple(float(f"{x:.12g}") for x in np.linspace(start, stop, count)), option)
         if match := _HALF_RANGE.fullmatch(value):
             example = f"{key}={match[1]}:{match[2]}:5"
-            raise ScenarioError(f"--grid {text}: must be start:stop:count with an integer count, such as {example}")
-        values = parse_yaml(f"[{value}]", ScenarioError, f"--grid {key}", line_numbers=False)
+            raise ScenarioError(f"{option} {text}: must be start:stop:count with an integer count, such as {example}")
+        values = parse_yaml(f"[{value}]", ScenarioError, f"{option} {key}", line_numbers=False)
         if not values:
-            raise ScenarioError(f"--grid {text}: has no values")
+            raise ScenarioError(f"{option} {text}: has no values")
         if len(set(map(json.dumps, values))) < len(values):
-            raise ScenarioError(f"--grid {text}: contains a value twice; remove one of them")
-        return cls(key, tuple(values))
+            raise ScenarioError(f"{option} {text}: contains a value twice; remove one of them")
+        return cls(key, tuple(values), option)
 
 
 @dataclass(frozen=True)
@@ -172,7 +175,7 @@ class Plan:
         # not change.
         overrides = self.overrides if isinstance(self.overrides, SetOptions) else {}
         options = [("--set", key, [key]) for key in overrides]
-        options += [("--grid", axis.key, self._entries(axis.key)) for axis in self.grid]
+        options += [(axis.option, axis.key, self._entries(axis.key)) for axis in self.grid]
         options += [("--sample", law.key, self._entries(law.key)) for law in self.laws]
         # Option that set each key; there is also an entry for every key that contains it.
         inside: dict[str, str] = {}

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import struct
-from collections import OrderedDict
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
 import numpy as np
 from pydantic import BaseModel
@@ -27,19 +26,19 @@ class Memo:
     """
 
     def __init__(self) -> None:
-        self._kept: dict[str, OrderedDict[Hashable, tuple[Any, Any]]] = {}
+        # Bits of the inputs, inputs and result of each call, the last one first.
+        self._kept: dict[str, list[tuple[Any, Any, Any]]] = {}
 
     def recall(self, kind: str, make: Callable[[], T], *inputs: Any) -> T:
         """Return the result for the given inputs, as described for the function :func:`recall`."""
-        kept, key = self._kept.setdefault(kind, OrderedDict()), _bits(inputs)
-        if key in kept:
-            kept.move_to_end(key)
-            return cast(T, kept[key][1])
-        result = make()
+        kept, bits = self._kept.setdefault(kind, []), _bits(inputs)
+        # A few comparisons take less time than hashes, which Python computes again at each access.
+        k = next((k for k, entry in enumerate(kept) if entry[0] == bits), None)
         # Keep the inputs too, so that no other object can reuse the identity of a deleted one.
-        kept[key] = inputs, result
-        if len(kept) > KEPT:
-            kept.popitem(last=False)
+        entry = (bits, inputs, make()) if k is None else kept.pop(k)
+        kept.insert(0, entry)
+        del kept[KEPT:]
+        result: T = entry[2]
         return result
 
 
@@ -74,7 +73,7 @@ def recall(kind: str, make: Callable[[], T], *inputs: Any) -> T:
     return make() if memo is None else memo.recall(kind, make, *inputs)
 
 
-def _bits(value: Any) -> Hashable:
+def _bits(value: Any) -> Any:
     kind = type(value)
     if kind is np.ndarray:
         if value.dtype == object:

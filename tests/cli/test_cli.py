@@ -19,7 +19,7 @@ from ruamel.yaml import YAML
 from support.messages import check_message, lines_with, mentions, says
 
 from dynsim._version import __version__
-from dynsim.cli import main
+from dynsim.cli import commands, drawing, main
 from dynsim.cli.tables import _CONTACT_ROWS
 from dynsim.engine import check
 from dynsim.jit.kernel import cache_folder
@@ -113,6 +113,31 @@ def test_tables_of_the_paper_are_written_without_figures(tmp_path: Path):
     rows = list(csv.reader((folder / "table_iii.csv").read_text().splitlines()))
     assert len(rows) == 1 + 4 * 6
     assert "rows" not in result.stdout  # the table fits on the screen
+
+
+@pytest.mark.parametrize(
+    ("few", "options", "single"),
+    [
+        (4, [], True),
+        (4, ["--no-variant-figures"], False),
+        (3, [], False),
+        (3, ["--variant-figures"], True),
+        (3, ["--variant-figures", "--panels", "error"], False),
+    ],
+)
+def test_compare_draws_the_figures_of_few_variants(
+    few: int, options: list[str], single: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Those of many on request; never their animations."""
+    drawn: list[drawing.Figures] = []
+    monkeypatch.setattr(commands, "draw_all", lambda wanted, page, quiet: drawn.extend(wanted))
+    monkeypatch.setattr(commands, "FEW", few)
+    result = dynsim("compare", "elbow_comparison", "-q", *options, *SHORT, "--out", "out", folder=tmp_path)
+    assert result.returncode == 0, result.stderr
+    together, *others = drawn
+    assert len(together.records) == 4
+    assert [name for figures in others for name in figures.records] == (list(together.records) if single else [])
+    assert not any(figures.look.film for figures in others)
 
 
 def test_compare_says_what_real_contacts_did(tmp_path: Path):
@@ -577,3 +602,11 @@ def test_a_damaged_kernel_cache_is_a_warning_in_one_line(tmp_path: Path):
     (line,) = done.stderr.splitlines()
     assert line.startswith("warning: ")
     assert mentions(line, damaged[0].name)
+
+
+def test_the_command_line_starts_without_libraries_for_computation():
+    """Help, versions and completion need no arrays; commands import these when they run."""
+    heavy = ("numpy", "numba", "pydantic", "matplotlib", "dynsim.record")
+    code = f"import sys, dynsim.cli.commands; print([name for name in {heavy} if name in sys.modules])"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=True)
+    assert result.stdout == "[]\n"

@@ -34,7 +34,7 @@ def small(tmp_path: Path) -> Path:
 @pytest.mark.long
 def test_a_plan_leaves_its_files_and_a_scenario_that_runs(small: Path, tmp_path: Path) -> None:
     out = tmp_path / "plan"
-    command = ["plan", str(small), "--count", "0:1", "--starts", "1", "--no-verify", "--out", str(out)]
+    command = ["plan", str(small), "--count", "0:1", "--starts", "1", "--budget", "0", "--no-verify", "--out", str(out)]
     result = CliRunner().invoke(app, command)
     assert result.exit_code == 0, result.output
     assert lines_with(result.output, "link_6", "floor")
@@ -54,10 +54,42 @@ def test_a_plan_leaves_its_files_and_a_scenario_that_runs(small: Path, tmp_path:
     assert (out / "plan_table.csv").read_text(encoding="utf-8").startswith("count,braces,heat_W")
 
 
+@pytest.mark.long
+def test_plans_for_several_values_leave_a_table_a_figure_and_the_best_plan(small: Path, tmp_path: Path) -> None:
+    out = tmp_path / "plan"
+    require = ["--require", "hand_sag_m=0.5", "--require", "hand_force_N=[0,0,-1]"]
+    vary = ["--vary", "surfaces.floor.point_m.2=-0.02:0:2", "--vary", "contacts.friction=0.1,0.2"]
+    command = ["plan", str(small), "--count", "0:1", "--candidates", "link_6", "--budget", "0", "--no-verify"]
+    result = CliRunner().invoke(app, [*command, *require, *vary, "--out", str(out)])
+    assert result.exit_code == 0, result.output
+    assert mentions(" ".join(result.output.split()), "surfaces.floor.point_m.2", "hand sag")
+    table = json.loads((out / "vary_table.json").read_text(encoding="utf-8"))
+    values = [(row["surfaces.floor.point_m.2"], row["contacts.friction"]) for row in table]
+    assert values == [(-0.02, 0.1), (-0.02, 0.2), (0.0, 0.1), (0.0, 0.2)]
+    margins = [1.0 - row["hand_sag_m"] / 0.5 for row in table]
+    assert [row["hand_sag_m_margin"] for row in table] == pytest.approx(margins, abs=1e-12)
+    best = json.loads((out / "vary.json").read_text(encoding="utf-8"))["best"]
+    least = min(table, key=lambda row: row["heat_W"])
+    assert best == {key: least[key] for key in best}
+    plan = json.loads((out / "plan.json").read_text(encoding="utf-8"))
+    assert plan["sizes"][plan["best"]]["heat_W"] == least["heat_W"]
+    (requirement,) = plan["sizes"][1]["requirements"]
+    assert (requirement["key"], requirement["limit"], requirement["reason"]) == ("hand_sag_m", 0.5, "")
+    assert (out / "figures" / "plan_vary.png").exists()
+    assert (out / "vary_table.csv").read_text(encoding="utf-8").startswith("surfaces.floor.point_m.2,contacts.friction")
+    result = CliRunner().invoke(app, [*command, "--no-figures", "--out", str(out)])
+    assert not (out / "vary.json").exists()
+
+
 @pytest.mark.parametrize(
     ("options", "names"),
     [
+        (["--vary", "contacts.friction=low"], ("--vary contacts.friction", "0:1:5")),
+        (["--vary", "contacts.friction=0:1:1"], ("--vary contacts.friction=0:1:1", "2")),
+        (["--require", "hand_sag=1"], ("requirements.hand_sag", "hand_sag_m")),
         (["--count", "two"], ("--count two", "0:3")),
+        (["--phases", "two"], ("--phases two", "1:2")),
+        (["--phases", "0:2"], ("phases = 0:2", "1 to 4")),
         (["--count", "99"], ("99", "5")),
         (["--weight", "heat=1"], ("--weight heat=1", "peak=0.5")),
         (["--gains", "0"], ("--gains 0", "500,100,20")),
@@ -120,7 +152,9 @@ def test_a_scene_without_an_answer_ends_with_its_reason_and_code_2(
     own = out / "figures" / "mine.png"
     for file in (*earlier, own):
         file.write_text("")
-    result = CliRunner().invoke(app, ["plan", str(path), "--count", "0:1", "--starts", "1", "--out", str(out)])
+    result = CliRunner().invoke(
+        app, ["plan", str(path), "--count", "0:1", "--starts", "1", "--budget", "0", "--out", str(out)]
+    )
     assert isinstance(result.exception, UnreachableReference)
     assert result.exception.exit_code == 2
     check_message(result.exception, name, phrase=phrase)
@@ -150,26 +184,26 @@ def floor_that_grips(data: dict[str, Any]) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize(
-    ("change", "survives", "names"),
+    ("change", "best", "survives", "names"),
     [
-        (floor_below_reach, None, ("5",)),
-        (floor_that_grips, False, ("× 1", "+0 mm")),
+        (floor_below_reach, 0, None, ("5",)),
+        (floor_that_grips, 1, True, ("on floor",)),
     ],
 )
-def test_where_no_brace_helps_the_answer_is_none(
-    tmp_path: Path, change: Callable[[dict[str, Any]], None], survives: bool | None, names: tuple[str, ...]
+def test_outcome_of_the_run_decides_about_braces(
+    tmp_path: Path, change: Callable[[dict[str, Any]], None], best: int, survives: bool | None, names: tuple[str, ...]
 ) -> None:
-    """Nothing in reach to lean on, or dragging dearer than hanging: said in words, and the arm hangs."""
+    """No surface in reach: the arm hangs. With friction of 6, a brace sticks and still needs less than hanging."""
     data = scene(11)
     change(data)
     path, out = tmp_path / "scene.yaml", tmp_path / "plan"
     path.write_text(to_yaml(data), encoding="utf-8")
-    options = ["--count", "0:1", "--starts", "1", "--no-figures", "--out", str(out)]
+    options = ["--count", "0:1", "--starts", "1", "--budget", "0", "--no-figures", "--out", str(out)]
     result = CliRunner().invoke(app, ["plan", str(path), *options])
     assert result.exit_code == 0, result.output
     assert mentions(" ".join(result.output.split()), *names)
     plan = json.loads((out / "plan.json").read_text(encoding="utf-8"))
-    assert (plan["best"], plan["sizes"][1]["survives"]) == (0, survives)
+    assert (plan["best"], plan["sizes"][1]["survives"]) == (best, survives)
 
 
 def refused(corners: Sequence[Corner], tolerance: tuple[float | None, float | None] | None) -> Size:

@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import IO, Any
 
@@ -102,6 +103,15 @@ def pids(folder: Path, pattern: str) -> list[int]:
     return [int(path.name.rpartition("_")[2]) for path in folder.glob(f"{pattern}_*")]
 
 
+def workers(folder: Path, pattern: str, process: subprocess.Popen[str]) -> list[int]:
+    """Those of its workers; the process itself tries the first task for a short time."""
+    return [pid for pid in pids(folder, pattern) if pid != process.pid]
+
+
+def both_simulate(folder: Path, process: subprocess.Popen[str]) -> bool:
+    return len(workers(folder, "simulating", process)) == 2
+
+
 def is_running(pid: int) -> bool:
     """False for a process that has ended, also when nobody has asked for its exit code."""
     try:
@@ -147,7 +157,9 @@ def test_a_signal_ends_runs_whose_steps_do_not(tmp_path: Path, number: signal.Si
     """What was recorded before is saved, and no process is left in its step."""
     arguments = ["compare", "elbow_comparison_floor", "--jobs", jobs, *LONG, "--out", "out"]
     with started(tmp_path, *arguments, stands=True) as process:
-        wait_until(lambda: len(pids(tmp_path, "simulating")) == int(jobs), process)
+        wait_until(
+            lambda: bool(pids(tmp_path, "simulating")) if jobs == "1" else both_simulate(tmp_path, process), process
+        )
         time.sleep(0.5)
         process.send_signal(number)
         _, stderr = communicate(process)
@@ -160,7 +172,7 @@ def test_a_signal_ends_runs_whose_steps_do_not(tmp_path: Path, number: signal.Si
 def test_a_signal_ends_a_sweep_whose_steps_do_not(tmp_path: Path):
     arguments = ["sweep", "elbow_comparison_floor", "--grid", "contacts.friction=0,0.1,0.2", "--jobs", "2", *LONG]
     with started(tmp_path, *arguments, "--out", "out", stands=True) as process:
-        wait_until(lambda: len(pids(tmp_path, "simulating")) == 2, process)
+        wait_until(lambda: both_simulate(tmp_path, process), process)
         process.send_signal(signal.SIGTERM)
         _, stderr = communicate(process)
     assert process.returncode == 128 + signal.SIGTERM, stderr
@@ -189,7 +201,7 @@ def test_a_signal_saves_all_variants_that_run_in_processes(
 ):
     """To the parent alone or, as a terminal sends it, to all. Two variants run, two wait."""
     with started(tmp_path, "compare", "elbow_comparison", "--jobs", "2", *LONG, "--out", "out") as process:
-        wait_until(lambda: len(pids(tmp_path, "simulating")) == 2, process)
+        wait_until(lambda: both_simulate(tmp_path, process), process)
         kill(process.pid, number)
         _, stderr = communicate(process)
     assert process.returncode == 128 + number, stderr
@@ -208,19 +220,18 @@ def test_a_signal_saves_all_variants_that_run_in_processes(
 )
 def test_workers_end_with_their_parent(tmp_path: Path, number: signal.Signals):
     with started(tmp_path, "compare", "elbow_comparison", "--jobs", "2", *LONG, "--out", "out") as process:
-        wait_until(lambda: len(pids(tmp_path, "simulating")) == 2, process)
-        workers = pids(tmp_path, "simulating")
-        assert process.pid not in workers
+        wait_until(lambda: both_simulate(tmp_path, process), process)
         process.send_signal(number)
         process.wait(timeout=DEADLINE_S)
-        wait_until(lambda: not any(is_running(pid) for pid in workers))
+        wait_until(lambda: not any(is_running(pid) for pid in workers(tmp_path, "simulating", process)))
     assert process.returncode == -number
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_ctrl_c_while_references_are_planned_names_every_variant(tmp_path: Path, jobs: int):
     with started(tmp_path, "compare", "elbow_comparison", "--jobs", str(jobs), *PLANNING) as process:
-        wait_until(lambda: len(pids(tmp_path, "planning")) == jobs, process)
+        marked = partial(workers, process=process) if jobs > 1 else pids
+        wait_until(lambda: len(marked(tmp_path, "planning")) == jobs, process)
         process.send_signal(signal.SIGINT)
         _, stderr = communicate(process)
     assert process.returncode == 130, stderr

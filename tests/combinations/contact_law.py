@@ -14,7 +14,7 @@ from dynsim.model.surfaces import HeightField
 Array = NDArray[np.float64]
 Finding = Iterator[str]
 
-# Specification of docs/physics.md: gaps after the projection of a step [m]; and gap at which a point counts as landed.
+# docs/theory/contact.md: gaps after the projection of a step [m]; and gap at which a point counts as landed.
 DRIFT = 1e-9
 # Slack for joint stops, because limits in files are rounded [rad or m].
 STOP_SLACK = 1e-6

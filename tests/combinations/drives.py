@@ -88,9 +88,14 @@ def controller(
     elif level == "pressing":
         # Either all declared points press, or only the elbow.
         alone = levels["start"] in ("on_surface", "on_references") and levels["points"] != "elbow"
-        section["brace"] = (
-            "optimal" if random.random() < 0.5 and not alone else {"elbow": float(random.uniform(1.0, 8.0))}
-        )
+        if random.random() < 0.5 and not alone:
+            section["brace"] = "optimal"
+        else:
+            force = float(random.uniform(1.0, 8.0))
+            # A third of the elbows press in the first part of the run only, half of these with the least heat.
+            during = {"during_s": [[0.0, max(0.5 * duration, 0.2)]]}
+            kinds: list[Any] = [during, {"force_N": force, **during}, *[force] * 4]
+            section["brace"] = {"elbow": kinds[int(1e6 * force) % 6]}
     followed: list[Joint] = []
     if level == "hand_path":
         followed = _followers(random, levels, robot, moved)

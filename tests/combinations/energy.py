@@ -1,4 +1,4 @@
-"""Checks of energies on records: stored energies, the ledger as defined in docs/physics.md, losses and heat."""
+"""Checks of energies on records: stored energies, the ledger as defined in docs/theory/energy.md, losses and heat."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Finding = Iterator[str]
 
 # Share of the turnover above which a ledger must warn.
 RESIDUAL = 1e-6
-# Total error of ten landings, each located to 1e-13 m (docs/physics.md) [m].
+# Total error of ten landings, each located to 1e-13 m (docs/theory/energy.md) [m].
 LANDINGS_M = 1e-12
 # Rate of a joint at rest that time stepping leaves as rounding [rad/s or m/s].
 RATE_ROUNDING = 1e-10
@@ -177,7 +177,7 @@ def _integrated(
 
 
 def residual_floor(seen: Observed) -> float:
-    """Return the floor of the denominator of the relative residual, as in docs/physics.md [J]."""
+    """Return the floor of the denominator of the relative residual, as in docs/theory/energy.md [J]."""
     reach, lever, mass = {}, 0.0, 0.0
     for link in seen.bodies.robot.links:
         reach[link.name] = 0.0 if link.parent is None else reach[link.parent] + float(np.linalg.norm(link.p_PJ))

@@ -509,7 +509,10 @@ class _Touching:
         if level != "carried":
             self.contacts["between"] = [{"bodies": ["rider", "thing" if level == "objects" else "links"]}]
             if random.random() < 0.3:
-                self.contacts["between"][0]["friction"] = float(random.uniform(0.0, 1.0))
+                own = self.contacts["between"][0]
+                own["friction"] = float(random.uniform(0.0, 1.0))
+                if "static_friction" in self.contacts:
+                    own["static_friction"] = 1.3 * own["friction"]
 
     def _start_of(self, body: str) -> Array:
         return self._model.point_position(body, np.zeros(3), self._q)

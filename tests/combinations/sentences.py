@@ -75,6 +75,10 @@ SENTENCES: dict[str, str] = {
     "scheme": rf"^time stepping: the steps themselves (?:removed|added|1) up to {NUMBER} J",
     "gains": rf"^time stepping: the steps themselves add {NUMBER} J to compliant contacts or ties",
     "sinks": rf"^time stepping: points sink up to {NUMBER} mm",
+    "compressed": (
+        rf"^(\S+): compressed by up to (?:{NUMBER}|1) mm, more than the rounding of the edges \((?:{NUMBER}|1) mm\)"
+    ),
+    "passes through": rf"^(\S+): pass through each other at t = {NUMBER} s, .*fast \((?:{NUMBER} mm per step|.*);",
     "shared with dry friction": r"^(.*): forces shared with the dry friction of (.+), which keeps? these joints",
     "shared by joints": r"^(.+): shared dry friction forces keep these coupled joints at rest",
     "shared": r"^(.*): the motion does not determine how load is shared()",
@@ -150,5 +154,7 @@ FALSE_WARNINGS = (
     "joint_1 9 of 2 A: the rms current of the run exceeds the nominal current; a real motor would overheat",
     "link_2 passes below floor by more than the link's radius: link_2 (radius 10 mm) by up to 90 mm in the samples",
     "operator: the hand did not execute 0.2 m of the commanded 0.4 m, mostly from t = 1 s on",
+    "link_1-link_3: compressed by up to 5 mm, more than the rounding of the edges (2 mm); use a larger stiffness",
+    "link_1-link_3: pass through each other at t = 0.1 s, because they move too fast (30 mm per step; half 2 mm)",
     "an unknown warning",
 )

@@ -217,7 +217,7 @@ def _all_holds(levels: dict[str, str], seed: int, number: int, folder: Path, **o
 
 
 def _shares_a_program(drawn: Scene, method: str, manner: str) -> bool:
-    """Return whether the default tests of docs/dev/tests.md compile its program."""
+    """Return whether the default tests of CONTRIBUTING.md compile its program."""
     if method == "time_stepping":
         return True
     if method == "auto" or manner == M_STAR:

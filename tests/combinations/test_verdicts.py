@@ -20,7 +20,9 @@ SOURCES = {
     "engine/warnings.py": "",
     "engine/soundness.py": "",
     "engine/equilibrium.py": "",
+    "engine/overlaps.py": "",
     "engine/target_distance.py": "off_target",
+    "scenario/between.py": "idle_entries",
     "scenario/build.py": "left_out_warnings",
 }
 LEAST_WORDS = 5

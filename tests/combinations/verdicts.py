@@ -163,7 +163,7 @@ def _stands(stop: SimulationStopped, seen: Observed) -> str:
 # Explicit steps that stiff friction holds up, in its time constants: the limit of stability of DOPRI5 is 3.3,
 # and steps go up to it, are rejected, and go up again.
 HELD_UP = (1.0, 5.0)
-# Slip below 1000 atol, or this [m/s], turns friction as fast as at this speed (docs/physics.md).
+# Slip below 1000 atol, or this [m/s], turns friction as fast as at this speed (docs/theory/unilateral.md).
 SLOWEST = 1e-7
 # Forces of real contacts come from the last sample, but the state from the stop: they may have changed by this factor.
 SINCE = 1.3
@@ -502,6 +502,26 @@ def _sinks(match: Match, seen: Observed) -> str:
     rigid = [touch for touch in seen.touches() if touch.contact.stiffness == 0.0]
     deepest = max((-1e3 * float(touch.gap.min(initial=0.0)) for touch in rigid), default=0.0)
     return "" if deepest <= float(match[1]) * (1.0 + DIGITS) + 1e-3 else f"{deepest:.3g} mm in a sample"
+
+
+def _compressed(match: Match, seen: Observed) -> str:
+    """Check that the contact or pair is compliant, and that no sample is deeper than stated."""
+    own = [touch for touch in seen.touches() if touch.contact.name == match[1]]
+    own += [t for t in seen.touches() if f"{t.contact.body}-{t.contact.surface.carrier}" == match[1]]
+    if not any(touch.contact.stiffness > 0.0 for touch in own):
+        return "no such compliant contact"
+    deepest = 1e3 * max(-float(touch.gap.min()) for touch in own)
+    return "" if deepest <= float(match[2]) * (1.0 + DIGITS) + 1e-3 else f"{deepest:.3g} mm in a sample"
+
+
+def _passes_through(match: Match, seen: Observed) -> str:
+    """Check that the pair exists and that its gap changes at that time."""
+    own = [t for t in seen.touches() if f"{t.contact.body}-{t.contact.surface.carrier}" == match[1]]
+    if not own:
+        return "no such pair"
+    around = np.abs(seen.time - float(match[2])) <= np.diff(seen.time).max()
+    change = max(float(np.ptp(touch.gap[around])) for touch in own)
+    return "" if change > 0.0 else "the gap does not change"
 
 
 def _shared(match: Match, seen: Observed) -> str:
@@ -881,6 +901,8 @@ VERIFIERS: dict[str, Callable[[Match, Observed], str]] = {
     SENTENCES["scheme"]: _scheme,
     SENTENCES["gains"]: _gains,
     SENTENCES["sinks"]: _sinks,
+    SENTENCES["compressed"]: _compressed,
+    SENTENCES["passes through"]: _passes_through,
     SENTENCES["shared with dry friction"]: _shared,
     SENTENCES["shared by joints"]: _shared_by_joints,
     SENTENCES["shared"]: _shared,

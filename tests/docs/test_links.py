@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 
 import pytest
+import yaml
 
 ROOT = Path(__file__).parents[2]
 PAGES = [
@@ -27,10 +28,10 @@ def anchors(text: str) -> set[str]:
     return names
 
 
-def dead_links(page: Path) -> list[str]:
-    """Return the relative links of a page whose file or anchor is missing."""
+def dead_links(page: Path, text: str | None = None) -> list[str]:
+    """Return the relative links of a page, or of a text in its place, whose file or anchor is missing."""
     dead = []
-    text = FENCE.sub("", page.read_text(encoding="utf-8"))
+    text = FENCE.sub("", page.read_text(encoding="utf-8") if text is None else text)
     for link in LINK.findall(re.sub(r"`[^`\n]*`", "", text)):
         if re.match(r"[a-z]+:", link):
             continue
@@ -46,6 +47,18 @@ def dead_links(page: Path) -> list[str]:
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
 def test_links_lead_to_files_and_headings(page: Path) -> None:
     assert dead_links(page) == []
+
+
+def test_redirects_lead_from_removed_pages_to_files_and_headings() -> None:
+    moved = yaml.safe_load((ROOT / "docs" / "site" / "redirects.yml").read_text(encoding="utf-8"))
+    for old, new in moved.items():
+        name = old.partition("#")[0]
+        assert name in moved, f"{old}: its page has no line"
+        assert not (ROOT / "docs" / name).exists(), f"{name} still exists"
+        assert new.partition("#")[0] not in moved, f"{new} has moved too"
+    # The site writes this page from CONTRIBUTING.md.
+    links = "".join(f"[a]({new})" for new in moved.values() if new != "dev/contributing.md")
+    assert dead_links(ROOT / "docs" / "index.md", links) == []
 
 
 def test_dead_links_are_reported(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Scripted faults: the replay ends as docs/hardware.md says, in time, and sends only the policy's goals after it."""
+"""Scripted faults end as docs/hardware/faults.md states, in time; only the policy's goals are sent afterwards."""
 
 from __future__ import annotations
 

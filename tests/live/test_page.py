@@ -195,6 +195,26 @@ def test_focus_that_is_lost_lets_everything_go(teleop: Callable[..., Teleop], pi
     assert drive.group_is_gone()
 
 
+def test_page_shows_contacts_that_close_later(teleop: Callable[..., Teleop], pilot: Callable[[Teleop], Pilot]) -> None:
+    """The hand reaches the box after the start; before that the page shows only the box on its table."""
+    drive = teleop("push_box", "--variant", "pushes")
+    user = pilot(drive)
+
+    def shows(name: str) -> str:
+        return f"dynsim.state().records[0].contacts.some((one) => one.name === '{name}' && one.shown)"
+
+    user.until(shows("box1.table"))
+    assert not user.js(shows("link_3-box"))
+    assert "link_3-box: open" not in user.page.inner_text("#status")
+    user.page.keyboard.down("w")
+    user.space()
+    user.until(shows("link_3-box"), user.space)
+    assert user.js(shows("link_3-box on box"))
+    assert "link_3-box: " in user.page.inner_text("#status")
+    assert not user.js(shows("link_3-box_2"))
+    assert drive.interrupt() == 0
+
+
 PHONE = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True}
 
 

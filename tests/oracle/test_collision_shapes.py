@@ -16,7 +16,8 @@ from typer.testing import CliRunner
 
 from dynsim import build_model, load_scenario, simulate
 from dynsim.cli.commands import app
-from dynsim.compile.solids import fixed_solids, solids_of
+from dynsim.compile.scene import drawn_surface
+from dynsim.compile.solids import solids_of
 from dynsim.compile.touching import touch
 from dynsim.errors import DynsimError
 from dynsim.model.surfaces import Box, Capsule
@@ -51,7 +52,7 @@ def gaps(scenario: Scenario, q: np.ndarray) -> dict[frozenset[str], float]:
     """Smallest gap of each pair of bodies [m]."""
     model, least = build_model(scenario), dict[frozenset[str], float]()
     for contact in build.contacts(scenario):
-        pair = frozenset((contact.body, str(contact.surface.carrier)))
+        pair = frozenset((contact.body, contact.surface_name))
         least[pair] = min(touch(model, contact, q).gap, least.get(pair, np.inf))
     return least
 
@@ -77,12 +78,11 @@ def test_a_coiled_urdf_arm_has_the_gaps_of_pinocchio(tmp_path):
     pinocchio.updateGeometryPlacements(peer, data, shapes, geometry, coordinates)
     request = coal.DistanceRequest()
     request.gjk_tolerance = 1e-12
-    names = {joint: str(peer.names[joint]) for joint in range(1, peer.njoints)}
-    bodies = {link.joint: link.name for link in build_model(scenario).robot.links}
+    names = [str(name) for name in peer.names]
+    bodies = {link.joint: link.name for link in build_model(scenario).robot.links} | {names[0]: "base"}
     expected: dict[frozenset[str], float] = {}
-    movable = [k for k, solid in enumerate(shapes.geometryObjects) if solid.parentJoint > 0]
-    for i in movable:
-        for j in movable:
+    for i in range(len(shapes.geometryObjects)):
+        for j in range(len(shapes.geometryObjects)):
             a, b = (shapes.geometryObjects[k] for k in (i, j))
             pair = frozenset(bodies[names[solid.parentJoint]] for solid in (a, b))
             if i < j and len(pair) == 2:
@@ -91,7 +91,7 @@ def test_a_coiled_urdf_arm_has_the_gaps_of_pinocchio(tmp_path):
                 far = coal.distance(first, at[0], second, at[1], request, coal.DistanceResult()) - left - right
                 expected[pair] = min(far, expected.get(pair, np.inf))
     own = gaps(scenario, q)
-    assert len(own) == 10
+    assert len(own) == 15  # ten pairs of links, and all links except the first against the base
     assert min(own.values()) < 0.03
     for pair, gap in own.items():
         assert gap == pytest.approx(expected[pair], abs=1e-9), sorted(pair)
@@ -124,8 +124,7 @@ def test_solids_survive_export_and_reading_back(tmp_path, kind):
     (tmp_path / "again.urdf").write_text(build_model(load_scenario(tmp_path / "scene.yaml")).to_urdf())
     again = build_model(loaded(tmp_path, {"file": str(tmp_path / "again.urdf")})).robot
     before, after = solids_of(original), solids_of(again)
-    assert list(before) == list(after) == ["upper", "lower"]
-    before["stand"], after["stand"] = fixed_solids(original), fixed_solids(again)
+    assert list(before) == list(after) == ["upper", "lower", "stand"]
     for body in before:
         (solid,), (copy,) = before[body], after[body]
         assert type(solid) is type(copy)
@@ -243,7 +242,7 @@ def test_mujoco_finds_the_contacts_of_links_that_touch(tmp_path):
     peer, data = in_mujoco(tmp_path, "--contacts")
     model = build_model(scenario)
     order = [peer.joint(joint).qposadr[0] for joint in model.joint_names]
-    assert peer.npair == 14  # the flange has two shapes
+    assert peer.npair == 20  # the flange has two shapes
     assert np.all(peer.pair_friction[:, :2] == 0.4)
     touched = 0
     for elbow in np.deg2rad([140.0, 149.0, 155.0, 160.0]):
@@ -280,6 +279,53 @@ def test_objects_rest_on_each_other_in_mujoco_as_in_dynsim(tmp_path):
     peer, data = in_mujoco(tmp_path)
     mujoco.mj_forward(peer, data)
     assert (peer.npair, data.ncon) == (0, 0)
+
+
+SURFACES: dict[str, dict[str, Any]] = {
+    "plane": {"type": "plane", "point_m": [0.1, 0.2, 0.3], "normal": [1, 2, 3]},
+    "sphere": {"type": "sphere", "center_m": [0.1, 0.2, 0.3], "radius_m": 0.2},
+    "cylinder": {"type": "cylinder", "point_m": [0.1, 0.2, 0.3], "axis": [1, 2, 3], "radius_m": 0.2},
+    "box": {"type": "box", "center_m": [0.1, 0.2, 0.3], "edges_m": [0.1, 0.2, 0.3], "rpy_deg": [10, 20, 30]},
+}
+
+
+@pytest.mark.parametrize("kind", SURFACES)
+def test_a_surface_on_a_fixed_link_is_on_the_body_that_carries_it(tmp_path, kind):
+    """The link ``tool`` is fixed to ``lower``, and the root link ``stand`` to the world."""
+    surfaces = {name or "free": SURFACES[kind] | ({"on": name} if name else {}) for name in ("", "tool", "stand")}
+    scenario = loaded(tmp_path, {"file": robot_file(tmp_path)}, surfaces=surfaces, contacts={"law": "unilateral"})
+    known, (tool,) = build.surfaces(scenario), [f for f in build_model(scenario).robot.frames if f.name == "tool"]
+    assert [known[name].carrier for name in surfaces] == [None, "lower", None]
+    points = np.random.default_rng(0).normal(size=(50, 3))
+    gaps, normals = known["free"].gaps(points), known["free"].normals(points)
+    np.testing.assert_allclose(known["stand"].gaps(points), gaps, rtol=0.0, atol=1e-15)
+    moved = tool.p + points @ tool.R.T
+    np.testing.assert_allclose(known["tool"].gaps(moved), gaps, rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(known["tool"].normals(moved), normals @ tool.R.T, rtol=0.0, atol=1e-9)
+    assert drawn_surface("tool", known["tool"]).kind == kind
+
+
+def test_a_ball_rests_on_a_tray_that_is_fixed_to_a_link(tmp_path):
+    """A joint turns the tool so that the tray is level; the record draws the tray on the body of the tool."""
+    file = Path(robot_file(tmp_path))
+    file.write_text(file.read_text(encoding="utf-8").replace('rpy="0.3 0.5 0.7"', 'rpy="0 0.5 0"'), encoding="utf-8")
+    plant = {"file": str(file), "motor": {"type": "wang_minami"}, "initial_deg": {"j1": float(np.rad2deg(-0.5))}}
+    ball = {"shape": "sphere", "radius_m": 0.05, "mass_kg": 0.1}
+    tray = {"type": "box", "center_m": [0.1, 0, 0.1], "edges_m": [0.2, 0.2, 0.02], "on": "tool"}
+    more = {"surfaces": {"tray": tray}, "contacts": {"law": "unilateral"}, "controller": {"type": "joint_pd"}}
+    model = build_model(loaded(tmp_path, plant, **more))
+    at = model.point_position("tool", [0.1, 0.0, 0.16], model.robot.initial).tolist()
+    record = simulate(loaded(tmp_path, plant, objects={"ball": ball | {"position_m": at}}, **more))
+    assert record["contact_normal_force"][-1] == pytest.approx([0.1 * 9.81], rel=0.05)
+    assert record.scene is not None
+    assert [body.name for body in record.scene.bodies if any(shape.kind == "box" for shape in body.shapes)] == ["lower"]
+
+
+def test_a_height_field_cannot_be_turned_with_a_link(tmp_path):
+    np.savetxt(tmp_path / "hill.csv", np.zeros((4, 4)), delimiter=",")
+    field = {"type": "height_field", "file": "hill.csv", "spacing_m": [0.1, 0.1], "on": "tool"}
+    with raises(DynsimError, "surfaces.hill.on", "height field", "turned"):
+        build.surfaces(loaded(tmp_path, {"file": robot_file(tmp_path)}, surfaces={"hill": field}))
 
 
 def test_a_surface_on_a_link_collides_in_mujoco(tmp_path):

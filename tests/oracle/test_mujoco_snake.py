@@ -77,10 +77,10 @@ def test_torques_of_servos(snake: tuple[Prepared, Any], seed: int) -> None:
 def test_a_manoeuvre() -> None:
     """Sag and friction of the raised head that nods by 30 degrees: MuJoCo's friction is soft, but hardly so here."""
     scenario = load_scenario(SCENARIO, "beta")
-    commands, own = run_dynsim(scenario, 0)
-    peer = run_mujoco(build_snake(commands.prepared, 1e-3, stiff=True), commands, scenario.duration_s, 1)
+    commands, own = run_dynsim(scenario)
+    peer = run_mujoco(build_snake(commands.prepared, 1e-3, stiff=True), commands, scenario.duration_s)
     off = np.abs(peer.displacement - own.displacement)
     assert off[Z] < 0.5e-3
     assert off[BETA] < 2e-3
-    soft = run_mujoco(build_snake(commands.prepared, 1e-3), commands, scenario.duration_s, 1)
+    soft = run_mujoco(build_snake(commands.prepared, 1e-3), commands, scenario.duration_s)
     assert abs(soft.displacement[Z] - own.displacement[Z]) > 5e-3

@@ -220,7 +220,7 @@ class Driven:
     """The oracle under the controller of a scenario, as an ordinary differential equation written apart.
 
     State: coordinates, rates, and the current of every DC motor. References are quintic splines through samples of the
-    clamped cubic ones that the scenario names (docs/scenarios.md).
+    clamped cubic ones that the scenario names (docs/scenarios/control.md).
     """
 
     def __init__(self, scenario: dict[str, Any], q: np.ndarray) -> None:

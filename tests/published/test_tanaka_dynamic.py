@@ -1,6 +1,6 @@
 """Table III and Figs 7 to 10 of [T] with compliant servos and wheels that can slip.
 
-Nothing is tuned: the parameters are those of docs/snake.md, and what disagrees with the paper is told there.
+Nothing is tuned. docs/snake.md lists the parameters, docs/validation/snake.md the differences from the paper.
 """
 
 import csv

@@ -1,4 +1,7 @@
-"""Tables IV and V of [T], V.C: what the head pushes with. Nothing is tuned; what disagrees is told in docs/snake.md."""
+"""Forces with which the head pushes: Tables IV and V of [T], V.C.
+
+Nothing is tuned; docs/validation/snake.md lists the differences.
+"""
 
 import csv
 

@@ -17,7 +17,7 @@ def test_less_energy_with_more_elbows(records):
     """ "less-energy consumption ... [is] achieved"; Fig 8: "bigger in the motion ... without restraint elbow"."""
     energy = {name: record.summary["electrical_energy_J"] for name, record in records.items()}
     assert energy["two_elbows"] < energy["elbow_7"] < energy["elbow_4"] < energy["no_elbow"]
-    # The assumed values of docs/validation.md change the figures by per cents; the paper's axes show hundreds.
+    # The assumed values of docs/validation/bracing.md change the figures by per cents; the paper's axes show hundreds.
     assert energy["no_elbow"] > 10.0 * energy["two_elbows"]
 
 
@@ -63,7 +63,7 @@ def test_the_floor_pulls_at_elbow_4(records):
 
 
 def test_the_forces_at_elbow_4_are_those_of_the_documentation():
-    """docs/validation.md: pushed for 33 ms with up to 9.9 N, −4.0 N at 0.1 s, pulled with 1.1 to 1.8 N from 0.17 s."""
+    """bracing.md: pushed for 33 ms with up to 9.9 N, −4.0 N at 0.1 s, pulled with 1.1 to 1.8 N from 0.17 s."""
     forces = elbow_forces(dynsim.simulate(dynsim.load_scenario("elbow_comparison", overrides={"record.rate_hz": 2000})))
     assert forces["pushes_until_s"] == pytest.approx(0.033, abs=0.001)
     assert forces["push_max_N"] == pytest.approx(9.9, abs=0.1)

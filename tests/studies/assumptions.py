@@ -1,7 +1,7 @@
 """Study: sensitivity of the elbow comparison to assumptions that the paper leaves open, one at a time.
 
-``PYTHONPATH=tests python -m studies.assumptions`` writes results/reference/assumptions.json, which docs/validation.md
-quotes.
+``PYTHONPATH=tests python -m studies.assumptions`` writes results/reference/assumptions.json, which
+docs/validation/bracing.md quotes.
 """
 
 from __future__ import annotations

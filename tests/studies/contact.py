@@ -1,7 +1,7 @@
 """Study: the published arm with its elbows held on the floor, on a real floor, and with all links as candidates.
 
-``PYTHONPATH=tests python -m studies.contact`` writes results/contact/, which README.md and docs/validation.md quote, in
-about ten seconds once the kernels are compiled.
+``PYTHONPATH=tests python -m studies.contact`` writes results/contact/, which README.md and docs/validation/bracing.md
+quote, in about ten seconds once the kernels are compiled.
 """
 
 from __future__ import annotations

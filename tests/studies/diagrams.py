@@ -1,4 +1,4 @@
-"""The diagrams of docs/physics.md: ``PYTHONPATH=tests python -m studies.diagrams`` writes docs/images/*.svg.
+"""The diagrams of docs/theory/: ``PYTHONPATH=tests python -m studies.diagrams`` writes docs/images/*.svg.
 
 Poses, axes and forces come from a model and from the laws; they are not drawn by hand.
 """

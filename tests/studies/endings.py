@@ -6,8 +6,8 @@ and hand paths.
 
     PYTHONPATH=tests python -m studies.endings --count 10000 --jobs 2
 
-writes results/endings/endings.json, which docs/validation.md quotes, in about half an hour; ``--journal FILE`` stores
-completed scenes and resumes from them.
+writes results/endings/endings.json, which docs/validation/evidence.md quotes, in about half an hour; ``--journal FILE``
+stores completed scenes and resumes from them.
 """
 
 from __future__ import annotations

@@ -2,10 +2,10 @@
 
     PYTHONPATH=tests python -m studies.fault_table --runs 100 --out results/reference/bridge_faults.json
 
-prints the table of docs/hardware.md. A cell is a fault, the state of the replay in which it strikes, and a policy; its
-runs differ in their seed: servo, time, and random parts of the fault. Each run is checked against the bytes on the line
-and the registers: after the fault only the policy sends goals, no torque is switched on, and the servos are in the
-reported state.
+prints the table of docs/hardware/faults.md. A cell is a fault, the state of the replay in which it strikes, and a
+policy; its runs differ in their seed: servo, time, and random parts of the fault. Each run is checked against the bytes
+on the line and the registers: after the fault only the policy sends goals, no torque is switched on, and the servos are
+in the reported state.
 """
 
 from __future__ import annotations

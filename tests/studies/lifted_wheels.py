@@ -1,7 +1,8 @@
 """Wheel pairs of a snake on servos, posed in Pinocchio, and the study of their heights and directions.
 
-``PYTHONPATH=tests python -m studies.lifted_wheels`` writes results/snake/lifted_wheels.json, which docs/hardware.md
-quotes. The robot gets the recorded head pose and the angles sent to the servos, but no data of the base.
+``PYTHONPATH=tests python -m studies.lifted_wheels`` writes results/snake/lifted_wheels.json, which
+docs/hardware/lifted-wheels.md quotes. The robot gets the recorded head pose and the angles sent to the servos, but no
+data of the base.
 """
 
 from __future__ import annotations
@@ -196,7 +197,7 @@ def _to_ticks(angles: np.ndarray) -> np.ndarray:
 
 
 def study() -> dict[str, Any]:
-    """Return the numbers quoted in docs/hardware.md."""
+    """Return the numbers quoted in docs/hardware/lifted-wheels.md."""
     records = {name: simulate(load_scenario(name, variant)) for name, variant in RECORDS}
     operator = records["snake_operator"]
     poses = posed(operator, snake_map())

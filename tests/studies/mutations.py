@@ -2,7 +2,7 @@
 
 ``NUMBA_DISABLE_JIT=1 PYTHONPATH=tests python -m studies.mutations OUT.json`` draws lines of the kernels at random,
 writes which tests reach each of them, then the result for each error. Kernels run as Python: an error is a code object
-exchanged in a forked process, and nothing is compiled. Numbers: docs/dev/tests.md.
+exchanged in a forked process, and nothing is compiled. Numbers: docs/dev/tried.md.
 """
 
 from __future__ import annotations

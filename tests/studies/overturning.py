@@ -1,7 +1,7 @@
 """Study: tipping of a mobile base with four elbow configurations, and a sweep over parameters of the base.
 
 ``PYTHONPATH=tests python -m studies.overturning`` writes results/overturning/ (configurations.json, sweep.csv,
-sweep.png), which docs/validation.md quotes, in about two minutes.
+sweep.png), which docs/validation/bracing.md quotes, in about two minutes.
 """
 
 from __future__ import annotations

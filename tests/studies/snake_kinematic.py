@@ -1,7 +1,7 @@
 """Study: results of the kinematic snake scenarios, and their sensitivity to settings.
 
-``PYTHONPATH=tests python -m studies.snake_kinematic`` writes results/snake/kinematic.json, which docs/snake.md quotes,
-in half a minute with compiled kernels.
+``PYTHONPATH=tests python -m studies.snake_kinematic`` writes results/snake/kinematic.json, which
+docs/validation/snake.md quotes, in half a minute with compiled kernels.
 """
 
 from __future__ import annotations

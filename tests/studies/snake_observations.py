@@ -1,7 +1,7 @@
 """Study: tracking with measured feedback, motion of the head during mode changes, and heights of lifted wheels.
 
-``PYTHONPATH=tests python -m studies.snake_observations`` writes results/snake/observations.json, which docs/snake.md
-quotes, in a minute. All runs use the dynamic snake.
+``PYTHONPATH=tests python -m studies.snake_observations`` writes results/snake/observations.json, which
+docs/validation/snake.md quotes, in a minute. All runs use the dynamic snake.
 """
 
 from __future__ import annotations

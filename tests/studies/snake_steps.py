@@ -1,7 +1,7 @@
 """Study of the dynamic snake: step length and Table III of [T]; order of time stepping while a released head falls.
 
-``PYTHONPATH=tests python -m studies.snake_steps`` writes results/snake/steps.json, which docs/snake.md quotes, in a
-minute or two.
+``PYTHONPATH=tests python -m studies.snake_steps`` writes results/snake/steps.json, which
+docs/validation/snake.md quotes, in a minute or two.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Study: the snake's tasks on both levels, each with the variants that fail.
 
-``PYTHONPATH=tests python -m studies.snake_tasks`` writes results/snake/tasks.json, whose table is in docs/snake.md, in
-two minutes.
+``PYTHONPATH=tests python -m studies.snake_tasks`` writes results/snake/tasks.json, whose table is in
+docs/validation/snake.md, in two minutes.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ from contextlib import suppress
 from dynsim.engine import simulate
 from dynsim.scenario import load_scenario
 
-# Scenarios and variants with the programs of docs/dev/tests.md. The programs of a worker have most parts in common.
+# Scenarios and variants with the programs of CONTRIBUTING.md. The programs of a worker have most parts in common.
 SHARES: tuple[tuple[tuple[str, str | None], ...], ...] = (
     (("block_on_slope", None), ("elbow_comparison_links", None), ("elbow_comparison", "no_elbow")),
     (("falling_arm", None), ("snake_positioning_dynamic", "x"), ("single_pendulum", None)),

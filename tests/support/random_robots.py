@@ -32,6 +32,7 @@ from dynsim.integrators.methods import METHODS
 from dynsim.integrators.radau5.tables import CLOSE
 from dynsim.integrators.run import FINISHED, STATUS, TIME_STEPPING, Run, new_run
 from dynsim.integrators.simd.forms import has_forms
+from dynsim.integrators.stepping.articulated_contacts import articulated_arrays
 from dynsim.integrators.stepping.tables import stepping_arrays
 from dynsim.jit.kernel import integers, reals
 from dynsim.model.description import Contact, Inertia, Link, Load, Quadric, Robot
@@ -256,7 +257,8 @@ class CompiledSystem:
         dry, ties = (0, 0) if system.unilateral is None else (len(system.unilateral.dry), len(self.robot.ties))
         couplings += dry + ties
         if METHODS[method].number == TIME_STEPPING:
-            stepping = stepping_arrays(system.model, system.contacts, na, couplings, theta)
+            art = articulated_arrays(system)
+            stepping = stepping_arrays(system.model, system.contacts, na, couplings, theta, articulated=art)
         run = new_run(
             METHODS[method].number,
             y,

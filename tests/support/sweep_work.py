@@ -72,6 +72,14 @@ def pid(number: int, look: Progress) -> int:
     return os.getpid()
 
 
+def busy(duration: float, look: Progress) -> int:
+    """Use the processor for a time [s], and return the process id."""
+    begun = time.process_time()
+    while time.process_time() < begun + duration:
+        look(0.0)
+    return os.getpid()
+
+
 def named(thing: Any, look: Progress) -> str:
     """Return the name of an object."""
     return str(thing.name)

@@ -1,6 +1,6 @@
 """Study: results and forces of the arm of [WM] with elbows on the floor, and their sensitivity.
 
-[WM]: see docs/physics.md. What the paper states is asserted in tests/published/test_wang_minami.py.
+[WM]: see docs/theory/multibody.md. What the paper states is asserted in tests/published/test_wang_minami.py.
 """
 
 from __future__ import annotations

@@ -58,6 +58,8 @@ def test_quick_run(small: None) -> None:
     snakes = {row["program"]: row for row in result["snake"]}
     assert tuple(snakes) == snake.SNAKES
     assert snakes[snake.DYNSIM]["z_rms_m"] < 8e-3
+    alone, whole = (snakes[program]["displacements"] for program in (snake.COMMANDED, snake.DYNSIM))
+    assert alone[0] == pytest.approx(whole[0], abs=1e-7)  # the same motion without the controller
     assert [row["failed"] for row in result["sweeps"]] == [0] * len(result["sweeps"])
     assert {row["runs"] for row in result["sweeps"]} == {25, 50, 100}
     assert [row["variant"] for row in result["variants"]] == variant_names(programs.SCENARIO)

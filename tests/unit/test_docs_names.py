@@ -105,7 +105,7 @@ def test_what_a_page_names_exists(name: str) -> None:
     text = page(name)
     # The patterns find what they are for.
     assert len(paths(text)) > 15
-    assert len(claims(text)) > 12
+    assert len(claims(text)) > 5
     assert missing(text) == []
 
 
@@ -156,7 +156,7 @@ def test_what_sources_name_exists() -> None:
 
 
 def test_examples_make_what_is_not_there() -> None:
-    assert all(f"`{path}`" in page("extending.md") for path in MADE)
+    assert all(f"`{path}`" in page("extending.md") + page("dev/core.md") for path in MADE)
     assert [path for path in MADE if file_named(path) is not None] == []
 
 

@@ -70,7 +70,7 @@ def test_a_measured_record(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     folder = tmp_path / "results" / "elbow_comparison" / "two_elbows"
     folder.mkdir(parents=True)
     simulate(load_scenario("elbow_comparison", "two_elbows", {"duration_s": 0.1})).save(folder / "record.h5")
-    script("extending.md", "A measured record drawn")
+    script("extending.md", "Draw a measured record")
     record = Record.load("measured.h5")
     assert record["hand_position"].shape == (401, 3)
     assert record.labels["winding"] == ("joint_9",)

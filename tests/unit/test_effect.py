@@ -51,6 +51,17 @@ PUSH = {"type": "samples", "body": "link_4", "times_s": [3, 4], "force_N": [[1, 
             "sensors.encoders",
             "controller.state feedforward",
         ),
+        (FLOOR, {"surfaces.lid": {"type": "plane", "on": "link_3"}}, "surfaces.lid", "link_3"),
+        (
+            FLOOR,
+            {
+                "contacts.candidates": "links",
+                "contacts.points": {"p": {"body": "link_5", "surface": "s"}},
+                "surfaces": {"s": {"type": "plane", "on": "link_3"}},
+            },
+            "contacts.candidates",
+            "surfaces world",
+        ),
         ("snake_circle", {"integrator.rtol": 1e-8}, "integrator.rtol", "snake kinematic"),
     ],
 )

@@ -335,6 +335,31 @@ def test_labels_of_ticks_span_the_axis(low: float, high: float, height: float) -
     assert tick_faults(figure) == []
 
 
+@pytest.mark.parametrize("name", ["tracking_error", "hand_path"])
+def test_labels_are_measured_once_in_each_layout(name: str, braced: Record, monkeypatch: pytest.MonkeyPatch) -> None:
+    measured, measure = list[Axes](), Axes.get_tightbbox
+
+    def counted(axes: Axes, *args: Any, **options: Any) -> Any:
+        measured.append(axes)
+        return measure(axes, *args, **options)
+
+    monkeypatch.setattr(Axes, "get_tightbbox", counted)
+    with style.look():
+        figure = drawn(arm.FIGURES[name](braced))
+        list(style.with_panels([(name, figure)]))
+        assert sorted(map(id, measured)) == sorted(map(id, figure.axes))
+        figure.draw_without_rendering()
+    assert len(measured) == 3 * len(figure.axes)
+    # Another layout, which measures the labels at the present positions, moves no edge by a pixel: only labels that
+    # extend over the ends of an axis change their space, by a part of the change of its length.
+    before = [axes.get_position(original=True).extents for axes in figure.axes]
+    layout = figure.get_layout_engine()
+    assert layout is not None
+    layout.execute(figure)
+    moved = np.abs(np.subtract(before, [axes.get_position(original=True).extents for axes in figure.axes]))
+    assert moved.max() * figure.bbox.width < 1.0
+
+
 def test_planes_of_a_flat_path_have_different_scales() -> None:
     panels = list(style.new_figure(3.0, "").subplots(1, 3))
     note = energy._frame(panels, energy.PLANES, np.zeros(3), np.array([0.4, 0.3, 0.02]))

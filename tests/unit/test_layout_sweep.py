@@ -114,7 +114,7 @@ def test_maps_of_four_variants_have_no_faults(maps: Any, size: str, plotted: tup
 def planned(scenario: str, verify: bool, most: int, *candidates: str) -> PlanPicture:
     """The picture of a plan."""
     loaded = dynsim.load_scenario(scenario, next(iter(variant_names(scenario)), None))
-    plan = dynsim.plan_braces(loaded, candidates=candidates, count=(0, most), starts=1, verify=verify)
+    plan = dynsim.plan_braces(loaded, candidates=candidates, count=(0, most), starts=1, budget_s=0.0, verify=verify)
     assert plan.best is not None
     return pictures.picture(plan, pictures._records(plan).get(plan.best.variant))
 

@@ -33,7 +33,7 @@ def test_the_citation_is_of_this_version_and_names_both_papers() -> None:
     families = [[author["family-names"] for author in paper["authors"]] for paper in citation["references"]]
     assert families == [["Wang", "Minami"], ["Tanaka", "Tadakuma", "Nakajima", "Fujita"]]
     # Titles as in the documentation, whose line breaks differ.
-    for paper, page in zip(citation["references"], ("physics.md", "snake.md"), strict=True):
+    for paper, page in zip(citation["references"], ("theory/multibody.md", "snake.md"), strict=True):
         assert paper["title"] in " ".join((ROOT / "docs" / page).read_text(encoding="utf-8").split())
 
 

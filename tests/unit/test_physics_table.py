@@ -1,10 +1,10 @@
-"""Table of equations in docs/physics.md: it names every equation of [WM], and functions that exist."""
+"""Table of equations in docs/theory/equations.md: it names every equation of [WM], and functions that exist."""
 
 import importlib.util
 import re
 from pathlib import Path
 
-PHYSICS = Path(__file__).parents[2] / "docs" / "physics.md"
+PAGE = Path(__file__).parents[2] / "docs" / "theory" / "equations.md"
 EQUATIONS = 56  # of the paper, the last is the voltage law
 
 
@@ -12,7 +12,7 @@ def rows() -> list[tuple[str, str]]:
     """(equation, function) of the table of equations."""
     cells = [
         [cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]]
-        for line in PHYSICS.read_text(encoding="utf-8").splitlines()
+        for line in PAGE.read_text(encoding="utf-8").splitlines()
         if line.startswith(("| [WM]", "| –"))
     ]
     return [(row[0], row[2]) for row in cells]

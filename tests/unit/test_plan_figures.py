@@ -11,8 +11,18 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon
 from support.messages import mentions
 
-from dynsim.draw.figures.plan import CornerRun, PlanPicture, Pose, heat_by_set, posture, robustness, single_braces
-from dynsim.record.quantities import rounded
+from dynsim.draw.figures.plan import (
+    CornerRun,
+    PlanPicture,
+    Pose,
+    VariedPlans,
+    heat_by_set,
+    posture,
+    robustness,
+    single_braces,
+    varied,
+)
+from dynsim.record.quantities import Quantity, rounded
 
 
 def picture(aside: float) -> PlanPicture:
@@ -23,7 +33,7 @@ def picture(aside: float) -> PlanPicture:
     along, up = np.linspace(-0.2, 2.2, 5), np.linspace(-0.2, 0.7, 4)
     return PlanPicture(
         "arm", [pose, pose], np.array([[2.0, 0.0, 0.4], [2.1, 0.0, 0.4]]), ["elbow on floor"],
-        (along, up, np.repeat(up[:, None], len(along), axis=1)), None, [], {}, {}, {}, {},
+        (along, up, np.repeat(up[:, None], len(along), axis=1)), None, [], {}, {}, {}, {}, {},
     )  # fmt: skip
 
 
@@ -83,8 +93,8 @@ def test_an_arm_without_braces_has_no_forces() -> None:
 def compared() -> PlanPicture:
     """Plans of no brace and of one that does not survive, with two corners."""
     corners = {
-        0: [CornerRun("as planned", 1.0, 1.05, 0.1, 5.0), CornerRun("up", 1.0, 1.5, 0.1, 10.0)],
-        1: [CornerRun("as planned", 0.8, 1.05, 0.2, 5.0), CornerRun("up", 18.0, 1.5, 12.0, 10.0, "too hot")],
+        0: [CornerRun("as planned", 1.0, np.nan, 0.1, 5.0), CornerRun("up", 1.0, 1.5, 0.1, 10.0)],
+        1: [CornerRun("as planned", 1.0, np.nan, 0.2, 5.0), CornerRun("up", 18.0, 1.5, 12.0, 10.0, "too hot")],
     }
     return replace(
         picture(0.0),
@@ -92,6 +102,7 @@ def compared() -> PlanPicture:
         survives={0: True, 1: False},
         singles={"a on floor": 0.3, "b on floor": 9.0},
         corners=corners,
+        simulated={0: 50.0, 1: 0.4},
     )
 
 
@@ -120,7 +131,7 @@ def test_limits_and_rejected_runs_of_robustness_are_drawn() -> None:
     assert figure is not None
     heats, errors = figure.axes
     assert names_of(heats) == ["no braces: survives", "1 brace: rejected", "limit", "rejects the plan"]
-    for axes, limits, rejected in ((heats, [1.05, 1.5], 18.0), (errors, [5.0, 10.0], 12.0)):
+    for axes, limits, rejected in ((heats, [1.5], 18.0), (errors, [5.0, 10.0], 12.0)):
         (dashed,) = axes.collections
         assert [segment[0, 0] for segment in dashed.get_segments()] == pytest.approx(limits)
         crosses = [x for line in axes.lines if line.get_marker() == "x" for x in line.get_xdata()]
@@ -128,6 +139,15 @@ def test_limits_and_rejected_runs_of_robustness_are_drawn() -> None:
         assert axes.get_xlim()[1] > max(rejected, *limits)
     assert [text.get_text() for text in heats.get_yticklabels()] == ["as planned", "up"]
     assert mentions(figure.caption, "survives", "limit", "too hot")
+
+
+def test_hand_errors_without_a_limit_are_drawn() -> None:
+    shown = compared()
+    free = {count: [replace(run, error_limit=np.nan) for run in runs] for count, runs in shown.corners.items()}
+    figure = robustness(replace(shown, corners=free))
+    assert figure is not None
+    assert not figure.axes[1].collections[0].get_segments()
+    assert figure.axes[1].get_xlim()[1] > 12.0
 
 
 def test_run_that_ended_early_is_a_cross_at_the_edge() -> None:
@@ -154,3 +174,25 @@ def test_base_and_spheres_of_braces_are_drawn() -> None:
         assert [patch.radius for patch in axes.patches if isinstance(patch, Circle)] == pytest.approx([0.05, 0.05])
     # The column from the base to the first joint, 0.5 m high.
     assert any(np.allclose(line.get_xydata(), [[0.0, 0.2], [0.0, 0.5]]) for line in views[0].lines)
+
+
+def test_plans_for_several_values_show_limits_and_rejections() -> None:
+    """A panel for heat and for each requirement; a value without a plan leaves a gap, a rejected plan is hollow."""
+    rows = [
+        {"height_m": 0.1, "heat_W": 2.0, "hand_sag_m": 0.0005, "survives": True},
+        {"height_m": 0.2, "heat_W": 1.0, "hand_sag_m": 0.002, "survives": False},
+        {"height_m": 0.3, "reason": "out of reach"},
+    ]
+    plans = VariedPlans(
+        "height_m", Quantity("height", unit="m"), {"pad 0.1 m": rows, "pad 0.2 m": rows[:2]}, {"hand_sag_m": 0.001}
+    )
+    assert varied(picture(0.0)) is None
+    figure = varied(replace(picture(0.0), varied=plans))
+    assert figure is not None
+    heat, sag = figure.axes
+    assert (heat.get_ylabel(), sag.get_ylabel(), sag.get_xlabel()) == ("heat [W]", "hand sag [mm]", "height [m]")
+    assert {"pad 0.1 m", "pad 0.2 m", "limit"} == set(names_of(sag))
+    first, hollow = sag.lines[:2]
+    assert np.array_equal(first.get_ydata(), [0.5, 2.0, np.nan], equal_nan=True)
+    assert (list(hollow.get_xdata()), hollow.get_markerfacecolor()) == ([0.2], "white")
+    assert any(np.allclose(line.get_ydata(), 1.0) for line in sag.lines if line.get_label() == "limit")

@@ -1,11 +1,12 @@
 """Worker processes: started from any script, killed, or unable to start; errors and isolation of their tasks."""
 
+import importlib
 import json
 import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -13,10 +14,10 @@ from typing import Any
 import pytest
 from support.messages import check_message, mentions, raises
 from support.processes import wait_for
-from support.sweep_work import pid, says, square, unsendable
+from support.sweep_work import REFUSED, busy, pid, says, square, unsendable
 
 from dynsim.studies import processes
-from dynsim.studies.processes import START, STARTS, WorkerError, run_in_processes
+from dynsim.studies.processes import START, STARTS, WorkerError, end_workers, run_in_processes
 
 BATCH = """
 import json, os, sys
@@ -197,6 +198,99 @@ def test_a_worker_that_is_stopped_when_all_is_done_is_not_waited_for():
 
     run_in_processes(pid, range(4), 1, take)
     assert len(pids) == 4
+    end_workers()
+
+
+def collected(work: Callable[..., Any], tasks: Sequence[Any], jobs: int, **options: Any) -> list[Any]:
+    """Results in the order of the tasks."""
+    taken: dict[Any, Any] = {}
+    run_in_processes(work, tasks, jobs, lambda task, result: taken.update({task: result()}), **options)
+    return [taken[task] for task in tasks]
+
+
+def test_workers_are_kept_for_the_next_call(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    end_workers()
+    (first,) = {*collected(pid, range(3), 1)}
+    assert {*collected(pid, range(3), 1)} == {first}
+    assert collected(square, range(3), 1) == [0, 1, 4]
+    assert {*collected(pid, range(3), 1)} == {first}
+    monkeypatch.chdir(tmp_path)
+    assert first not in collected(pid, range(3), 1)
+
+
+def test_workers_of_older_modules_are_not_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    (tmp_path / "edited.py").write_text("")
+    monkeypatch.syspath_prepend(tmp_path)
+    importlib.import_module("edited")
+    os.utime(tmp_path / "edited.py", (1.0, 1.0))
+    before = collected(pid, [0], 1)
+    assert collected(pid, [0], 1) == before
+    os.utime(tmp_path / "edited.py")
+    assert collected(pid, [0], 1) != before
+    monkeypatch.delitem(sys.modules, "edited")
+
+
+def test_a_worker_that_died_since_the_last_call_is_replaced():
+    (before,) = collected(pid, [0], 1)
+    os.kill(before, signal.SIGKILL)
+    wait_for(lambda: not is_alive(before))
+    assert collected(pid, [0], 1) != [before]
+
+
+def is_alive(number: int) -> bool:
+    try:
+        return Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def test_unused_workers_end(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(
+        processes, "START", START.replace("serve(", "import dynsim.studies.processes as p\np.IDLE_S = 0.2\nserve(")
+    )
+    (before,) = collected(pid, [0], 1)
+    wait_for(lambda: not is_alive(before))
+    assert collected(pid, [0], 1) != [before]
+
+
+def nothing(task: Any) -> None:
+    """No progress function for tasks in this process."""
+
+
+def test_a_short_batch_stays_in_this_process():
+    end_workers()
+    assert {*collected(pid, range(50), 2, here=nothing)} == {os.getpid()}
+    assert not processes._kept
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_a_task_that_is_too_long_is_repeated_by_a_worker(jobs: int, monkeypatch: pytest.MonkeyPatch):
+    """The other tasks too; with one job there is no worker."""
+    monkeypatch.setattr(processes, "HERE_S", 0.05)
+    pids = collected(busy, [0.001, 0.2, 0.002, 0.003], jobs, here=nothing)
+    assert [number == os.getpid() for number in pids] == [True, *[jobs == 1] * 3]
+
+
+@pytest.mark.long
+def test_long_batches_are_shared_with_a_worker(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(processes, "ALONE_S", 0.2)
+    pids = collected(busy, [0.02 + 1e-6 * k for k in range(150)], 2, here=nothing)
+    assert os.getpid() in pids
+    assert len({*pids}) == 2
+
+
+@pytest.mark.parametrize("here", [None, nothing])
+def test_an_error_of_a_task_is_raised_for_this_task(here: Any):
+    errors: dict[int, str] = {}
+
+    def take(number: int, result: Callable[[], int]) -> None:
+        try:
+            result()
+        except ValueError as error:
+            errors[number] = str(error)
+
+    run_in_processes(square, [1, REFUSED, 2], 2, take, here=here)
+    assert {*errors} == {REFUSED}
 
 
 WAITS = """

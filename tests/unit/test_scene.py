@@ -9,6 +9,7 @@ import pytest
 from support.messages import raises
 
 from dynsim.compile.protocols import BuildContext
+from dynsim.compile.scene import solid_shape
 from dynsim.draw.geometry.shapes import round_patch, surface_grids
 from dynsim.errors import RecordError
 from dynsim.library.surfaces import cylinder, plane, sphere
@@ -39,6 +40,13 @@ def test_round_trip_and_unknown_keys():
     assert Scene.from_json(json.dumps(later)) == scene
     assert (scene.hand, scene.contacts) == (scene.points[0], scene.points[1:])
     assert (scene.surface("s"), scene.surface("none")) == (scene.surfaces[0], None)
+
+
+def test_planes_on_bodies_are_drawn_at_their_point():
+    config = plane.Config(type="plane", point_m=[0.05, 0.0, 0.3], normal=[1.0, 0.0, 0.0])
+    shape = solid_shape(plane.build(config, CONTEXT).shifted(np.array([0.0, 0.1, 0.0])), 0.5)
+    assert shape.position == pytest.approx((0.05, 0.1, 0.3))
+    assert shape.size[:2] == (0.5, 0.5)
 
 
 def test_heights_of_single_points_are_those_of_many():

@@ -12,8 +12,9 @@ from PIL import Image
 from support.messages import mentions, raises, says
 
 import dynsim
+from dynsim.draw.figures import draw, snake_tasks, snake_view, style, tanaka2019
 from dynsim.draw.figures import snake as figures
-from dynsim.draw.figures import snake_tasks, snake_view, style, tanaka2019
+from dynsim.draw.figures.look import Look
 from dynsim.engine import simulate
 from dynsim.errors import RecordError
 from dynsim.record import Record
@@ -47,6 +48,11 @@ def test_draw_writes_every_figure_from_a_record_on_disk(record, tmp_path, monkey
             assert len(np.unique(np.asarray(image.convert("L")))) > 10
     with Image.open(written[-1]) as animation:
         assert animation.n_frames == 4
+
+
+def test_the_animation_can_be_excluded(record, unwritten, tmp_path):
+    written = draw(record, tmp_path, look=Look(film=False))
+    assert [path.name for path in written] == [f"{name}.png" for name in figures.figures(record)]
 
 
 def test_figures_as_functions_of_records(record):

@@ -359,7 +359,7 @@ def test_a_lost_process_is_a_row_with_its_reason(tmp_path: Path, monkeypatch: py
     def lose() -> None:
         raise WorkerLost
 
-    def run(work: Any, tasks: Any, jobs: int, take: Any, *, attempts: int) -> bool:
+    def run(work: Any, tasks: Any, jobs: int, take: Any, *, attempts: int, here: Any) -> bool:
         for k, task in enumerate(tasks):
             take(task, lose if k == 1 else partial(work, task, None))
         return False
@@ -739,7 +739,7 @@ def test_colour_bars_stand_below_their_column():
 
 
 # One run takes long enough to be met on its way.
-LONG = ["--set", "duration_s=100", "--set", "record.rate_hz=1", "--no-figures", "--jobs", "2"]
+LONG = ["--set", "duration_s=3000", "--set", "record.rate_hz=1", "--no-figures", "--jobs", "2"]
 GRID = ["single_pendulum", "--grid", f"{LENGTH}=0.5:1:12"]
 
 
@@ -783,7 +783,7 @@ def test_whatever_ends_a_sweep_it_goes_on(tmp_path: Path, number: signal.Signals
 def test_a_killed_worker_costs_nothing_but_time(tmp_path: Path, whole: bytes):
     out = tmp_path / "out"
     with started(command("--out", str(out), "-q"), tmp_path / "errors") as child:
-        wait_for(lambda: done(out) >= 2)
+        wait_for(lambda: done(out) >= 2 and bool(workers_of(child.process.pid)))
         os.kill(workers_of(child.process.pid)[0], signal.SIGKILL)
         assert child.end() == 0, child.stderr
     assert (out / "sweep.csv").read_bytes() == whole

@@ -168,7 +168,7 @@ def test_braces_that_the_motors_cannot_press(tmp_path: Path) -> None:
         ),
         (
             "{type: height_field, file: nan.npy, spacing_m: [0.1, 0.1]}",
-            ("file = 'nan.npy'", "2", "1", "nan"),
+            ("file = ", "nan.npy", "2", "1", "nan"),
         ),
     ],
 )

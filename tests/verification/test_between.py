@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import math
+import re
+import sys
+import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,6 +17,7 @@ from support.random_bodies import Motions, in_motion
 from dynsim import Record, load_scenario, simulate
 from dynsim.errors import DynsimError
 from dynsim.record.quaternion import rotated
+from dynsim.scenario import Scenario
 from dynsim.scenario.schema import SceneObject
 
 POST = {
@@ -385,11 +390,13 @@ def test_neighbours_and_ignored_pairs_do_not_touch(tmp_path):
     [
         ([{"bodies": ["a", "x"]}], "unknown body 'x'"),
         ([{"bodies": ["a"]}], "two bodies"),
+        ([{"bodies": ["a", "table"]}], "'table' is a surface, not a body"),
     ],
 )
 def test_wrong_pairs_are_errors(tmp_path, between, text):
+    surfaces = {"table": {"type": "plane", "point_m": [0, 0, -1]}}
     with pytest.raises(DynsimError, match=text):
-        run(tmp_path, {"a": ball(1.0, 0.05, [0, 0, 0])}, between=between, duration_s=0.01)
+        run(tmp_path, {"a": ball(1.0, 0.05, [0, 0, 0])}, between=between, duration_s=0.01, surfaces=surfaces)
 
 
 def test_overlap_at_the_start_is_an_error(tmp_path):
@@ -398,10 +405,89 @@ def test_overlap_at_the_start_is_an_error(tmp_path):
         run(tmp_path, objects, duration_s=0.01)
 
 
+BOX = {"size_m": [0.1, 0.12, 0.14], "mass_kg": 1}
+ROD = {"shape": "cylinder", "radius_m": 0.03, "length_m": 0.3, "mass_kg": 1}
+
+
+@pytest.mark.parametrize(
+    ("other", "depth"),
+    [
+        (BOX | {"position_m": [0.05, 0.0, 0.0]}, 0.05),
+        (BOX | {"position_m": [0.06, 0.01, 0.02]}, 0.04),
+        (BOX | {"position_m": [0.02, 0.03, 0.05], "rpy_deg": [20, 30, 40]}, None),
+        (BOX | {"position_m": [0.06, 0.08, 0.0], "rpy_deg": [45, 0, 45]}, None),
+        (ROD | {"position_m": [0.01, 0.02, 0.0], "rpy_deg": [90, 0, 0]}, 0.07),
+        (ROD | {"position_m": [0.0, 0.03, 0.08], "rpy_deg": [70, 20, 0]}, None),
+        (ball(1.0, 0.05, [0.02, 0.01, 0.0]), 0.08),
+        (ball(1.0, 0.05, [0.07, 0.08, 0.0]), None),
+    ],
+)
+def test_overlap_ends_after_the_advised_move(tmp_path, other, depth):
+    """The depth is the length of the move; moves that are 1 % shorter leave an overlap."""
+    start, objects = np.array([0.3, 0.2, 0.1]), {"b": other, "a": BOX | {"position_m": [0, 0, 0]}}
+
+    def error(position: Any) -> str:
+        objects["a"]["position_m"] = [float(value) for value in position]
+        objects["b"] = other | {"position_m": (start + other["position_m"]).tolist()}
+        try:
+            run(tmp_path, objects, duration_s=0.002, integrator={"method": "time_stepping"})
+        except DynsimError as failure:
+            return str(failure)
+        return ""
+
+    message = re.search(r"overlap by (\S+) m .* move (\w) by \((.*)\) m", error(start))
+    assert message
+    by = np.array([float(part) for part in message[3].split(",")]) * (1.0 if message[2] == "a" else -1.0)
+    stated = float(message[1])
+    assert depth is None or stated == pytest.approx(depth, abs=1e-5)
+    assert np.linalg.norm(by) == pytest.approx(stated, abs=1e-4)
+    assert error(start + by) == ""
+    assert "overlap by" in error(start + 0.99 * by)
+
+
+def test_object_inside_a_surface_is_an_error_about_its_position(tmp_path):
+    box = {"size_m": [0.1, 0.1, 0.1], "mass_kg": 1, "position_m": [0, 0, 0.049]}
+    with pytest.raises(DynsimError, match=r"objects\.box\.position_m: box starts 0\.001 m inside surface 'table'"):
+        run(tmp_path, {"box": box}, duration_s=0.01, surfaces={"table": {"type": "plane"}})
+
+
 def test_many_pairs_need_time_stepping(tmp_path):
     boxes = {f"b{k}": {"size_m": [0.1, 0.1, 0.1], "mass_kg": 1, "position_m": [0.2 * k, 0, 0]} for k in range(2)}
     with pytest.raises(DynsimError, match=r"28 candidates .* time_stepping"):
         run(tmp_path, boxes, duration_s=0.01, integrator={"method": "dopri5"})
+
+
+def folded(tmp_path, links: int) -> Scenario:
+    """An arm whose links, in a zigzag, can all touch each other."""
+    chain = [{"axis": "y", "count": links, "length_m": 0.2, "mass_kg": 0.2, "radius_m": 0.02}]
+    plant = {"type": "serial_arm", "chain": chain, "initial_deg": [10, -10] * (links // 2)}
+    scenario = {"duration_s": 0.01, "plant": plant, "integrator": {"method": "time_stepping"}}
+    scenario["contacts"] = {"law": "unilateral", "between": [{"bodies": "self"}]}
+    (tmp_path / "arm.yaml").write_text(yaml.safe_dump(scenario), encoding="utf-8")
+    return load_scenario(tmp_path / "arm.yaml")
+
+
+def test_pairs_of_thirty_links_are_prepared_quickly(tmp_path):
+    resource = pytest.importorskip("resource")
+    before, started = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.process_time()
+    record = simulate(folded(tmp_path, 30))
+    assert time.process_time() - started < 3.0
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 5e5  # KB
+    assert len(record.labels["contact_normal_force"]) == 4 * (30 * 29 // 2 - 29)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits of the address space")
+def test_scratch_of_too_many_pairs_is_an_error(tmp_path):
+    import resource
+
+    scenario, limits = folded(tmp_path, 30), resource.getrlimit(resource.RLIMIT_AS)
+    used = resource.getpagesize() * int(Path("/proc/self/statm").read_text().split()[0])
+    try:
+        resource.setrlimit(resource.RLIMIT_AS, (used + 3 * 10**9, limits[1]))
+        with pytest.raises(DynsimError, match=r"arm\.yaml.*1624 contact candidates need 3\.8 GB .*fewer pairs"):
+            simulate(scenario)
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, limits)
 
 
 def test_bilateral_law_is_refused(tmp_path):
@@ -424,8 +510,201 @@ def test_a_sphere_on_the_corner_of_a_box_is_one_contact(tmp_path):
     assert record["contact_gap"][0, 0] == pytest.approx(0.15 - 0.001 - math.sqrt(3.0) * 0.049, abs=1e-12)
 
 
-def test_names_of_groups_are_refused_for_bodies_and_entries_without_effect_are_named(tmp_path, caplog):
+def test_names_of_groups_are_refused_for_bodies(tmp_path):
     with pytest.raises(DynsimError, match="'links' is a group and a body"):
         run(tmp_path, {"links": ball(1.0, 0.05, [0, 0, 0]), "b": ball(1.0, 0.05, [0, 0, 1])}, duration_s=0.002)
-    run(tmp_path, {"b": ball(1.0, 0.05, [0, 0, 1])}, duration_s=0.002)
-    assert "contacts.between.0 has no effect" in caplog.text
+
+
+def test_entries_and_ignored_pairs_without_effect_are_listed(tmp_path):
+    objects = {"a": ball(1.0, 0.05, [0, 0, 0]), "b": ball(1.0, 0.05, [0, 0, 1])}
+    pair = {"bodies": ["a", "b"]}
+    between = [{"bodies": ["a", "a"]}, pair | {"ignore": [["b", "a"]]}, pair | {"ignore": [["link_1", "b"]]}, pair]
+    warnings = run(tmp_path, objects, between=between, duration_s=0.002).summary["warnings"]
+    listed = [text.partition(" (")[0] for text in warnings if text.startswith("contacts.between")]
+    nothing = "no pair remains without neighbours on joints and `ignore`"
+    assert listed == [
+        f"contacts.between.0 has no effect: {nothing}",
+        f"contacts.between.1 has no effect: {nothing}",
+        "contacts.between.2.ignore has no effect: the entry does not contain link_1-b",
+    ]
+
+
+def test_further_contacts_of_a_pair_cannot_determine_the_start(tmp_path):
+    boxes, entries = {"a": cube([0, 0, 0]), "b": cube([0, 0, 0.2])}, [{"bodies": ["b", "a"]}]
+    with pytest.raises(DynsimError, match="'b-a_2' is a further contact of a pair; use 'b-a'"):
+        run(tmp_path, boxes, between=entries, initial={"on_surface": ["b-a_2"]}, duration_s=0.002)
+
+
+def cube(position: list[float], **more: Any) -> dict[str, Any]:
+    return {"size_m": [0.1, 0.1, 0.1], "mass_kg": 1.0, "position_m": position} | more
+
+
+def pressed(tmp_path, upper: dict[str, Any], lower: dict[str, Any], stiffness: float, direction: list[float]) -> Record:
+    """A body on rails that 10 N press on a fixed one."""
+    rails = {"slide": {"axis": direction, "damping_N_s_per_m": 60.0}}
+    fixed = {"slide": {"axis": [0, 1, 0], "friction_N": 1000.0}}
+    between = [{"bodies": ["a", "b"], "stiffness_N_per_m": stiffness}]
+    force = {"p": {"type": "constant", "body": "a", "force_N": [-10.0 * x for x in direction]}}
+    return run(tmp_path, {"a": upper | rails, "b": lower | fixed}, between=between, loads=force, duration_s=0.3)
+
+
+DIAGONAL = [3.0**-0.5] * 3
+UPRIGHT = {"rpy_deg": [45.0, 35.26439, 0.0]}
+CORNERS = cube([0.098 + 0.0021 * 3.0**-0.5] * 3), cube([0, 0, 0]), DIAGONAL
+EDGES = (
+    cube([0, 0, 0.1407], rpy_deg=[45, 0, 0]),
+    cube([0, 0, 0], rpy_deg=[0, 45, 0]),
+    [0.0, 0.0, 1.0],
+)
+FACES = cube([0.01, 0.02, 0.1001]), cube([0, 0, 0]), [0.0, 0.0, 1.0]
+CORNER_ON_FACE = cube([0.01, 0.02, 0.136]) | UPRIGHT, cube([0, 0, 0]), [0.0, 0.0, 1.0]
+BALL_ON_EDGE = (
+    ball(1.0, 0.05, [0.049 + 0.0511 * 2.0**-0.5, 0, 0.049 + 0.0511 * 2.0**-0.5]),
+    cube([0, 0, 0]),
+    [2.0**-0.5, 0.0, 2.0**-0.5],
+)
+
+
+@pytest.mark.parametrize(
+    ("scene", "stiffness", "warned"),
+    [
+        (CORNERS, 1000.0, True),
+        (CORNERS, 10_000.0, False),
+        (EDGES, 1000.0, True),
+        (EDGES, 10_000.0, False),
+        (FACES, 300.0, False),
+        (CORNER_ON_FACE, 1000.0, False),
+        (BALL_ON_EDGE, 1000.0, False),
+    ],
+)
+def test_edges_compressed_beyond_their_rounding_are_reported(tmp_path, scene, stiffness, warned):
+    """Only the normals of edges and corners depend on the rounding; a ball keeps its normal."""
+    upper, lower, direction = scene
+    warnings = pressed(tmp_path, upper, lower, stiffness, direction).summary["warnings"]
+    assert any("rounding of the edges (2 mm)" in text for text in warnings) == warned
+    assert not warned or not any(text.startswith("time stepping") and "integrator.step_s" in text for text in warnings)
+
+
+@pytest.mark.parametrize(("shift", "warned"), [(0.049, True), (0.0, False)])
+def test_points_pressed_into_an_edge_of_the_world_are_reported(tmp_path, shift, warned):
+    """10 mm deep, at the edge and on the face of a box that stands in the world."""
+    slope = [2.0**-0.5 if warned else 0.0, 0.0, 2.0**-0.5 if warned else 1.0]
+    rails = {"axis": slope, "damping_N_s_per_m": 60.0}
+    block = {"type": "box", "center_m": [0, 0, 0], "edges_m": [0.1, 0.1, 0.1], "edge_radius_m": 0.001}
+    record = run(
+        tmp_path,
+        {"a": cube([shift + 0.001 * slope[0], 0, 0.049 + 0.001 * slope[2]], slide=rails)},
+        surfaces={"block": block},
+        contacts={
+            "law": "unilateral",
+            "points": {"p": {"body": "a", "surface": "block", "stiffness_N_per_m": 1000.0}},
+        },
+        loads={"f": {"type": "constant", "body": "a", "force_N": [-10.0 * x for x in slope]}},
+        duration_s=0.5,
+    )
+    texts = [text for text in record.summary["warnings"] if "rounding of the edges (1 mm)" in text]
+    assert len(texts) == warned
+    assert record.summary["contacts"][0]["penetration_max_m"] > 5e-3
+
+
+def test_the_advised_stiffness_conserves_energy(tmp_path):
+    objects = {
+        "a": cube([0, 0, 0], rpy_deg=[10, 20, 30]),
+        "b": {"mass_kg": 2, "size_m": [0.2, 0.1, 0.05], "position_m": [0.3, 0.03, 0.02], "rpy_deg": [5, 0, 40]},
+    }
+    loads = {"push": pushed("a", [15.0, 0.0, 0.0])}
+    between = {"bodies": ["a", "b"], "stiffness_N_per_m": 50_000.0}
+    record = run(tmp_path, objects, between=[between], loads=loads, duration_s=0.3)
+    (warning,) = [text for text in record.summary["warnings"] if "rounding of the edges" in text]
+    assert warning.startswith("a-b: ")
+    assert abs(record["energy_kinetic"][-1] / record["work_loads"][-1, 0] - 1.0) > 0.03
+    between["stiffness_N_per_m"] = float(warning.rpartition(" ")[2])
+    record = run(tmp_path, objects, between=[between], loads=loads, duration_s=0.3, step=2e-5)
+    assert record["energy_kinetic"][-1] == pytest.approx(record["work_loads"][-1, 0], rel=1e-3)
+    assert not record.summary["warnings"]
+
+
+def test_bodies_elsewhere_do_not_change_a_rebound(tmp_path):
+    """A rod whose restitution would create energy with friction, and a ball that lands 5 m away in the same step."""
+    rod = {"shape": "cylinder", "radius_m": 0.02, "length_m": 0.4, "mass_kg": 1, "position_m": [0, 0, 0.12341457]}
+    objects = {"rod": rod | {"rpy_deg": [0, 55.5148884, 0]}, "ball": ball(2.0, 0.05, [5, 0, 0.051411036])}
+    motions = {"rod": ([-1.3812, 0, -0.060582], [0, -12.493, 0]), "ball": ([0, 0, -1.0], [0, 0, 0])}
+    ends = {}
+    for names in (["rod", "ball"], ["rod"], ["ball"]):
+        record = run(
+            tmp_path,
+            {name: objects[name] for name in names},
+            between=[{"bodies": ["objects", "links"]}],
+            motions={name: motions[name] for name in names},
+            surfaces={"floor": {"type": "plane"}},
+            plant={"chain": [{"axis": "y", "length_m": 0.1, "mass_kg": 0.1, "radius_m": 0.01}]},
+            weight=True,
+            friction=1.889434,
+            restitution=0.961838,
+            duration_s=0.01,
+        )
+        labels = np.array([label.partition(".")[0] for label in record.labels["v"]])
+        ends[len(names), names[0]] = record["v"][-1]
+        if len(names) == 2:
+            both = {name: record["v"][-1][labels == name] for name in names}
+    assert both["ball"][2] > 0.8
+    np.testing.assert_allclose(both["rod"], ends[1, "rod"][-6:], atol=1e-9)
+    np.testing.assert_allclose(both["ball"], ends[1, "ball"][-6:], atol=1e-9)
+
+
+def test_names_of_contacts_are_unique(tmp_path):
+    objects = {"b": cube([0, 0, 0.05]), "b1": ball(1.0, 0.05, [1, 0, 0.05])}
+    record = run(tmp_path, objects, surfaces={"floor": {"type": "plane"}}, weight=True, duration_s=0.02)
+    labels = record.labels["contact_normal_force"]
+    assert len(set(labels)) == len(labels)
+    assert record["contact_normal_force"][-1, labels.index("b1.floor_2")] == pytest.approx(9.81, rel=1e-6)
+
+
+@pytest.mark.parametrize("rate", [60.0, 150.0])
+def test_a_slender_rod_spins_with_constant_energy(tmp_path, rate):
+    """At 150 rad/s the iteration for the angular momentum diverges, and the midpoint equation is kept."""
+    rods = {name: bar(1.0, 0.01, 0.6, [0, y, 0]) for name, y in (("a", 0.0), ("b", 1.0))}
+    record = run(tmp_path, rods, motions={"a": ([0, 0, 0], [0, rate, 0])}, duration_s=0.1)
+    np.testing.assert_allclose(record["energy_kinetic"], record["energy_kinetic"][0], rtol=1e-9)
+
+
+PLATE = cube([0, 0.01, 0.01], size_m=[0.004, 0.2, 0.2])
+
+
+@pytest.mark.parametrize("rate", [200, 3000])
+@pytest.mark.parametrize(
+    ("bodies", "step", "passes"),
+    [
+        ((cube([-0.3, 0, 0]), cube([0, 0.01, 0.01])), 1e-3, True),
+        ((cube([-0.3, 0, 0]), cube([0, 0.01, 0.01])), 1e-4, False),
+        ((cube([-0.3, 0, 0], size_m=[0.01, 0.05, 0.05]), PLATE), 1e-3, True),
+        # A cube, and a ball that sinks in by more than the plate is thick, turns the plate and stays on its side.
+        ((cube([-0.3, 0, 0]), PLATE), 1e-3, False),
+        ((ball(1.0, 0.02, [-0.3, 0, 0]), PLATE), 1e-3, False),
+        # Beside each other.
+        ((cube([-0.3, 0, 0]), cube([0, 0.105, 0])), 1e-3, False),
+    ],
+)
+def test_bodies_that_pass_through_each_other_are_reported(tmp_path, bodies, step, passes, rate):
+    """At 30 m/s; a shorter step finds the contact."""
+    more = {"duration_s": 0.03, "step": step, "record": {"rate_hz": rate}}
+    record = run(tmp_path, dict(zip("ab", bodies, strict=True)), motions={"a": ([30, 0, 0], [0, 0, 0])}, **more)
+    texts = [text for text in record.summary["warnings"] if "pass through each other" in text]
+    assert len(texts) == passes
+    ahead = record["q"][-1, [record.labels["q"].index(f"{name}.x") for name in "ab"]]
+    assert not passes or ahead[0] > ahead[1] + 0.1
+    for text in texts:
+        assert "30 mm per step" in text
+
+
+def test_drift_is_the_error_of_event_driven_constraints_only(tmp_path):
+    """A ball on a spring: its compression is the depth of the contact, and no drift."""
+    objects = {"a": cube([0, 0, 0.05]), "b": ball(1.0, 0.05, [0, 0, 0.15])}
+    more = {"surfaces": FLOOR, "weight": True, "duration_s": 0.1}
+    soft = run(tmp_path, objects, between=[{"bodies": ["a", "b"], "stiffness_N_per_m": 1e4}], **more).summary
+    assert "constraint_drift_max_m" not in soft
+    assert soft["time_stepping"]["penetration_max_m"] < 1e-5
+    (pair,) = [contact for contact in soft["contacts"] if contact["name"] == "b-a"]
+    assert pair["penetration_max_m"] > 1e-3
+    rigid = run(tmp_path, objects, integrator={"method": "dopri5"}, **more).summary
+    assert rigid["constraint_drift_max_m"] < 1e-9

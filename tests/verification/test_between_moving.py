@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 import pytest
 from verification.test_between import FLOOR, ball, leaning, run
 
-from dynsim import Record
+from dynsim import Record, load_scenario, simulate
+from dynsim.errors import DynsimError
+from dynsim.scenario import build
 
 G = 9.81
 HEAVY = {"size_m": [4, 4, 1], "mass_kg": 1e9, "position_m": [0, 0, -0.5]}
@@ -167,6 +170,38 @@ def test_a_rider_on_a_turntable_slips_at_its_friction(tmp_path, method):
     assert away[record.time > 1.1 * slips].min() > 1e-4
 
 
+@pytest.mark.parametrize("method", ["time_stepping", "dopri5"])
+def test_a_rider_on_a_tilting_table_slips_at_the_angle_of_friction(tmp_path, method):
+    """Its tangents turn with the table: it slips at tan φ = µ, and its normal force is the force along the normal."""
+    record = run(
+        tmp_path,
+        {
+            "rider": {"size_m": [0.004, 0.004, 0.002], "mass_kg": 1e-3, "position_m": [0, 0, 0.001]},
+            "table": {
+                "size_m": [1, 1, 0.02],
+                "mass_kg": 10.0,
+                "position_m": [0, 0, -0.01],
+                "hinge": {"axis": [0, 1, 0]},
+            },
+        },
+        surfaces={"top": {"type": "plane", "point_m": [0, 0, 0.01], "on": "table"}},
+        between=[],
+        loads={"turn": load("table", [0.0] * 3, (0.0, 10.0 / 12.0 * (1.0 + 0.02**2) * 0.5, 0.0))},
+        weight=True,
+        friction=0.6,
+        duration_s=1.6,
+        integrator=integrator(method),
+    )
+    slips = min(event.time for event in record.events if event.kind == "slip_start")
+    angle = np.interp(slips, record.time, coordinates(record, "table")[:, 0])
+    assert angle == pytest.approx(math.atan(0.6), abs=5e-3)
+    normal = np.sum(record["contact_force"] * record["contact_normal"], axis=-1)
+    sticks = record.time < slips
+    # With time stepping, forces are along the normal at the middle of the step.
+    rtol = 1e-3 if method == "time_stepping" else 1e-6
+    np.testing.assert_allclose(record["contact_normal_force"][sticks], normal[sticks], rtol=rtol, atol=1e-8)
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("method", ["dopri5", pytest.param("radau5", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("rider", ["box", "sphere"])
@@ -202,3 +237,31 @@ def test_a_disc_is_flat(tmp_path):
     record = run(tmp_path, objects, weight=True, friction=0.3, duration_s=0.1)
     assert record["contact_normal_force"][-1].sum() == pytest.approx(0.5 * G, rel=1e-9)
     assert coordinates(record, "ball")[-1, 2] == pytest.approx(0.025, abs=1e-9)
+
+
+def test_a_mobile_base_pushes_a_ball():
+    """The ball leaves at the speed of the base, because the base then brakes; a box has too many candidates."""
+    path = {"type": "waypoints", "frame": "start", "times_s": [0.1, 2.1], "points_m": [[0, 0], [0.4, 0]]}
+    keys = {
+        "duration_s": 1.8,
+        "controller.base.path": path,
+        "objects": {"ball": ball(0.3, 0.06, [0.3, 0, 0.06])},
+        "contacts": {"law": "unilateral", "friction": 0.0, "between": [{"bodies": ["base", "ball"]}]},
+    }
+    record = simulate(load_scenario("mobile_path", None, keys))
+    force = record["contact_normal_force"][:, record.labels["contact_normal_force"].index("ball-base")]
+    pressed = np.flatnonzero(force > 1e-6)
+    assert 0.2 < record.time[pressed[0]] < record.time[pressed[-1]] < 1.5
+    assert record["contact_gap"].min() > -1e-6
+    speed = record["v"][:, record.labels["v"].index("ball.x")]
+    base = np.gradient(record["q"][:, record.labels["q"].index("base.x")], record.time)
+    assert speed[-1] == pytest.approx(speed[pressed[-1] + 1], abs=1e-6)
+    assert speed[-1] == pytest.approx(base.max(), rel=0.02)
+    assert record.summary["energy_residual_relative"] < 1e-8
+    box = {"size_m": [0.1, 0.1, 0.1], "mass_kg": 0.3, "position_m": [0.5, 0, 0.05]}
+    alone = keys["contacts"] | {"between": [{"bodies": ["links", "objects"]}]}
+    touching = build.contacts(load_scenario("mobile_path", None, keys | {"contacts": alone}))
+    links = {contact.surface.carrier for contact in touching if contact.is_between_bodies}
+    assert links == {f"link_{k}" for k in range(2, 11)}
+    with pytest.raises(DynsimError, match=r"28 candidates .* use spheres"):
+        simulate(load_scenario("mobile_path", None, keys | {"objects": {"ball": box}}))

@@ -13,7 +13,7 @@ from support.random_robots import random_positions, random_robot, random_robot_o
 
 import dynsim
 from dynsim.cli.comparison import print_comparison, print_summary
-from dynsim.compile.clearance import poses, sinking
+from dynsim.compile.clearance import _is_above, axis_gaps, poses, sinking
 from dynsim.compile.model import Model
 from dynsim.engine import check
 from dynsim.errors import ModelError
@@ -52,6 +52,20 @@ def test_poses_behind_joints_of_every_kind(seed):
             rotation, origin = model.body_pose(link.name, q[k])
             np.testing.assert_allclose(R[:, :, k], rotation, atol=1e-12)
             np.testing.assert_allclose(p[:, k], origin, atol=1e-11)
+
+
+@given(seeds)
+def test_heights_in_single_precision_decide_away_from_the_limit(seed):
+    rng = np.random.default_rng(seed)
+    robot, q = random_robot(rng, 7), rng.normal(size=(9, 7))
+    plane = Quadric(np.zeros((3, 3)), rng.normal(size=3), rng.normal())
+    lowest = min(float(gap.min()) for _, _, gap in axis_gaps(robot, {"plane": plane}, q))
+    size = float(np.linalg.norm(plane.b))
+    # 160 roundings of 1.2e-7 of lengths (14 m), positions (7 × 4 rad) and the distance of the plane (100 m) are 3e-3 m.
+    for height, above in ((1e-2, True), (1e-6, False), (-1e-2, False)):
+        raised = Quadric(plane.Q, plane.b, plane.c + size * (height - lowest))
+        assert _is_above(robot, {"plane": raised}, q) == above
+        assert (sinking(robot, {"plane": raised}, q) == []) == (height > 0.0)
 
 
 def test_rows_without_a_body_do_not_sink():

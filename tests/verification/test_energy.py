@@ -104,7 +104,7 @@ def test_the_floor_is_far_below_what_a_run_turns_over():
 
 @pytest.mark.parametrize("name", sorted(FREE))
 def test_free_motion_leaves_no_more_than_is_documented(name):
-    """docs/validation.md: tens of rtol without losses; a run that leaves more than 1e-6 says so, and rtol helps."""
+    """Compare with docs/validation/evidence.md: tens of rtol without losses, a warning above 1e-6, and rtol helps."""
     summary = dynsim.simulate(free_scenario(name)).summary
     assert summary["energy_residual_relative"] < 2e-4
     warned = bool(lines_with(summary["warnings"], phrase="ledger"))

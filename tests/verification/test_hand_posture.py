@@ -10,8 +10,10 @@ from support.messages import raises
 from support.turned_tool import TURNED
 
 import dynsim
-from dynsim.compile.hand_posture import hand_turns, turn_error
+from dynsim.compile.hand_posture import hand_turn, hand_turns, turn_error
+from dynsim.compile.references.inverse_kinematics import follow
 from dynsim.errors import ModelError, UnreachableReference
+from dynsim.model.base_pose import base_row
 from dynsim.scenario import build
 from dynsim.scenario.reading import scenario_from_resolved
 
@@ -49,6 +51,39 @@ def test_braces_stay_on_their_surfaces_within_limits(arm) -> None:  # type: igno
     stops = np.array([(link.lower, link.upper) for link in model.robot.links])
     assert (q >= stops[:, 0]).all()
     assert (q <= stops[:, 1]).all()
+
+
+def test_objects_do_not_change_hand_postures() -> None:
+    """A free object has a joint with several coordinates, which does not belong to the chain of the hand."""
+    data = scene(3)
+    alone = dynsim.build_model(scenario_from_resolved(data))
+    block = {"mass_kg": 1.0, "size_m": [0.1, 0.1, 0.1], "position_m": [3.0, 0.0, 1.0]}
+    model = dynsim.build_model(scenario_from_resolved(data | {"objects": {"block": block}}))
+    there = np.linspace(0.1, 0.5, alone.n)
+    target, R = alone.point_position(*alone.robot.hand, there), alone.body_pose(alone.robot.hand[0], there)[0]
+    start = model.robot.initial
+    start[: alone.n] = there + 0.1
+    q = model.inverse_kinematics(target, start, orientation=R)
+    assert np.array_equal(q[alone.nq :], start[alone.nq :])
+    expected = alone.inverse_kinematics(target, there + 0.1, orientation=R)
+    np.testing.assert_allclose(q[: alone.nq], expected, rtol=0.0, atol=1e-12)
+
+
+def test_orientation_is_kept_on_a_moving_base() -> None:
+    """The arm compensates for the motion of the base, whose coordinates are wheels, x and y."""
+    model = dynsim.build_model(dynsim.load_scenario("mobile_reach"))
+    start = model.robot.initial
+    target, turn = model.point_position(*model.robot.hand, start), hand_turn(model, start)
+    first = base_row(model.robot)[0]
+    base = start[first : first + 4] + np.array([[0.0, 0.0, 0.0, 0.0], [0.02, -0.02, -0.01, 0.0]])
+    joints = [f"joint_{k}" for k in range(1, 11)]
+    positions = follow(model, np.arange(2.0), np.array([target, target]), joints, start, 1e-8, None, base, (), turn)
+    q = start.copy()
+    q[first : first + 4] = base[1]
+    q[[model.robot.position_index[model.joint_names.index(joint)] for joint in joints]] = positions[1]
+    assert np.abs(q - start)[[first, first + 2]].min() > 1e-3
+    np.testing.assert_allclose(model.point_position(*model.robot.hand, q), target, atol=1e-7)
+    assert np.abs(hand_turn(model, q) - turn).max() < 1e-6
 
 
 def test_what_is_out_of_reach_says_how_far(arm) -> None:  # type: ignore[no-untyped-def]

@@ -5,12 +5,13 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from numba import config, types
+from numba import config, typeof, types
 from support.random_robots import assemble, random_contacts, random_robot
 
 from dynsim.compile.model import Model
@@ -18,7 +19,7 @@ from dynsim.dynamics import derivative as system
 from dynsim.dynamics import ledger
 from dynsim.dynamics.tree import articulated, joints, sweep
 from dynsim.integrators import driver, steps
-from dynsim.jit.kernel import FixedSignature, reals
+from dynsim.jit.kernel import FixedSignature, _traits, reals
 
 PLAIN_PYTHON = """
 import sys
@@ -101,6 +102,26 @@ def test_a_direct_kernel_is_the_kernel():
     direct = FixedSignature(steps.finite)
     for values in ([1.0, 2.0], [1.0, np.nan, 3.0], []):
         assert direct(reals(values)) == steps.finite(reals(values)) == bool(np.isfinite(values).all())
+
+
+def test_values_with_equal_traits_have_the_same_numba_type():
+    grid = np.zeros((3, 4))
+    fixed = grid.copy()
+    fixed.flags.writeable = False
+    arrays = (
+        grid,
+        grid.T,
+        grid[:, ::2],
+        grid[0],
+        fixed,
+        np.zeros((3, 4), dtype=np.int64),
+        np.zeros(25)[1:].reshape(4, 6),
+    )
+    values = (*arrays, 1, 1.0, True, None, (grid,), (grid, 1), (fixed,), ((grid,),), steps.finite)
+    for a, b in combinations(values, 2):
+        assert _traits(a) != _traits(b) or typeof(a) == typeof(b), (a, b)
+    # The traits distinguish no more than this, so that runs share the compiled signatures.
+    assert _traits((grid, 1, 2.0)) == _traits((np.ones((7, 2)), 5, 0.0))
 
 
 def test_kernels_run_as_plain_python(tmp_path):

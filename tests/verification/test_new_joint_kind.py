@@ -1,4 +1,4 @@
-"""The screw joint of docs/extending.md, added to a copy of the package as the document says, and its dynamics."""
+"""The screw joint of docs/dev/core.md, added to a copy of the package as the document says, and its dynamics."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ print("the screw turns")
 def extended(folder: Path) -> Path:
     """A copy of the package with the file and the branch of the document."""
     shutil.copytree(ROOT / "dynsim", folder / "dynsim", ignore=shutil.ignore_patterns("__pycache__"))
-    text = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "dev" / "core.md").read_text(encoding="utf-8")
     section = text.split("\n## A joint\n")[1].split("\n## ")[0]
     file, branch = re.findall(r"```python\n(.*?)```", section, flags=re.DOTALL)
     (folder / "dynsim" / "model" / "joints" / "screw.py").write_text(file, encoding="utf-8")

@@ -12,7 +12,6 @@ from support.messages import raises
 import dynsim
 from dynsim.compile.touching import touch
 from dynsim.errors import ModelError
-from dynsim.model.description import WORLD
 from dynsim.planner.problem import LINK_CLEARANCE, Options, Task, task
 from dynsim.planner.search import Search
 from dynsim.planner.verify import Tolerances
@@ -34,7 +33,7 @@ def arm(**changes: Any) -> dynsim.Scenario:
 
 
 def search(scenario: dynsim.Scenario, **options: Any) -> tuple[Search, dict[int, list]]:
-    searched = Search(task(scenario, Options(**{"count": (0, 1), "starts": 1} | options)))
+    searched = Search(task(scenario, Options(**{"count": (0, 1), "starts": 1, "budget_s": 0.0} | options)))
     return searched, searched.run()
 
 
@@ -81,13 +80,12 @@ def test_distances_of_solids_and_their_rates(tmp_path):
 
 
 def test_self_contact_steers_the_search():
-    """Without `between` every path without braces is rejected, because links touch."""
-    refused, without = search(arm(**LONG), count=(0, 0), starts=2)
-    assert not without[0]
-    assert "touch each other" in refused.tally.refused[()]
-    searched, planned = search(arm(**LONG, **SELF), count=(0, 0))
-    for plans in planned.values():
-        assert least(searched.task, plans[0].dense.q) > LINK_CLEARANCE - 1e-6
+    """Links with a radius keep clear of each other, as with `between`; links that overlap at the start do not."""
+    searched, planned = search(arm(**LONG), count=(0, 0))
+    assert least(searched.task, planned[0][0].dense.q) > LINK_CLEARANCE - 1e-6
+    entire = task(arm(**LONG, **SELF), Options(count=(0, 0)))
+    assert set(searched.task.arm.pairs) <= set(entire.arm.pairs)
+    assert len(searched.task.arm.pairs) > 50
 
 
 @pytest.mark.long
@@ -99,7 +97,7 @@ def test_collision_shapes_keep_links_apart(tmp_path):
     data["contacts"] = {"law": "unilateral", "friction": 0.1}
     (tmp_path / "arm.yaml").write_text(yaml.safe_dump(data | {"variants": {}}))
     searched, planned = search(dynsim.load_scenario(tmp_path / "arm.yaml"), radius_m=0.05)
-    assert searched.task.self_contact
+    assert searched.task.arm.pairs
     model, arm_of = searched.task.arm.model, searched.task.arm
     for count in (0, 1):
         q = planned[count][0].dense.q
@@ -122,7 +120,7 @@ def test_shapes_that_overlap_at_the_start_do_not_count():
     assert set(coiled.arm.pairs) < set(all_pairs.arm.pairs)
     # Ten pairs of links, and the links except the first against the pedestal.
     assert len(set(all_pairs.arm.pairs)) == 15
-    assert {pair[0] for pair in all_pairs.arm.pairs if pair[1] == WORLD} == set(all_pairs.arm.model.robot.bodies[1:])
+    assert {pair[0] for pair in all_pairs.arm.pairs if pair[1] == "base"} == set(all_pairs.arm.model.robot.bodies[1:])
 
 
 def test_objects_are_obstacles():
@@ -131,9 +129,15 @@ def test_objects_are_obstacles():
     scenario = arm(**{"objects.box": BOX})
     made = task(scenario, Options(count=(1, 1)))
     assert least(made, without[1][0].dense.q) < 0.0
-    plan = dynsim.plan_braces(
-        scenario, count=(1, 1), starts=1, tolerances=Tolerances(friction=(1.0,), shift_m=(0.0,)), jobs=1
-    )
+    with pytest.warns(UserWarning, match="objects.box"):
+        plan = dynsim.plan_braces(
+            scenario,
+            count=(1, 1),
+            starts=1,
+            budget_s=0.0,
+            tolerances=Tolerances(friction=(1.0,), shift_m=(0.0,)),
+            jobs=1,
+        )
     (size,) = plan.sizes
     assert size.planned is not None
     assert least(made, size.planned.dense.q) > made.options.clearance_m - 1e-6
@@ -142,6 +146,31 @@ def test_objects_are_obstacles():
     record = plan.record(1)
     assert least(made, record["q"]) > 0.0
     assert "objects" not in plan.scenario(1).resolved
+
+
+def test_plans_omit_all_parts_of_objects_and_report_no_pair_as_a_brace():
+    tie = {"type": "linear", "axis": [0, 0, 1], "stiffness_N_per_m": 10.0, "other": "box"}
+    push = {"type": "samples", "body": "box", "times_s": [0, 1], "force_N": [[1, 0, 0], [1, 0, 0]]}
+    keys = {
+        "objects.box": BOX,
+        "surfaces.lid": {"type": "plane", "on": "box", "point_m": [0, 0, 0.05]},
+        "loads.push": push | {"interpolation": "linear"},
+        "ties": {"tie": tie | {"body": "link_3"}},
+        "integrator": {"method": "time_stepping"},
+        **SELF,
+    }
+    exact = Tolerances(friction=(1.0,), shift_m=(0.0,))
+    with pytest.warns(UserWarning, match=r"objects\.box: not in plan\.yaml") as caught:
+        plan = dynsim.plan_braces(arm(**keys), count=(0, 0), starts=1, budget_s=0.0, tolerances=exact, jobs=1)
+    assert not any("loads" in str(warning.message) for warning in caught)
+    resolved = plan.scenario(0).resolved
+    assert "box" not in str(resolved)
+    assert "floor" in resolved["surfaces"]
+    (size,) = plan.sizes
+    assert size.nominal is not None
+    # The record has pairs of links, which are not braces.
+    assert len(plan.record(0).summary["contacts"]) > 10
+    assert size.nominal.closed_fraction == {}
 
 
 def test_pairs_without_a_solid_are_refused_with_their_key():

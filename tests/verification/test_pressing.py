@@ -10,8 +10,10 @@ import pytest
 from support.messages import raises
 
 import dynsim
-from dynsim.compile.bracing import Brace
+from dynsim.compile.bracing import Brace, PressingBrace
 from dynsim.compile.posture import gaps_and_rates
+from dynsim.compile.references.inverse_kinematics import pressing
+from dynsim.engine import check
 from dynsim.errors import DynsimError
 from dynsim.scenario import build
 
@@ -150,13 +152,13 @@ def test_elbows_press_as_commanded(law, tmp_path):
     """Within 2 % (they are within 1e-4) after a second, glued floor and real one; and the hand follows better."""
     make = (lambda **more: real_floor(tmp_path, **more)) if law == "unilateral" else scenario
     short = {"duration_s": 3.0, "metrics.settle_s": 1.0}
-    plain, pressing = (dynsim.simulate(make(**short, **more)) for more in ({}, {"controller.brace": FORCES}))
-    late = pressing.time >= 1.0
-    forces = pressing["contact_normal_force"][late]
+    plain, pressed = (dynsim.simulate(make(**short, **more)) for more in ({}, {"controller.brace": FORCES}))
+    late = pressed.time >= 1.0
+    forces = pressed["contact_normal_force"][late]
     assert np.abs(forces / np.array([3.0, 8.0]) - 1.0).max() <= 1e-4
     assert np.abs(plain["contact_normal_force"][late] / np.array([3.0, 8.0]) - 1.0).max() > 0.02
-    assert pressing.summary["hand_error_rms_m"] < 0.2 * plain.summary["hand_error_rms_m"]
-    assert pressing.summary["electrical_energy_J"] > plain.summary["electrical_energy_J"]
+    assert pressed.summary["hand_error_rms_m"] < 0.2 * plain.summary["hand_error_rms_m"]
+    assert pressed.summary["electrical_energy_J"] > plain.summary["electrical_energy_J"]
 
 
 def test_least_heat_keeps_both_elbows_on_the_real_floor(tmp_path):
@@ -219,3 +221,97 @@ def test_a_brace_in_the_air_is_refused(tmp_path):
     case = real_floor(tmp_path, **{"controller.brace": FORCES}, **raised)
     with raises(DynsimError, "controller.brace", "elbow_4", "+0.3 m", "floor"):
         dynsim.simulate(case)
+
+
+def mixed_forces(shares):
+    """Torques (T, n), normal forces (T, c) and number of solved samples in one posture with shares of both elbows."""
+    case = scenario()
+    model = dynsim.build_model(case)
+    contacts = build.contacts(case)
+    braces = {c.name: PressingBrace(c, force) for c, force in zip(contacts, (3.0, None), strict=True)}
+    times = np.linspace(0.0, 1.0, len(shares))
+    q, still = np.tile(model.robot.initial, (len(times), 1)), np.zeros((len(times), model.n))
+    planner, tables, every = pressing(model, times, q, still, braces)
+    assert every is None
+    return planner.least_heat(q, still, still, tables, np.array(shares))
+
+
+def test_shares_mix_solutions_of_brace_sets():
+    """Bound: rounding of a sum of three solutions, 1e-12 of the torques."""
+    corners, _, solved = mixed_forces([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
+    torques, forces, _ = mixed_forces([[0.25, 0.75], [1.0, 0.5], [0.0, 0.25]])
+    none, first, second, both = corners
+    assert solved == 4
+    assert np.abs(none - first).max() > 0.1
+    wanted = [0.25 * both + 0.5 * second + 0.25 * none, 0.5 * (both + first), 0.25 * second + 0.75 * none]
+    assert np.abs(torques - wanted).max() <= 1e-12 * np.abs(corners).max()
+    assert forces[:, 0] == pytest.approx([0.75, 3.0, 0.0], abs=1e-12)
+
+
+def test_share_of_a_brace_rises_and_falls_inside_its_intervals():
+    times = np.linspace(0.0, 4.0, 81)
+    share = PressingBrace(build.contacts(scenario())[0], None, ((0.0, 1.0), (2.0, 4.0))).share(times)
+    assert share[[0, 18, 19, 20, 30, 40, 41, 42, 80]] == pytest.approx([1, 1, 0.5, 0, 0, 0, 0.5, 1, 1], abs=1e-12)
+    assert np.array_equal(PressingBrace(build.contacts(scenario())[0]).share(times), np.ones(81))
+
+
+def test_currents_do_not_jump_at_a_hand_over():
+    """Half the sampling step halves the largest change of a current; with a jump it would stay.
+
+    The ratio differs from 1/2 by less than the step over the ramp, 5 ms / 100 ms, times a factor of order 1.
+    """
+    changes, records = [], []
+    for rate in (200.0, 400.0):
+        records.append(dynsim.simulate(dynsim.load_scenario("hand_over", overrides={"record.rate_hz": rate})))
+        late = records[-1].time >= 0.5  # at the start the currents grow from zero
+        changes.append(np.abs(np.diff(records[-1]["current"][late], axis=0)).max())
+    assert changes[1] / changes[0] == pytest.approx(0.5, abs=0.1)
+    record = records[0]
+    force = record["contact_normal_force"]
+    before, after = (record.time > 0.5) & (record.time < 1.75), record.time > 2.25
+    assert force[before, 0].min() > 2.0
+    assert not force[before, 1].any()
+    assert not force[after, 0].any()
+    # Between the knots of the waypoints the references leave the floor by 0.01 mm, against which the joints are stiff.
+    assert force[after, 1] == pytest.approx(1.5, rel=0.05)
+    assert record["contact_gap"][-1, 0] > 0.05
+
+
+@pytest.mark.parametrize(
+    ("name", "overrides"),
+    [
+        ("hand_over", {"integrator.method": "time_stepping"}),
+        ("hand_over", {"integrator.method": "radau5", "controller.sample_time_s": 0.0002}),
+        ("elbow_comparison", {"controller.brace": {"elbow_4": {"during_s": [[0, 0.4]]}, "elbow_7": 8.0}}),
+        ("mobile_elbow_comparison", {"controller.brace": {"elbow_4": {"during_s": [[0, 0.4]]}, "elbow_7": 8.0}}),
+    ],
+)
+def test_braces_with_times_run_in_pieces_and_from_snapshots(name, overrides):
+    """Plans are part of the references: pieces and a restored state give the run of `simulate`, bit for bit."""
+    variant = None if name == "hand_over" else "two_elbows"
+    case = dynsim.load_scenario(name, variant, {"duration_s": 1.0, **overrides})
+    whole = dynsim.simulate(case)
+    assert not any("sampled loop" in warning for warning in whole.summary["warnings"])
+    simulation = dynsim.Simulation(case)
+    simulation.advance(0.37)
+    state = simulation.snapshot()
+    simulation.advance(0.9)
+    simulation.restore(state)
+    simulation.advance(1.0)
+    assert np.array_equal(simulation.record()["q"], whole["q"])
+    assert np.array_equal(simulation.record()["current"], whole["current"])
+
+
+def test_check_does_not_place_braces_that_press_later():
+    """The second elbow starts 0.15 m above the floor on purpose; without its times it should be placed there."""
+    start = check(dynsim.load_scenario("hand_over"))
+    assert start.aloft == ""
+    assert start.gaps["elbow_2"] == pytest.approx(0.15, abs=1e-5)
+    assert "elbow_2" in check(dynsim.load_scenario("hand_over", overrides={"controller.brace": None})).aloft
+
+
+def test_references_may_leave_a_surface_outside_the_times_of_a_brace():
+    """Elbow 1 rises after 2.25 s, which is an error if it still has to press."""
+    for during, time in ((None, "t = 4.000"), ([[0, 3]], "t = 2.980")):
+        with raises(DynsimError, "controller.brace", "elbow_1", "during_s", time):
+            dynsim.simulate(dynsim.load_scenario("hand_over", overrides={"controller.brace.elbow_1.during_s": during}))

@@ -13,6 +13,9 @@ FEW = {
     23: "a stack of crossed boxes, which touched along two lines only and rattled",
     34: "two boxes, which the face beyond an edge pushed apart by 0.1 m",
     37: "a stack without the crossings of edges above the border of a face",
+    12541: "a stack whose contact problem needs a small proximal term",
+    21161: "a problem solved to 5e-10 m/s only",
+    22017: "a problem solved to 4e-10 m/s only",
     1988: "a turned box whose corners beyond the other one took the slots of places that touched: it rattled",
 }  # fmt: skip
 SCENES = 3000

@@ -59,7 +59,7 @@ def test_a_spinning_rotor_turns_with_its_link_and_its_joint():
 
 @pytest.mark.slow
 def test_armature_alone_takes_the_documented_share_more():
-    """docs/physics.md: 219.67 J with spinning rotors, 219.75 J with armature."""
+    """docs/validation/evidence.md: 219.67 J with spinning rotors, 219.75 J with armature."""
     scenario = load_scenario("elbow_comparison", "two_elbows")
     energies = rotor_energies(scenario)
     assert energies["armature"] == pytest.approx(dynsim.simulate(scenario).summary["electrical_energy_J"], abs=2e-3)

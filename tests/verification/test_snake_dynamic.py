@@ -8,14 +8,16 @@ import pytest
 from support.messages import lines_with, raises
 
 from dynsim.compile.model import Model
-from dynsim.compile.snake_tree import configuration, lifted_moments
+from dynsim.compile.snake_tree import configuration
 from dynsim.compile.touching import gap_at
 from dynsim.engine import simulate
 from dynsim.engine.simulation import Simulation
 from dynsim.engine.snake_control import WheelLifter
 from dynsim.engine.snake_pilot import base_pose, roll_pitch_yaw
 from dynsim.errors import DynsimError, ModelError, SimulationStopped
+from dynsim.record import Record
 from dynsim.scenario import build, load_scenario, scenario_from_resolved
+from dynsim.snake.fold import lifted_moments
 from dynsim.snake.kinematics import pose_of_point
 from dynsim.teleop.snake import Command, begin
 
@@ -75,14 +77,15 @@ def test_lifted_pairs_are_at_their_height_and_the_head_stays(tree):
 
 def test_moments_of_lifted_pairs_are_those_of_beams(tree):
     """Plates of weight w and length 2 l: two between supports w l in the middle; a tail w l, and 4 w l before it."""
-    w, l = 2.0 * 10.0 / 18.0 * 9.81, 0.0905
-    between = lifted_moments(tree, MODE_1 == 0)
-    np.testing.assert_allclose(between, [0, 0, -w * l, 0, 0, -w * l], atol=1e-12)
-    tail = lifted_moments(tree, np.array([0, 0, 0, 0, 0, 1, 1], dtype=bool))
-    np.testing.assert_allclose(tail, [0, 0, 0, 0, 4 * w * l, w * l], atol=1e-12)
-    # three plates: 3 w/2 · 2 l − w l at both
-    three = lifted_moments(tree, np.array([0, 0, 1, 1, 0, 0, 0], dtype=bool))
-    np.testing.assert_allclose(three, [0, 0, -2 * w * l, -2 * w * l, 0, 0], atol=1e-12)
+    w, l, moments = 2.0 * 10.0 / 18.0 * 9.81, 0.0905, np.zeros(6)
+    for lifted, expected in (
+        (MODE_1 == 0, [0, 0, -w * l, 0, 0, -w * l]),
+        ([0, 0, 0, 0, 0, 1, 1], [0, 0, 0, 0, 4 * w * l, w * l]),
+        ([0, 0, 1, 1, 0, 0, 0], [0, 0, -2 * w * l, -2 * w * l, 0, 0]),  # three plates: 3 w/2 · 2 l − w l at both
+    ):
+        lifting = WheelLifter(tree, np.ones(7)).lifting
+        lifted_moments(lifting.weight, lifting.length, np.array(lifted, dtype=float), 1.0, moments)
+        np.testing.assert_allclose(moments, expected, atol=1e-12)
 
 
 def test_a_pair_is_put_down_before_the_next_is_lifted(tree):
@@ -265,6 +268,79 @@ def test_a_record_that_ends_between_two_ticks_is_the_same_later(restored):
     assert again.time[-1] == 0.1013
     for name in record:
         np.testing.assert_array_equal(record[name], again[name], err_msg=name)
+
+
+def both_ways(scenario: str, variant: str | None, duration: float) -> tuple[Simulation, Simulation]:
+    """A simulation that computes commands for several ticks at once, and one whose idle callback prevents this."""
+    queued, single = (Simulation(dynamic(variant, scenario, duration_s=duration)) for _ in range(2))
+    single.every(100.0, lambda simulation: None, first=100.0)
+    return queued, single
+
+
+def assert_same_records(records: tuple[Record, Record]) -> None:
+    first, second = records
+    for name in first:
+        np.testing.assert_array_equal(first[name], second[name], err_msg=name)
+    assert first.summary["waiting_s"] == second.summary["waiting_s"]
+
+
+@pytest.mark.parametrize(
+    ("scenario", "variant", "stops"),
+    [
+        ("snake_positioning", "x", (0.0, 0.0134, 0.9, 1.3, 1.301)),
+        pytest.param("snake_joint_limits", "cyclic", (1.9, 2.503, 3.3), marks=pytest.mark.long),
+    ],
+)
+def test_queued_commands_equal_commands_of_each_tick(scenario, variant, stops):
+    """Lifting, modes and waiting included; no tick is ahead of the time that a caller sees."""
+    simulations = both_ways(scenario, variant, stops[-1])
+    calls = [Calls(simulation) for simulation in simulations]
+    for time in stops:
+        states = [simulation.advance(time) for simulation in simulations]
+        np.testing.assert_array_equal(states[0].q, states[1].q)
+        targets = [simulation.operator.state.w_target for simulation in simulations]
+        np.testing.assert_array_equal(*targets)
+    assert calls[0].count < 0.5 * calls[1].count
+    assert_same_records(tuple(simulation.record() for simulation in simulations))
+
+
+class Calls:
+    """Number of calls of the operator of a simulation."""
+
+    def __init__(self, simulation: Simulation) -> None:
+        self.count, self.call = 0, simulation._calls[0]
+        simulation._calls[0] = self
+
+    def __call__(self, simulation: Simulation) -> None:
+        self.count += 1
+        self.call(simulation)
+
+
+def test_interrupted_run_records_the_ticks_that_it_has_reached(monkeypatch):
+    """Ctrl-C three steps after a tick: one of the ticks commanded there has passed."""
+    queued, single = both_ways("snake_positioning", "x", 0.5)
+    for simulation in (queued, single):
+        simulation.advance(0.1)
+
+    pieces, run_piece = iter((True, False)), queued._run_piece
+
+    def interrupted(look):
+        if next(pieces):
+            return run_piece(look)
+        prepared = queued._prepared
+        queued._kernel(prepared.system, prepared.workspace, prepared.run, 3)
+        return KeyboardInterrupt()
+
+    with monkeypatch.context() as context:
+        context.setattr(queued, "_run_piece", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            queued.advance(0.5)
+    assert queued.time == pytest.approx(0.1125)
+    assert queued.operator.time > queued.time + 0.01
+    single.advance(queued.time)
+    assert_same_records((queued.record(), single.record()))
+    np.testing.assert_array_equal(queued.advance(0.5).q, single.advance(0.5).q)
+    assert_same_records((queued.record(), single.record()))
 
 
 @pytest.mark.parametrize("theta", [0.5, pytest.param(1.0, marks=pytest.mark.long)])

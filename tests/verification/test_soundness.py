@@ -126,7 +126,7 @@ def test_check_warns_of_an_unstable_loop_alone(name, variant, period, stable):
 
 
 def test_the_shown_encoders_are_stable_with_the_shown_gains():
-    """The example in docs/scenarios.md, on the published arm; with its default gains it is not."""
+    """The example in docs/scenarios/control.md, on the published arm; with its default gains it is not."""
     shown = {"controller.sample_time_s": 0.001, "sensors.encoders.delay_s": 0.002}
     gains = {"controller.k_p_V_per_rad": 100, "controller.k_d_V_s_per_rad": 2}
     assert not growth_of(load_scenario("elbow_comparison", "two_elbows", shown | gains), 0.001).unstable

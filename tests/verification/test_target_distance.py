@@ -17,7 +17,8 @@ from support.messages import mentions
 
 import dynsim
 from dynsim.cli.comparison import print_summary
-from dynsim.engine.target_distance import PART, UNEXPLAINED, DistanceCause, because, named_causes
+from dynsim.engine.target_distance import HEAD_FIXES, PART, TEXTS, UNEXPLAINED, DistanceCause, because, named_causes
+from dynsim.library.controllers import joint_pd, task_space
 from dynsim.scenario.reading import scenario_from_resolved
 from dynsim.system.files import json_text
 from dynsim.system.terminal import Terminal
@@ -432,3 +433,16 @@ def test_clamped_joints_of_kinematic_snake_are_the_cause() -> None:
     assert (distance > 6e-3, joints) == (True, [["theta8"]])
     assert causes("saturate", 1.5) == (pytest.approx(1.9e-3, abs=1e-4), [])
     assert causes("unlimited", 0.675) == (pytest.approx(0.0, abs=1e-4), [])
+
+
+@pytest.mark.parametrize(
+    ("other", "controllers"), [({}, (joint_pd,)), (HEAD_FIXES, (task_space,))], ids=["hand", "head"]
+)
+def test_fixes_name_keys_of_the_controller(other, controllers):
+    keys = {key for controller in controllers for key in controller.Config.model_fields}
+    # Drift and limits of the posture are causes of a head only.
+    causes = [cause for cause in TEXTS if bool(other) or cause not in ("drift", "clamped")]
+    fixes = [other.get(cause, TEXTS[cause][1]) for cause in causes]
+    named = {key for fix in fixes for key in re.findall(r"controller\.(\w+)", fix)}
+    assert named
+    assert named <= keys

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from dynsim.compile.bracing import MIN_N, BracePlanner, brace_rows
+from dynsim.compile.bracing import MIN_N, BracePlanner, PressingBrace, brace_rows
 from dynsim.compile.hand_posture import hand_posture
 from dynsim.compile.model import Model
 from dynsim.compile.reaching import path_arrays
@@ -90,7 +90,7 @@ def follow(
         that would exceed its limit, the time and the amount.
     """
     if orientation is not None:
-        args = model, times, targets, joints, q, tolerance, orientation, braces
+        args = model, times, targets, joints, q, tolerance, orientation, braces, base
         return recall("turned hand", lambda: _turned(*args), model.geometry, *args[1:])
     path, wanted = path_arrays(model, joints, braces, limited=True), reals(targets)
     carried = np.zeros((len(times), 0)) if base is None else reals(base)
@@ -141,11 +141,15 @@ def _turned(
     tolerance: float,
     orientation: Array,
     braces: Sequence[Contact],
+    base: Array | None,
 ) -> Array:
     """Compute the same positions as :func:`follow`, for a hand with constant orientation."""
     columns = [model.robot.position_index[model.joint_names.index(name)] for name in joints]
     postures = np.zeros((len(times), len(joints)))
     for k, target in enumerate(targets):
+        if base is not None:
+            first = base_row(model.robot)[0]
+            q = np.concatenate([q[:first], base[k], q[first + base.shape[1] :]])
         try:
             q = hand_posture(model, target, q, orientation, braces, tolerance, joints)
         except UnreachableReference as error:
@@ -189,7 +193,7 @@ def planned_voltages(
     model: Model,
     times: Array,
     positions: Mapping[str, Array],
-    braces: Mapping[str, tuple[Contact, float | None]],
+    braces: Mapping[str, PressingBrace],
     min_N: float = MIN_N,
     whole: bool = True,
 ) -> Array:
@@ -203,11 +207,10 @@ def planned_voltages(
         Equally spaced times [s].
     positions : mapping of str to (T,) ndarray
         Positions of the moving joints [rad or m]; the other joints keep their initial positions.
-    braces : mapping of str to (Contact, float or None)
-        Contact and commanded normal force [N] for each brace; None for the force of at least ``min_N`` with the least
-        motor heat.
+    braces : mapping of str to PressingBrace
+        Braces that press, by name.
     min_N : float, optional
-        Minimum normal force [N].
+        Minimum normal force of braces without a commanded force [N].
     whole : bool, optional
         True for the full dynamics and the circuits; False for the currents that hold the weight at rest, i = g / K_m.
 
@@ -249,16 +252,18 @@ def pressing(
     times: Array,
     q: Array,
     v: Array,
-    braces: Mapping[str, tuple[Contact, float | None]],
+    braces: Mapping[str, PressingBrace],
     min_N: float = MIN_N,
     slip_scale: float = SLIP_SCALE,
-) -> tuple[BracePlanner, Array]:
-    """Return the planner for braces that press along references, and their kernel tables, (T, c, BRACE_SIZE).
+) -> tuple[BracePlanner, Array, Array | None]:
+    """Return the planner for braces that press along references, their kernel tables and their shares.
 
+    The tables have shape (T, c, BRACE_SIZE), the shares (T, c); None if all braces press during the whole run.
     Friction opposes the slip that the references prescribe: μ f_n v/√(v² + v_s²), with v_s = ``slip_scale`` [m/s].
     """
     attached = []
-    for name, (contact, _) in braces.items():
+    for name, brace in braces.items():
+        contact = brace.contact
         if contact.tip is not None:
             raise ModelError(
                 f"controller.brace: {name} is the axis of a link; use points of contacts.points",
@@ -275,8 +280,11 @@ def pressing(
     points = np.array([point for _, point in attached]).reshape(-1, 3)
     positions, velocities = planner.motion(points, q, v)
     tables = np.zeros((len(times), len(braces), kb.BRACE_SIZE))
-    for k, (name, (contact, force)) in enumerate(braces.items()):
-        _check_gaps(name, contact, times, contact.surface.gaps(positions[:, k]) - contact.radius)
+    shares = np.array([brace.share(times) for brace in braces.values()]).reshape(-1, len(times)).T
+    for k, (name, brace) in enumerate(braces.items()):
+        contact = brace.contact
+        gaps = contact.surface.gaps(positions[:, k]) - contact.radius
+        _check_gaps(name, contact, times, np.where(shares[:, k] > 0.0, gaps, 0.0))
         normals = contact.surface.normals(positions[:, k])
         touching, velocity = points[k], velocities[:, k]
         if contact.radius > 0.0:
@@ -286,8 +294,9 @@ def pressing(
         slip[speed <= SLIP_MIN] = 0.0
         # Plan no friction for a point that does not slide, because its friction depends on its history.
         friction = np.where(speed > SLIP_MIN, contact.friction * speed / np.hypot(speed, slip_scale), 0.0)
-        tables[:, k] = brace_rows(touching, normals, friction, min_N, np.nan if force is None else force, slip)
-    return planner, tables
+        commanded = np.nan if brace.force is None else brace.force
+        tables[:, k] = brace_rows(touching, normals, friction, min_N, commanded, slip)
+    return planner, tables, shares if any(brace.during is not None for brace in braces.values()) else None
 
 
 def _pressing_torques(
@@ -296,12 +305,12 @@ def _pressing_torques(
     q: Array,
     v: Array,
     vdot: Array,
-    braces: Mapping[str, tuple[Contact, float | None]],
+    braces: Mapping[str, PressingBrace],
     min_N: float,
 ) -> Array:
     """Return the motor torques along the references, (T, n), with braces that press."""
-    planner, tables = pressing(model, times, q, v, braces, min_N)
-    torques, _, solved = planner.least_heat(q, v, vdot, tables)
+    planner, tables, shares = pressing(model, times, q, v, braces, min_N)
+    torques, _, solved = planner.least_heat(q, v, vdot, tables, shares)
     if solved < len(times):
         key, subject = ("brace", f"forces of {', '.join(braces)}") if braces else ("feed_forward", "motor torques")
         fix = "change the forces, slow down" if braces else "slow down, use gravity"
@@ -343,7 +352,7 @@ def _check_gaps(name: str, contact: Contact, times: Array, gaps: Array) -> None:
     if abs(gaps[k]) > GAP_MAX:
         raise ModelError(
             f"controller.brace: the references move {name} {gaps[k]:+.4g} m off surface {contact.surface_name!r} at "
-            f"t = {times[k]:.3f} s (limit {GAP_MAX:g} m); list it in controller.hand.braces, or use "
-            "initial.on_surface",
+            f"t = {times[k]:.3f} s (limit {GAP_MAX:g} m); list it in controller.hand.braces, use "
+            "initial.on_surface, or limit its times with during_s",
             keys=("controller", "brace"),
         )

@@ -35,6 +35,8 @@ class Look:
         Whether the figure has a title above, and notes below the axes.
     panels : tuple of str
         Names of panels to draw, or parts of them; empty: all panels.
+    film : bool
+        Whether an animation is written next to the figures of a snake.
     """
 
     width: float | None = None
@@ -45,6 +47,7 @@ class Look:
     title: bool = True
     caption: bool = True
     panels: tuple[str, ...] = ()
+    film: bool = True
 
     @classmethod
     def of(

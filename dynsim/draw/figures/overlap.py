@@ -34,7 +34,10 @@ STEP, STEPS, WIDER = 0.5, 3, 2.5
 
 
 def separate(figure: Figure) -> list[str]:
-    """Widen curves that others hide, and return notes on the curves that a reader cannot distinguish."""
+    """Widen curves that others hide, and return notes on the curves that a reader cannot distinguish.
+
+    The figure has a layout.
+    """
     lines = [line for axes in figure.axes for line in axes.get_lines()]
     known = {_look(line): _name(line) for line in reversed(lines) if _name(line)}
     names = {line: _name(line) or known.get(_look(line), "") for line in lines}
@@ -46,7 +49,6 @@ def separate(figure: Figure) -> list[str]:
             panels.setdefault(key, []).append((axes, curves))
     if not panels:
         return []
-    figure.draw_without_rendering()  # determines the layout
     dpi, widths, notes = figure.dpi, dict[str, float](), dict[str, list[str]]()
     figure.set_dpi(DPI)
     for (panel, _), group in panels.items():

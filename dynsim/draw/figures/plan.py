@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +19,7 @@ from dynsim.draw.figures import style
 from dynsim.draw.figures.look import Look
 from dynsim.draw.figures.style import BLACK, BLUE, GREEN, GREY, VARIANT_COLOURS, Array, number
 from dynsim.draw.geometry.shapes import outline
-from dynsim.record.quantities import rounded
+from dynsim.record.quantities import Quantity, rounded, summary_quantity
 
 # Length of the arrow of the largest force, and of the number at its tail, relative to the length of the view.
 ARROW, TAIL = 0.08, 0.07
@@ -70,9 +71,10 @@ class CornerRun:
     label : str
         Errors.
     heat, heat_limit : float
-        Mean heat and its limit, relative to the planned heat; the heat is NaN if the run ended early.
+        Mean heat and its limit, relative to the run without errors; the heat is NaN if the run ended early. NaN: no
+        limit.
     error, error_limit : float
-        Rms error of the hand and its limit [mm]; the error is NaN if the run ended early.
+        Rms error of the hand and its limit [mm]; the error is NaN if the run ended early. NaN: no limit.
     reason : str
         Reason why the run rejects the plan, such as a limit; "" if it does not.
     """
@@ -83,6 +85,28 @@ class CornerRun:
     error: float
     error_limit: float
     reason: str = ""
+
+
+@dataclass(frozen=True)
+class VariedPlans:
+    """Best plans for several values of a key.
+
+    Attributes
+    ----------
+    key : str
+        Column of the values.
+    axis : Quantity
+        Name and unit of the values.
+    series : mapping of str to sequence
+        Table rows of the plans by name of the curve; a row without a plan has no heat.
+    limits : mapping of str to float
+        Limits of required columns.
+    """
+
+    key: str
+    axis: Quantity
+    series: Mapping[str, Sequence[Mapping[str, Any]]]
+    limits: Mapping[str, float]
 
 
 @dataclass(frozen=True)
@@ -113,6 +137,10 @@ class PlanPicture:
         Heat of single braces by candidate [W].
     corners : mapping of int to sequence of CornerRun
         Simulated runs of each best set, by number of braces; the first run is as planned.
+    simulated : mapping of int to float
+        Heat of the run as planned of each best set [W], by number of braces.
+    varied : VariedPlans or None
+        Plans for several values of a key; this plan is the best of them.
     """
 
     title: str
@@ -126,6 +154,8 @@ class PlanPicture:
     survives: Mapping[int, bool | None]
     singles: Mapping[str, float]
     corners: Mapping[int, Sequence[CornerRun]]
+    simulated: Mapping[int, float]
+    varied: VariedPlans | None = None
 
 
 def posture(picture: PlanPicture) -> Figure | None:
@@ -228,11 +258,10 @@ def heat_by_set(picture: PlanPicture) -> Figure | None:
     if len(rows) < 2:
         return None
     marks, runs = [], []
-    for count, _, heat, k in rows:
-        corners = picture.corners.get(count, ())
+    for count, _, _, k in rows:
         lost = k == 0 and picture.survives.get(count) is False
         marks.append(_OTHER if k else _REJECTED if lost else _BEST)
-        runs.append(corners[0].heat * heat if k == 0 and corners else np.nan)
+        runs.append(picture.simulated.get(count, np.nan) if k == 0 else np.nan)
     labels, surface = _without_surface([label if count else "no braces" for count, label, _, _ in rows])
     title = f"{picture.title}: heat of the motors by brace set{surface}"
     figure = _dots(title, labels, [heat for _, _, heat, _ in rows], marks, "mean heat, planned [W]", runs)
@@ -240,9 +269,12 @@ def heat_by_set(picture: PlanPicture) -> Figure | None:
         if rows[y][0] != rows[y - 1][0]:
             figure.axes[0].axhline(y - 0.5, color=GREY, linewidth=0.5)
     verified = any(survives is not None for survives in picture.survives.values())
-    least = " of the sets that survive simulated errors of friction and surfaces" if verified else ""
-    rejected = " Rejected: no set of this size survives; the least planned heat is drawn." if _REJECTED in marks else ""
-    figure.note(f"Size: number of braces. Best: least planned heat{least}.{rejected}")
+    survive = " of the sets that survive simulated errors of friction and surfaces"
+    best = f"least simulated heat{survive}" if verified else "least planned heat"
+    rejected = (
+        " Rejected: no set of this size survives; the least simulated heat is drawn." if _REJECTED in marks else ""
+    )
+    figure.note(f"Size: number of braces. Best: {best}.{rejected}")
     return figure
 
 
@@ -259,11 +291,11 @@ def single_braces(picture: PlanPicture) -> Figure | None:
 
 def _without_surface(labels: Sequence[str]) -> tuple[list[str], str]:
     """Return labels without the name of the surface if it is the same for all braces, and a text with its name."""
-    parts = [[brace.rpartition(" on ") for brace in label.split(", ")] for label in labels]
-    surfaces = {surface for braces in parts for point, _, surface in braces if point}
+    surfaces = {surface for label in labels for surface in re.findall(r" on (.+?)(?=, | → |$)", label)}
     if len(surfaces) != 1:
         return list(labels), ""
-    return [", ".join(point or name for point, _, name in braces) for braces in parts], f" on {surfaces.pop()}"
+    ending = f" on {surfaces.pop()}"
+    return [re.sub(rf"{re.escape(ending)}(?=, | → |$)", "", label) for label in labels], ending
 
 
 def _row(labels: Sequence[str]) -> float:
@@ -324,17 +356,18 @@ def robustness(picture: PlanPicture) -> Figure | None:
     )
     panels = figure.subplots(1, 2, sharey=True)
     rows = np.arange(len(names))
-    quantities = (("heat", "heat / planned heat"), ("error", "hand error, rms [mm]"))
+    quantities = (("heat", "heat / heat without errors"), ("error", "hand error, rms [mm]"))
     for axes, (key, name) in zip(panels, quantities, strict=True):
         values = {count: np.array([getattr(corner, key) for corner in corners]) for count, corners in shown.items()}
         limits = np.array([getattr(corner, f"{key}_limit") for corner in first])
-        most = max(float(np.nanmax(array, initial=0.0)) for array in (limits, *values.values()))
-        if most > WIDE * limits.max():
-            least = min(float(np.nanmin(array)) for array in (limits, *values.values()))
+        bounded = np.isfinite(limits)
+        most = max(float(np.nanmax(array, initial=0.0)) for array in (limits[bounded], *values.values()))
+        if most > WIDE * limits[bounded].max(initial=0.0) > 0.0:
+            least = min(float(np.nanmin(array)) for array in (limits[bounded], *values.values()))
             axes.set_xlim(0.8 * max(least, 1e-3 * most), 1.5 * most)
             style.log_axis(axes, "x")
         else:
-            # A heat is compared with the planned heat, an error with zero.
+            # A heat is compared with the run without errors, an error with zero.
             least = min(1.0, *(float(np.nanmin(array)) for array in values.values())) if key == "heat" else 0.0
             axes.set_xlim(least - 0.06 * (most - least), most + 0.08 * (most - least))
             axes.xaxis.set_major_locator(MaxNLocator(4 if style.narrow() else 7, steps=(1, 2, 5, 10)))
@@ -349,7 +382,15 @@ def robustness(picture: PlanPicture) -> Figure | None:
             # Runs that ended early are at the edge.
             ends = np.where(np.isfinite(values[count]), values[count], axes.get_xlim()[1])
             axes.plot(ends[lost], at[lost], "x", color=BLACK, markersize=6.0, zorder=4)
-        axes.vlines(limits, rows - 0.5, rows + 0.5, color=BLACK, linestyle=(0, (3, 2)), linewidth=1.0, label="limit")
+        axes.vlines(
+            limits[bounded],
+            rows[bounded] - 0.5,
+            rows[bounded] + 0.5,
+            color=BLACK,
+            linestyle=(0, (3, 2)),
+            linewidth=1.0,
+            label="limit",
+        )
         if any(corner.reason for corners in shown.values() for corner in corners):
             axes.plot([], [], "x", color=BLACK, markersize=6.0, label="rejects the plan")
         axes.grid(visible=False, axis="y")
@@ -370,6 +411,44 @@ def robustness(picture: PlanPicture) -> Figure | None:
     return figure
 
 
+def varied(picture: PlanPicture) -> Figure | None:
+    """Draw heat and required quantities of the best plans against a varied key, with the limits of requirements."""
+    if picture.varied is None:
+        return None
+    plans = picture.varied
+    rows = [row for series in plans.series.values() for row in series]
+    metrics = {key: summary_quantity(key) for key in ("heat_W", *plans.limits)}
+    metrics = {key: drawn.fitted(row.get(key) for row in rows) for key, drawn in metrics.items()}
+    figure = style.new_figure(1.7 * len(metrics) + 1.0, f"{picture.title}: plans for each {plans.axis.name}")
+    panels = figure.subplots(len(metrics), 1, sharex=True, squeeze=False)[:, 0]
+    for axes, (key, drawn) in zip(panels, metrics.items(), strict=True):
+        values = []
+        for k, (label, series) in enumerate(plans.series.items()):
+            at = np.array([plans.axis.scale * row[plans.key] for row in series])
+            numbers = [row.get(key) for row in series]
+            y = np.array([np.nan if value is None else drawn.scale * value for value in numbers])
+            lost = np.array([row.get("survives") is False for row in series])
+            look: dict[str, Any] = {"color": VARIANT_COLOURS[k % 7], "marker": _MARKERS[k % 7], "markersize": 4.5}
+            axes.plot(at, y, label=label or None, linewidth=1.0, **look)
+            if lost.any():
+                axes.plot(at[lost], y[lost], linestyle="none", markerfacecolor="white", zorder=3, **look)
+            values += y[np.isfinite(y)].tolist()
+        if key in plans.limits:
+            limit = drawn.scale * plans.limits[key]
+            axes.axhline(limit, color=BLACK, linestyle=(0, (3, 2)), linewidth=1.0, label="limit")
+            values.append(limit)
+        if values and max(values) > WIDE * min(values) > 0.0:
+            style.log_axis(axes)
+        else:
+            axes.set_ylim(bottom=0.0)
+        axes.set_ylabel(style.broken(drawn.label, 1.6))
+    panels[-1].set_xlabel(style.broken(plans.axis.label))
+    figure.align_ylabels(panels)
+    style.legend_below(figure, list(panels), 3)
+    figure.note("Each point: the number of braces with the least heat. Hollow: rejected; gaps: no plan.")
+    return figure
+
+
 def _braces(count: int) -> str:
     return f"{count or 'no'} brace{'' if count == 1 else 's'}"
 
@@ -379,6 +458,7 @@ FIGURES = {
     "plan_heat": heat_by_set,
     "plan_single_braces": single_braces,
     "plan_robustness": robustness,
+    "plan_vary": varied,
 }
 
 

@@ -89,11 +89,19 @@ class Skeleton:
         return np.array(lines).reshape(-1, 2, 3)
 
     def solids(self, row: int) -> list[tuple[Array, Faces]]:
-        """Return corners, (n, 3) [m], and faces of the shapes of a base, its wheels, and objects at a sample."""
+        """Return corners, (n, 3) [m], and faces of the shapes of a base, its wheels, objects, and surfaces on links."""
         drawn = {*self.scene.base, *self.objects}
         # The root of a floating robot, to which no line leads.
         drawn |= {k for k, body in enumerate(self.scene.bodies) if body.joint.part_of and body.shapes}
-        return [solid for body in sorted(drawn) for solid in corners_of(self.record, self.scene, body, row)]
+        solids = [solid for body in sorted(drawn) for solid in corners_of(self.record, self.scene, body, row)]
+        # Surfaces on other bodies are the last shapes of these.
+        names, touched = {body.name for body in self.scene.bodies}, dict[int, set[str]]()
+        for point in self.scene.points:
+            if point.carrier != WORLD and point.carrier not in drawn and point.surface not in names:
+                touched.setdefault(point.carrier, set()).add(point.surface)
+        for carrier, surfaces in touched.items():
+            solids += corners_of(self.record, self.scene, carrier, row)[-len(surfaces) :]
+        return solids
 
     def bases(self) -> list[list[Array]]:
         """Return the corners of the solids of a mobile base and objects for the first and the last posture."""
@@ -186,13 +194,14 @@ class Skeleton:
             }
         contacts = []
         for point in self.scene.contacts:
-            surface, carried = self.scene.surface(point.surface), point.carrier != WORLD and NORMAL in record
-            if (surface is None and not carried) or point.name in untouched:
+            surface, normals = self.scene.surface(point.surface), record.labels.get(NORMAL, ())
+            if (surface is None and point.name not in normals) or point.name in untouched:
                 continue
             position, force = contact_positions(record, point, len(record) - 1), float(forces.get(point.name, np.nan))
-            if surface is None:
-                normal = record[NORMAL][-1, record.labels[NORMAL].index(point.name)]
+            if point.name in normals:
+                normal = record[NORMAL][-1, normals.index(point.name)]
             else:
+                assert surface is not None
                 normal = surface.normal(position)
                 if abs(force) > 0.0:
                     position = position - surface.gap(position) * normal

@@ -56,9 +56,9 @@ PAGE_ROWS = 4
 
 
 def draw(record: Record, folder: Path, kind: str = "png") -> list[Path]:
-    """Draw all figures of one run and the animation; return the files."""
+    """Draw all figures of one run and, unless the look excludes it, the animation; return the files."""
     written = style.save_all(figures(record), record, folder, kind)
-    return written if style.wanted_panels() else [*written, animate(record, folder / "animation.gif")]
+    return [*written, animate(record, folder / "animation.gif")] if style.wants_film() else written
 
 
 def draw_comparison(records: Mapping[str, Record], folder: Path, kind: str = "png") -> list[Path]:

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import product
 from pathlib import Path
 from threading import RLock
@@ -34,7 +35,7 @@ from matplotlib.patches import Patch
 from matplotlib.text import Text
 from matplotlib.textpath import text_to_path
 from matplotlib.ticker import AutoLocator, FuncFormatter, LogFormatter, LogLocator, NullFormatter, NullLocator
-from matplotlib.transforms import ScaledTranslation, Transform, blended_transform_factory
+from matplotlib.transforms import Bbox, ScaledTranslation, Transform, blended_transform_factory
 from numpy.typing import NDArray
 
 from dynsim.draw.figures.look import Look
@@ -145,6 +146,8 @@ STEPS = ((1, 2, 2.5, 5, 10), (1, 1.5, 2, 2.5, 3, 4, 5, 6, 8, 10))
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 # Group of the marks above axes, and the height of a row of them [point].
 RUG, RUG_ROW = "rug", 5.5
+# Number of additional layouts of axes with a fixed aspect.
+ASPECTS = 3
 # Height of a legend row as a multiple of the size of its letters.
 LEGEND_ROW = 1.67
 
@@ -327,11 +330,16 @@ class Drawing(Figure):
         Whether lines of title, legend and notes make the figure higher; False if the user set its height.
     needed : float
         Height that the contents require [inch].
+    ticked : bool
+        Whether the ticks of the next drawing have been chosen.
     """
 
     subject = notes = ""
     grows = True
     needed = 0.0
+    ticked = False
+    # During a layout, the space for the labels of axes on their four sides [pixel].
+    _measured: dict[Axes, Array] | None = None
     _note: Text | None = None
     _below: Legend | None = None
     _rows = 1
@@ -463,15 +471,70 @@ class Drawing(Figure):
         with matplotlib.rc_context({key: fonts[key] for key in fonts.keys() - _changed(fonts)}):
             super().savefig(fname, **options)
 
-    def draw(self, renderer: Any) -> None:
-        """Draw the figure, with notes at its lower edge, the legend above them, and the axes in the space above.
+    def add_subplot(self, *args: Any, **options: Any) -> Any:
+        """Add axes, see :meth:`matplotlib.figure.Figure.add_subplot`."""
+        axes: Any = super().add_subplot(*args, **options)
+        axes.get_tightbbox = partial(self._box, axes, axes.get_tightbbox)
+        return axes
+
+    def _box(self, axes: Axes, measure: Callable[..., Bbox], *args: Any, **options: Any) -> Bbox:
+        """Return the box of axes and their labels; during a layout, the labels are measured once.
+
+        Constrained layout measures them again after it has moved the axes, which takes most of its time, although the
+        ticks remain.
+        """
+        if self._measured is None or not axes.get_visible():
+            return measure(*args, **options)
+        if axes not in self._measured:
+            box = measure(*args, **options)
+            self._measured[axes] = np.subtract(box.extents, axes.bbox.extents)
+        axes.apply_aspect()
+        return Bbox(np.add(axes.bbox.extents, self._measured[axes]).reshape(2, 2))
+
+    def lay_out(self, renderer: Any) -> None:
+        """Determine the positions of the axes, and choose the ticks of the next drawing.
+
+        With ticks that depend on the size of the axes, the layout may alternate between two sizes, and cut labels. So
+        the ticks are chosen once, after a first layout; the layout of the drawing has space for their labels.
 
         Raises
         ------
         RecordError
             If the height that the user set leaves no space for the axes.
         """
-        engine, gap, used = self.get_layout_engine(), 4.0 * self.dpi / 72.0, 0.0
+        both = [axis for axes in self.axes[::-1] if axes.axison for axis in (axes.yaxis, axes.xaxis)]
+        automatic = {ticks: axis for axis in both if isinstance(ticks := axis.get_major_locator(), AutoLocator)}
+        # Others have a number of ticks that was set.
+        self._automatic |= {ticks for ticks in automatic if vars(ticks)["_nbins"] == "auto"}
+        with self._layout(renderer):
+            if (engine := self.get_layout_engine()) is not None:
+                engine.execute(self)
+        for ticks in automatic.keys() & self._automatic:
+            _choose_ticks(automatic[ticks], ticks)
+        self.ticked = True
+
+    def draw(self, renderer: Any) -> None:
+        """Draw the figure, with notes at its lower edge, the legend above them, and the axes in the space above.
+
+        Raises
+        ------
+        RecordError
+            As for :meth:`lay_out`.
+        """
+        if not self.ticked:
+            self.lay_out(renderer)
+        self.ticked = False
+        with self._layout(renderer):
+            super().draw(renderer)
+
+    @contextmanager
+    def _layout(self, renderer: Any) -> Iterator[None]:
+        """Place notes and legend for a layout of the axes in the block, in the space above.
+
+        Axes with a fixed aspect get their first layouts here, because the space for their labels depends on their size.
+        """
+        engine: Any = self.get_layout_engine()
+        gap, used = 4.0 * self.dpi / 72.0, 0.0
         for below in (self._note, self._below):
             if below is None:
                 continue
@@ -484,21 +547,15 @@ class Drawing(Figure):
         if isinstance(engine, ConstrainedLayoutEngine):
             share = min(used / self.bbox.height, 0.8)
             engine.set(rect=(0.0, share, 1.0, 1.0 - share))
-        # With ticks that depend on the size of the axes, the layout may alternate between two sizes, and cut labels. So
-        # the ticks are chosen once, after a first layout; a second one has space for their labels.
-        both = [axis for axes in self.axes[::-1] if axes.axison for axis in (axes.yaxis, axes.xaxis)]
-        automatic = {ticks: axis for axis in both if isinstance(ticks := axis.get_major_locator(), AutoLocator)}
-        # Others have a number of ticks that was set.
-        self._automatic |= {ticks for ticks in automatic if vars(ticks)["_nbins"] == "auto"}
+        self._measured, fixed = {}, any(axes.get_aspect() != "auto" for axes in self.axes)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            if engine is not None:
-                engine.execute(self)
-            for ticks in automatic.keys() & self._automatic:
-                _choose_ticks(automatic[ticks], ticks)
-            if engine is not None and any(axes.get_aspect() != "auto" for axes in self.axes):
-                engine.execute(self)  # the space for labels of axes with a fixed aspect is only known afterwards
-            super().draw(renderer)
+            try:
+                for _ in range(ASPECTS if fixed and engine is not None else 0):
+                    engine.execute(self)
+                yield
+            finally:
+                self._measured = None
         for warning in caught:
             if "collapsed" in str(warning.message) and not self.grows:
                 size = f"size {self.get_figwidth():.3g}x{self.get_figheight():.3g}"
@@ -615,6 +672,13 @@ def _powers(axis: Axis) -> list[Text]:
     return axis.get_ticklabels(which="both") if isinstance(axis.get_major_formatter(), LogFormatter) else []
 
 
+def _with_dots(figure: Figure) -> Figure:
+    """Return the figure with the resolution of its file, at which the extents of texts are computed only once."""
+    if not _changed(["savefig.dpi"]):
+        figure.set_dpi(DPI)
+    return figure
+
+
 def save(figure: Figure, path: Path) -> Path:
     """Write a figure as PNG, PDF or SVG, depending on the suffix; equal figures give equal bytes.
 
@@ -623,14 +687,13 @@ def save(figure: Figure, path: Path) -> Path:
     RecordError
         If the file cannot be written; an existing file is then unchanged.
     """
-    literal(figure)
-    if not _changed(["savefig.dpi"]):
-        figure.set_dpi(DPI)
+    literal(_with_dots(figure))
     kind = path.suffix.removeprefix(".")
     with _settings, replacing(path) as stream, matplotlib.rc_context({"svg.hashsalt": path.stem}):
         if kind == "png":
             # This draws once; ``savefig`` would draw twice, the first time for the layout.
-            FigureCanvasAgg(figure).print_png(stream)
+            canvas: Any = figure.canvas
+            canvas.print_png(stream)
         else:
             date = {"pdf": "CreationDate", "svg": "Date"}[kind]
             figure.savefig(stream, format=kind, dpi="figure", metadata={date: None})
@@ -640,7 +703,8 @@ def save(figure: Figure, path: Path) -> Path:
 def save_all(makers: Mapping[str, Callable[[T], Figure | None]], of: T, folder: Path, kind: str) -> list[Path]:
     """Draw and save every figure for which there are data, and write their captions; return the files of figures."""
     with look():
-        drawn = ((name, figure) for name, make in makers.items() if (figure := make(of)) is not None)
+        made = ((name, make(of)) for name, make in makers.items())
+        drawn = ((name, _with_dots(figure)) for name, figure in made if figure is not None)
         files, captions = [], []
         for name, figure in with_panels(drawn):
             files.append(save(figure, folder / f"{name}.{kind}"))
@@ -656,6 +720,12 @@ def wanted_panels() -> tuple[str, ...]:
     return (_drawn.get() or Look()).panels
 
 
+def wants_film() -> bool:
+    """Return whether an animation is written next to the figures."""
+    wanted = _drawn.get() or Look()
+    return wanted.film and not wanted.panels
+
+
 def with_panels(drawn: Iterable[tuple[str, Figure]]) -> Iterable[tuple[str, Figure]]:
     """Reduce figures to the panels of the look, if it names any; figures without such a panel are omitted.
 
@@ -669,8 +739,12 @@ def with_panels(drawn: Iterable[tuple[str, Figure]]) -> Iterable[tuple[str, Figu
     for name, figure in drawn:
         if isinstance(figure, Drawing):
             literal(figure)  # before its first layout
+            canvas: Any = figure.canvas
+            figure.lay_out(canvas.get_renderer())
             figure.note(*separate(figure))
         yield name, figure
+        if isinstance(figure, Drawing):
+            figure.ticked = False  # its owner may change it
 
 
 def title(record: Record, subject: str) -> str:

@@ -278,25 +278,29 @@ class DrawnContact:
     at: Array | None
 
 
-def contacts(robot: DrawnRobot, rows: NDArray[np.intp] | slice = slice(None)) -> list[DrawnContact]:
-    """Return the contact points at samples of the record; under the unilateral law only points that ever touched."""
+def contacts(
+    robot: DrawnRobot, rows: NDArray[np.intp] | slice = slice(None), open_too: bool = False
+) -> list[DrawnContact]:
+    """Return the contact points at samples of the record; without ``open_too`` only points that ever touched."""
     record, scene = robot.record, robot.scene
     if "contact_normal_force" not in record:
         return []
     names = record.labels["contact_normal_force"]
     result = []
     for point in scene.contacts:
-        surface, carried = scene.surface(point.surface), point.carrier != WORLD and NORMAL in record
+        surface, normals = scene.surface(point.surface), record.labels.get(NORMAL, ())
+        carried = point.name in normals
         if (surface is None and not carried) or point.name not in names:
             continue
         k = names.index(point.name)
         mode = record["contact_mode"][rows, k] if "contact_mode" in record else None
-        if mode is not None and not mode.any():
+        if mode is not None and not mode.any() and not open_too:
             continue
         at = np.asarray(contact_positions(record, point, rows), dtype=np.float64)
-        if surface is None:
-            normal = np.asarray(record[NORMAL][rows, record.labels[NORMAL].index(point.name)], dtype=np.float64)
+        if carried:
+            normal = np.asarray(record[NORMAL][rows, normals.index(point.name)], dtype=np.float64)
         else:
+            assert surface is not None
             normal = surface.normal(at)
         force = np.asarray(record["contact_normal_force"][rows, k], dtype=np.float64)
         tangent = None
@@ -304,7 +308,7 @@ def contacts(robot: DrawnRobot, rows: NDArray[np.intp] | slice = slice(None)) ->
             tangent = record["contact_force"][rows, k] - force[:, None] * normal
         shaped = carried or (TOUCHING in record and point.name in record.labels[TOUCHING])
         result.append(DrawnContact(point, normal, force, tangent, mode, at if shaped else None))
-        if carried:  # the reaction on the other body
+        if point.carrier != WORLD:  # the reaction on the other body
             other = replace(point, name=reaction_name(scene, point), body=point.carrier)
             result.append(DrawnContact(other, -normal, force, None if tangent is None else -tangent, mode, at))
     return result

@@ -199,8 +199,10 @@ _NAMES = {
 }
 
 
-def packed(records: Mapping[str, Record], *, ghost: bool = False) -> str:
+def packed(records: Mapping[str, Record], *, ghost: bool = False, live: bool = False) -> str:
     """Return the head and the blocks of a page in base64, see :func:`dynsim.draw.page.content.page`.
+
+    A ``live`` page also has the contacts that do not touch in the record.
 
     Raises
     ------
@@ -214,7 +216,7 @@ def packed(records: Mapping[str, Record], *, ghost: bool = False) -> str:
     blocks = Blocks()
     meshes = Meshes()
     layout = _Layout(records[name] for name in shown)
-    parts = [_record(name, robot, blocks, meshes, low, high) for name, robot in shown.items()]
+    parts = [_record(name, robot, blocks, meshes, low, high, live) for name, robot in shown.items()]
     for part, robot in zip(parts, every, strict=True):
         part["signals"], part["axes"] = _signals(robot.record, blocks, layout)
     head = {
@@ -252,9 +254,11 @@ def viewable(record: Record) -> bool:
     return robot_of(record) is not None
 
 
-def _record(name: str, robot: DrawnRobot, blocks: Blocks, meshes: Meshes, low: Array, high: Array) -> dict[str, Any]:
+def _record(
+    name: str, robot: DrawnRobot, blocks: Blocks, meshes: Meshes, low: Array, high: Array, live: bool
+) -> dict[str, Any]:
     record, scene, rows = robot.record, robot.scene, robot.rows
-    instants, touching = _contacts(robot, blocks)
+    instants, touching = _contacts(robot, blocks, live)
     sunk = penetrations(record, scene, rows)
     meshes.of_robot(record.scene)
     position, turn = record[POSITION][rows], record[ORIENTATION][rows]
@@ -331,12 +335,12 @@ def _stands(scene: Scene) -> list[list[float]]:
     return [] if scene.fixed else [list(joint.position) for joint in fixed]
 
 
-def _contacts(robot: DrawnRobot, blocks: Blocks) -> tuple[NDArray[np.intp], list[dict[str, Any]]]:
+def _contacts(robot: DrawnRobot, blocks: Blocks, live: bool) -> tuple[NDArray[np.intp], list[dict[str, Any]]]:
     """Return samples whose interpolation shows contacts, wheels, gripper and centre of pressure, and the contacts.
 
     A contact has its body, normal, normal force and friction over time, and mode and position if known.
     """
-    record, drawn = robot.record, contacts(robot)
+    record, drawn = robot.record, contacts(robot, open_too=live)
     tolerance = {"normal": FORCE_ERROR, "at": POSE_ERROR, "mode": 0.25}
     tolerance["force"] = tolerance["tangent"] = FORCE_ERROR * largest_force(drawn)
     entries, data = [], [np.zeros((len(record), 1))]
@@ -534,7 +538,7 @@ def page(records: Mapping[str, Record], *, ghost: bool = False, scripts: Sequenc
     >>> text.startswith("<!DOCTYPE html>")
     True
     """
-    data = packed(records, ghost=ghost)
+    data = packed(records, ghost=ghost, live=bool(connect))
     titles = (record.title.partition(" / ")[0] for record in records.values())
     title = next(filter(None, titles), "record")
     allowed = f"; connect-src {html.escape(connect)}" if connect else ""

@@ -193,7 +193,8 @@ def sticking_rows(model: ModelArrays, contacts: ContactArrays, ws: Workspace, k,
 
     The first row is the row of the surface, as for a sliding point, so that the gap remains the distance from the
     surface. The other rows are t · (r − anchor) = 0 with the tangents t at the anchor. These are constant, so that
-    t · r̈ = 0 is exact on any surface for any remaining velocity. At rest, the three rows together give r̈ = 0.
+    t · r̈ = 0 is exact on any surface for any remaining velocity. At rest, the three rows together give r̈ = 0. On a
+    surface that a body carries, all this is seen from the body.
     """
     state, rows, links, active = ws.contacts, ws.rows, ws.links, ws.active
     first = active[k, ka.FIRST_ROW]
@@ -504,10 +505,13 @@ def pair_row(pairs, shapes: ShapeArrays, unilateral: UnilateralArrays | None, mo
     i, carrier = contacts.link[k, ka.LINK], contacts.link[k, ka.CARRIER]
     at = slot[ks.PLACE], slot[ks.PLACE + 1], slot[ks.PLACE + 2]
     n = slot[ks.NORMAL], slot[ks.NORMAL + 1], slot[ks.NORMAL + 2]
-    V, other = six(ws.links, i, ka.V), six(ws.links, carrier, ka.V)
+    V, b = six(ws.links, i, ka.V), (-model.gravity[0], -model.gravity[1], -model.gravity[2])
     a = point_acceleration(six(ws.links, i, ka.A), V, at)
-    b = point_acceleration(six(ws.links, carrier, ka.A), other, at)
-    v = point_velocity(minus_scaled(V, other, 1.0), at)
+    if carrier >= 0:
+        other = six(ws.links, carrier, ka.V)
+        b = point_acceleration(six(ws.links, carrier, ka.A), other, at)
+        V = minus_scaled(V, other, 1.0)
+    v = point_velocity(V, at)
     rate = dot_vector(n, v)
     slip = along(v, n, -rate)
     t, mu = slip_friction(unilateral, contacts, ws, k, slip, n, signed_friction(ws, m))
@@ -597,8 +601,9 @@ def shaped_row(
     if ws.active[k, ka.MODE] != ka.STICKING:
         return
     rolls = radius > 0.0 or shapes.kind[k, kd.MOVES] != 0
-    if rolls:
-        # The candidate rolls away from its anchor; any two tangents at its present point span the same rows.
+    if rolls or carrier >= 0:
+        # The candidate rolls away from its anchor, or its surface turns; any two tangents at its present point span the
+        # same rows.
         tangents(ws, k)
     sticking_rows(model, contacts, ws, k, i)
     if rolls:

@@ -47,7 +47,7 @@ ALONG_STEPS = 60
 # Pairs whose bounding spheres are further apart than this [m] are not examined.
 NEAR = 5e-3
 # PairArrays.index
-LINKS = 0  # 2: links of the first solid and of the second, which carries the surface
+LINKS = 0  # 2: links of the first solid and of the second, which carries the surface; −1: the world
 PAIR_SIZE = 2
 # PairArrays.solid
 POSE = 0  # 12: rotation by rows and centre in the frame of its link
@@ -90,9 +90,9 @@ def find_pairs(pairs, ws: Workspace):
     solid, poses = pairs.solid, pairs.poses
     for m in range(pairs.index.shape[0]):
         for side in range(2):
-            i = pairs.index[m, LINKS + side]
-            R = rotation(ws.links, i, ka.R)
-            p = transform(vector(ws.links, i, ka.P), R, vector(solid[m], side, POSE + 9))
+            i, p = pairs.index[m, LINKS + side], vector(solid[m], side, POSE + 9)
+            if i >= 0:
+                p = transform(vector(ws.links, i, ka.P), rotation(ws.links, i, ka.R), p)
             poses[side, 9], poses[side, 10], poses[side, 11] = p
         dx, dy, dz = poses[0, 9] - poses[1, 9], poses[0, 10] - poses[1, 10], poses[0, 11] - poses[1, 11]
         apart = math.sqrt(dx * dx + dy * dy + dz * dz)
@@ -106,7 +106,9 @@ def find_pairs(pairs, ws: Workspace):
                     slot[PLACE + s] = 0.5 * (poses[0, 9 + s] + poses[1, 9 + s])
             continue
         for side in range(2):
-            R = compose(rotation(ws.links, pairs.index[m, LINKS + side], ka.R), rotation_of(solid[m, side]))
+            i, R = pairs.index[m, LINKS + side], rotation_of(solid[m, side])
+            if i >= 0:
+                R = compose(rotation(ws.links, i, ka.R), R)
             for s in range(9):
                 poses[side, s] = R[s]
         core, other = solid[m, 0, CORE:BOUND], solid[m, 1, CORE:BOUND]

@@ -269,6 +269,24 @@ def take_commands(drives: DriveArrays, reference: ReferenceArrays, t, ws: Worksp
             drives.input[a, ka.COMMAND] = fed_forward(reference.voltage, reference.grid, t, a, asked)
 
 
+@kernel
+def follow_lines(spline, table, line, sampled, motors, lines, t):
+    """Set linear references of motors from time t on: positions and rates, (m, 2), instead of planned references.
+
+    ``sampled``, (na,), is the scenario's entry of each motor in ``table``. Returns False and changes nothing if a motor
+    of ``motors``, (m,), does not exist.
+    """
+    count = spline.shape[0]
+    for k in range(motors.shape[0]):
+        if not -count <= motors[k] < count:
+            return False
+    for k in range(motors.shape[0]):
+        a = motors[k]
+        spline[a], table[a, ka.SAMPLED] = ka.REWRITTEN, sampled[a]
+        line[a, ka.LINE_START], line[a, ka.LINE_RATE], line[a, ka.LINE_SINCE] = lines[k, 0], lines[k, 1], t
+    return True
+
+
 @internal_kernel
 def drive_block(drives: DriveArrays, ws: Workspace, a, limit, block):
     """Write ∂τ/∂(q, v, i) and ∂(di/dt)/∂(q, v, i) of drive a at this limit to the row ``block``, (BLOCK_SIZE,)."""

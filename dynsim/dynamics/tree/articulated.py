@@ -88,7 +88,10 @@ def row_system(model: ModelArrays, ws: Workspace):
     tree, links, small, state = model.tree, ws.links, ws.small, ws.rows
     for k in range(ws.counts[ka.ROWS]):
         if ws.active[k, ka.BODY_B] >= 0:
-            two_ended_row(model, ws, k)
+            if ws.active[k, ka.ROW_KIND] != ka.STICKING_ROW:
+                two_ended_row(model, ws, k)
+            elif k == ws.active[ws.active[k, ka.OWNER], ka.FIRST_ROW]:
+                two_ended_columns(model, ws, k)
             continue
         if ws.active[k, ka.ROW_KIND] == ka.STICKING_ROW:
             if k == ws.active[ws.active[k, ka.OWNER], ka.FIRST_ROW]:
@@ -175,6 +178,55 @@ def sticking_columns(model: ModelArrays, ws: Workspace, k):
                 small[m, k + r] = small[k + r, m]
     small[k, k], small[b, b], small[c, c] = aa, bb, cc
     small[k, b], small[b, k], small[k, c], small[c, k], small[b, c], small[c, b] = ab, ab, ac, ac, bc, bc
+    state[k, ka.RHS], state[b, ka.RHS], state[c, ka.RHS] = ta, tb, tc
+
+
+@noinline_kernel
+def two_ended_columns(model: ModelArrays, ws: Workspace, k):
+    """Compute :func:`sticking_columns` for a point that sticks to another body.
+
+    The rows climb from both ends as in :func:`two_ended_row`.
+    """
+    tree, links, column, small, state = model.tree, ws.links, ws.column, ws.small[0], ws.rows
+    b, c = k + 1, k + 2
+    row_a, row_b, row_c = six(state, k, ka.ROW), six(state, b, ka.ROW), six(state, c, ka.ROW)
+    other_a, other_b, other_c = negative(row_a), negative(row_b), negative(row_c)
+    for r in range(3):
+        for m in range(k + 3):
+            small[k + r, m] = 0.0
+    ta, tb, tc = state[k, ka.TARGET], state[b, ka.TARGET], state[c, ka.TARGET]
+    i, j = ws.active[k, ka.BODY_A], ws.active[k, ka.BODY_B]
+    while i >= 0 or j >= 0:
+        if j > i:
+            i, j = j, i
+            row_a, row_b, row_c, other_a, other_b, other_c = other_a, other_b, other_c, row_a, row_b, row_c
+        if i == j:
+            row_a, row_b, row_c = plus(row_a, other_a), plus(row_b, other_b), plus(row_c, other_c)
+            j = -1
+        S, U_over_D = six(links, i, ka.S), six(links, i, ka.U_OVER_D)
+        x, y, z = dot(S, row_a), dot(S, row_b), dot(S, row_c)
+        column[i, 1 + 2 * k], column[i, 2 + 2 * k] = x, x
+        column[i, 1 + 2 * b], column[i, 2 + 2 * b] = y, y
+        column[i, 1 + 2 * c], column[i, 2 + 2 * c] = z, z
+        d = links[i, ka.INVERSE_D]
+        dx, dy, dz = d * x, d * y, d * z
+        applied = column[i, 0]
+        ta, tb, tc = ta - dx * applied, tb - dy * applied, tc - dz * applied
+        for m in range(k + 3):
+            w = column[i, 2 + 2 * m]
+            small[k, m] += dx * w
+            small[b, m] += dy * w
+            small[c, m] += dz * w
+        row_a, row_b = minus_scaled(row_a, U_over_D, x), minus_scaled(row_b, U_over_D, y)
+        row_c = minus_scaled(row_c, U_over_D, z)
+        i = tree[i, ka.PARENT]
+    for r in range(k, k + 3):
+        for m in range(r):
+            small[m, r] = small[r, m]
+            if ws.active[m, ka.ROW_KIND] == ka.SLIDING_ROW:
+                small[m, r] = 0.0
+                for i in range(tree.shape[0]):
+                    small[m, r] += links[i, ka.INVERSE_D] * column[i, 1 + 2 * m] * column[i, 2 + 2 * r]
     state[k, ka.RHS], state[b, ka.RHS], state[c, ka.RHS] = ta, tb, tc
 
 

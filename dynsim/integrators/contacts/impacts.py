@@ -12,7 +12,7 @@ from dynsim.dynamics import state as kst
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.cone import steps as kc
-from dynsim.dynamics.contact.cone.steps import approach, approach_or_proximal_point, solve_cones
+from dynsim.dynamics.contact.cone.steps import FEW_PROXIMAL, approach, approach_or_proximal_point, solve_cones
 from dynsim.dynamics.contact.delassus import find_splits, normal_is_open
 from dynsim.dynamics.contact.mobility import moves_along_normal
 from dynsim.dynamics.contact.rows import largest_of_rows, row_errors, set_modes, slip_speed
@@ -361,7 +361,8 @@ def look_for_other(system: System, ws: Workspace, run: Run, p, largest):
     if any_leaves:
         good = CONE_TOLERANCE * (1.0 + largest)
         room, kind = unilateral.room[ku.SCRATCH :], unilateral.index[ku.KINDS]
-        if approach(ws.small[0], b, kind, mu, p, f, room, 1e-2 * CONE_TOLERANCE * max(largest, IMMOBILE), 1) <= good:
+        goal = 1e-2 * CONE_TOLERANCE * max(largest, IMMOBILE)
+        if approach(ws.small[0], b, kind, mu, p, f, room, goal, 1, FEW_PROXIMAL) <= good:
             for k in range(tally.shape[0]):
                 if stays_or_leaves(unilateral, k):
                     r = ws.active[k, ka.FIRST_ROW]

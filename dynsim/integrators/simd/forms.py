@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba.core import cgutils, types
 from numba.extending import intrinsic
-from numba.np.arrayobj import make_array, populate_array
 
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
@@ -98,7 +97,7 @@ def _lane(context: Any, builder: Any, value: Any, kind: Any, index: Any) -> Any:
         parts = parts_of(context, builder, kind, value)
         lanes = [_lane(context, builder, x, part, index) for x, part in zip(parts, kind, strict=True)]
         return build_tuple(context, builder, result, lanes)
-    source, view = make_array(kind)(context, builder, value), make_array(result)(context, builder)
+    source, view = context.make_array(kind)(context, builder, value), context.make_array(result)(context, builder)
     start = builder.gep(builder.bitcast(source.data, view.data.type), [index])
     return _viewed(context, builder, view, start, source.shape, source.strides, 8)
 
@@ -130,7 +129,7 @@ def _of_lanes(array: Any) -> Any:
 
 
 def _as_lanes(context: Any, builder: Any, value: Any, kind: Any, result: Any) -> Any:
-    source, view = make_array(kind)(context, builder, value), make_array(result)(context, builder)
+    source, view = context.make_array(kind)(context, builder, value), context.make_array(result)(context, builder)
     shape = cgutils.unpack_tuple(builder, source.shape)[:-1]
     strides = cgutils.unpack_tuple(builder, source.strides)[:-1]
     start = builder.bitcast(source.data, view.data.type)
@@ -138,7 +137,7 @@ def _as_lanes(context: Any, builder: Any, value: Any, kind: Any, result: Any) ->
 
 
 def _viewed(context: Any, builder: Any, view: Any, data: Any, shape: Any, strides: Any, itemsize: int) -> Any:
-    populate_array(
+    context.populate_array(
         view,
         data=data,
         shape=shape,

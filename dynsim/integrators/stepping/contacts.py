@@ -27,8 +27,7 @@ from dynsim.dynamics.contact import distance as kd
 from dynsim.dynamics.contact import solids as ks
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.cone import steps as kc
-from dynsim.dynamics.contact.cone.program import select_least_norm
-from dynsim.dynamics.contact.cone.steps import approach, motion, proximal_point
+from dynsim.dynamics.contact.cone.steps import motion
 from dynsim.dynamics.contact.mobility import moves_along_normal
 from dynsim.dynamics.contact.rows import point_row, set_modes
 from dynsim.dynamics.contact.solids import remember_pairs
@@ -57,6 +56,8 @@ from dynsim.dynamics.tree.spatial import (
     wrench_at,
 )
 from dynsim.integrators.stepping import tables as kt
+from dynsim.integrators.stepping.articulated_contacts import begin_articulated, begin_search, solve_articulated
+from dynsim.integrators.stepping.islands import find_islands, solve_problem
 from dynsim.integrators.stepping.tables import SteppingArrays, geometry, place_state
 from dynsim.jit.kernel import internal_kernel
 
@@ -474,6 +475,7 @@ def list_contacts(system, s: SteppingArrays, ws: Workspace, h):
         s.modes[k] = mode
     if changed:
         set_modes(system.contacts, system.couplings, system.unilateral, ws, s.modes)
+        find_islands(system.model, system.shapes.pairs, s, ws)
     return changed
 
 
@@ -611,7 +613,7 @@ def friction_of(law, s: SteppingArrays, k, r):
 
 
 @internal_kernel
-def turn_rows(law, s: SteppingArrays, ws: Workspace, k, h):
+def turn_rows(law, s: SteppingArrays, ws: Workspace, k, h, slack):
     """Write the law's additions to the end rates of listed candidate k to ``s.turn``; its friction is in ``s.mu``."""
     turn, last, state, r = s.turn[k], s.memory[kt.LAST, k], ws.contacts[k], ws.active[k, ka.FIRST_ROW]
     share = h / (h + s.grid[kt.LENGTH_LAST]) if turn[kt.KNOWN] == 1.0 else 0.0
@@ -631,7 +633,7 @@ def turn_rows(law, s: SteppingArrays, ws: Workspace, k, h):
             turn[kt.ADDED] = law[k, ka.RESTITUTION] * s.rate[0, r]
         return
     if not soft:
-        turn[kt.PUSH] = return_rate(state[ka.GAP], turn[kt.TURNED], last[kt.BUDGET], h)
+        turn[kt.PUSH] = return_rate(state[ka.GAP], turn[kt.TURNED], last[kt.BUDGET], h, slack)
         turn[kt.ADDED] -= turn[kt.PUSH]
     if last[kt.SLID] == 1.0:
         slip = math.sqrt(s.rate[0, r + 1] ** 2 + s.rate[0, r + 2] ** 2)
@@ -645,7 +647,7 @@ def turn_rows(law, s: SteppingArrays, ws: Workspace, k, h):
 
 
 @internal_kernel
-def return_rate(gap, turned, budget, h):
+def return_rate(gap, turned, budget, h, slack):
     """Return the rate at which a closed contact is moved back to its surface [m/s]; positive out of the surface.
 
     Parameters
@@ -656,9 +658,11 @@ def return_rate(gap, turned, budget, h):
         Part of the contact's normal rate that is due to turning rows [m/s].
     budget : float
         Energy that the motion back may use [J].
+    slack : float
+        Distance from the surface that is left as it is [m].
     """
     gap -= 0.25 * h * turned
-    off = max(0.0, abs(gap) - SWAY * h * abs(turned))
+    off = max(0.0, abs(gap) - slack - SWAY * h * abs(turned))
     rate = min(off / max(RETURN_TIME, RETURN_STEPS * h), RETURN_SPEED)
     if gap > 0.0:
         return -rate
@@ -674,7 +678,7 @@ def stop_return(unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace, 
     """
     loss, rate, row = unilateral.stop[k, ku.STOP_LOSS], 0.0, unilateral.stop_table[k, ku.STOP_ROW]
     if loss > 0.0:
-        rate = return_rate(min(stop_gap(unilateral, ws, k), 0.0), 0.0, loss, h)
+        rate = return_rate(min(stop_gap(unilateral, ws, k), 0.0), 0.0, loss, h, 0.0)
         impulse = s.f[row]
         if rate * impulse > loss:
             rate = loss / impulse
@@ -689,8 +693,11 @@ def largest_mobility(W, r):
 
 
 @internal_kernel
-def solve_contacts(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace, h):
+def solve_contacts(art, model: ModelArrays, system, s: SteppingArrays, ws: Workspace, h):
     """Solve for the impulses of all rows, starting from the last ones, and write their mean forces to ``ws.rows``.
+
+    ``art`` is None for the dense solver, otherwise its :class:`ArticulatedArrays`, and then the function returns
+    whether it has found a solution.
 
     The function also updates ``s.impulse``. If a contact that was expected to continue sliding stops or reverses, the
     law for the end of the step is applied to it after all, at most once per contact. A problem without a solution is
@@ -698,6 +705,7 @@ def solve_contacts(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Wor
     without restitution, at most once each.
     """
     p, coupled, rows = ws.counts[ka.ROWS], ws.counts[ka.COUPLED], ws.rows
+    law, unilateral, pairs = system.contacts.law, system.unilateral, system.shapes.pairs
     start = 3 * ws.contacts.shape[0]
     scale_impulses(s, h)
     for r in range(p):
@@ -721,8 +729,11 @@ def solve_contacts(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Wor
             s.mu[r] = friction_of(law, s, k, r)
             for m in range(ka.MOST_ROWS):
                 s.f[r + m] = s.impulse[3 * k + m]
-            turn_rows(law, s, ws, k, h)
+            turn_rows(law, s, ws, k, h, 0.0 if pairs is None else kt.MARGIN)
             elastic = elastic or bounces(law, s, ws, k)
+    if art is not None:  # noqa: SIM102 (resolved at compile time)
+        if not begin_search(unilateral.dry_table, art, s, ws):
+            return False
     loads = MOST_LOADED if s.grid[kt.LENGTH_LAST] == 0.0 else 0
     for _ in range(3 + ws.contacts.shape[0] + loads):
         for k in range(ws.contacts.shape[0]):
@@ -730,17 +741,22 @@ def solve_contacts(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Wor
                 for m in range(ka.MOST_ROWS):
                     r = ws.active[k, ka.FIRST_ROW] + m
                     s.right[r] = s.b[r] + s.turn[k, kt.ADDED + m]
-        residual = solve_problem(s, ws.small[0], p, rigid)
-        if not residual <= kt.BAD and drop_turns(law, unilateral, s, ws, p):
-            continue
-        s.statistics[kt.WORST] = max(s.statistics[kt.WORST], residual)
-        if not residual <= kt.BAD:
-            s.statistics[kt.CAPPED] += 1.0
-            limit_energy(s, ws.small[0], p)
-        if elastic and gains_energy(law, unilateral, s, ws):
-            elastic = False
-            drop_restitution(law, s, ws)
-            continue
+        if art is None:  # resolved at compile time
+            residual = solve_problem(s, ws.small[0], p, rigid, pairs)
+            if not residual <= kt.BAD and drop_turns(law, unilateral, s, ws, p):
+                continue
+            s.statistics[kt.WORST] = max(s.statistics[kt.WORST], residual)
+            if not residual <= kt.BAD:
+                s.statistics[kt.CAPPED] += 1.0
+                limit_energy(s, ws.small[0], p)
+            if elastic and drop_gains(law, unilateral, pairs, s, ws, p):
+                elastic = pairs is not None  # other islands may gain energy, too
+                continue
+        else:
+            residual = solve_articulated(model, unilateral.dry_table, art, s, ws, h)
+            if not residual <= kt.GOOD:
+                return False
+            s.statistics[kt.WORST] = max(s.statistics[kt.WORST], residual)
         if slip_ends(s, ws):
             continue
         if loads == 0 or not residual <= kt.BAD or not load_tangents(law, s, ws):
@@ -754,6 +770,16 @@ def solve_contacts(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Wor
         listed, r = ws.active[k, ka.MODE] == ka.STICKING, ws.active[k, ka.FIRST_ROW]
         for m in range(ka.MOST_ROWS):
             s.impulse[3 * k + m] = s.f[r + m] if listed else 0.0
+    return True
+
+
+@internal_kernel
+def solve_compliant(art, model: ModelArrays, system, s: SteppingArrays, ws: Workspace, h):
+    """Solve for impulses and accelerations by articulated inertias; return False if the dense solver must do it."""
+    if art is None:  # resolved at compile time
+        return False
+    table = system.unilateral.dry_table
+    return begin_articulated(model, table, art, s, ws) and solve_contacts(art, model, system, s, ws, h)
 
 
 @internal_kernel
@@ -764,35 +790,6 @@ def scale_impulses(s: SteppingArrays, h):
         for j in range(s.impulse.shape[0]):
             s.impulse[j] *= h / before
     s.grid[kt.IMPULSE_STEP] = h
-
-
-@internal_kernel
-def solve_problem(s: SteppingArrays, W, p, rigid):
-    """Solve w = W f + ``s.right`` for impulses f and law rates w; if f is not unique, select the f of least norm.
-
-    Parameters
-    ----------
-    rigid : bool
-        False if all contacts are compliant, which makes W regular and f unique.
-
-    Returns
-    -------
-    residual : float
-        Residual of the contact problem [m/s].
-    """
-    residual = approach(W, s.right, s.kind, s.mu, p, s.f, s.room, kt.GOOD, 1)
-    s.statistics[kt.SOLVES] += 1.0
-    if not residual <= kt.FAIR:
-        s.statistics[kt.LONG_SOLVES] += 1.0
-        residual = proximal_point(W, s.right, s.kind, s.mu, p, s.f, s.room, kt.GOOD)
-    if not residual <= kt.FAIR:
-        residual = approach(W, s.right, s.kind, s.mu, p, s.f, s.room, kt.GOOD, kt.LAST_ROUNDS)
-    if kt.FAIR < residual <= kt.BAD:  # near a solution: W of deficient rank, b not in its range
-        residual = proximal_point(W, s.right, s.kind, s.mu, p, s.f, s.room, kt.GOOD)
-    motion(W, s.right, p, s.f, s.w)
-    if rigid and residual <= kt.BAD:
-        select_least_norm(W, s.w, s.kind, s.mu, p, s.f, s.room)
-    return residual
 
 
 @internal_kernel
@@ -833,20 +830,46 @@ def bounces(law, s: SteppingArrays, ws: Workspace, k):
 
 
 @internal_kernel
-def gains_energy(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace):
-    """Return whether contacts and stops together would add energy, p·(u + u')/2 > 0.
+def drop_gains(law, unilateral: UnilateralArrays, pairs, s: SteppingArrays, ws: Workspace, p):
+    """Remove restitution from landings that would create energy; return whether any was removed.
+
+    If bodies touch each other, each island is considered for itself: bodies elsewhere do not change a rebound.
+    """
+    if pairs is None:  # resolved at compile time
+        gains = gains_energy(law, unilateral, s, ws, -1)
+        if gains:
+            drop_restitution(law, s, ws, -1)
+        return gains
+    dropped = False
+    for first in range(p):
+        if s.group[kt.ISLAND, first] == first and gains_energy(law, unilateral, s, ws, first):
+            dropped = drop_restitution(law, s, ws, first) or dropped
+    return dropped
+
+
+@internal_kernel
+def is_elsewhere(s: SteppingArrays, r, island):
+    """Return whether row r belongs to another island than the one with this first row; −1 is the whole system."""
+    return island >= 0 and s.group[kt.ISLAND, r] != island
+
+
+@internal_kernel
+def gains_energy(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace, island):
+    """Return whether contacts and stops of an island together would add energy, p·(u + u')/2 > 0.
 
     u' excludes the additions for extrapolated rows and for returns to the surface; for closed rows it is the law rate
-    w.
+    w. ``island`` is the first row of the island, or −1 for the whole system.
     """
     gain, passed = 0.0, 0.0
     for k in range(unilateral.stop_table.shape[0]):
-        if unilateral.stop_table[k, ku.STOP_CLOSED] == 1:
-            r = unilateral.stop_table[k, ku.STOP_ROW]
+        r = unilateral.stop_table[k, ku.STOP_ROW]
+        if unilateral.stop_table[k, ku.STOP_CLOSED] == 1 and not is_elsewhere(s, r, island):
             gain += 0.5 * s.f[r] * (s.rate[0, r] + s.w[r])
             passed += 0.5 * abs(s.f[r]) * (abs(s.rate[0, r]) + abs(s.w[r]))
     for k in range(ws.contacts.shape[0]):
         if ws.active[k, ka.MODE] != ka.STICKING or law[k, ka.CONTACT_STIFFNESS] > 0.0:
+            continue
+        if is_elsewhere(s, ws.active[k, ka.FIRST_ROW], island):
             continue
         for m in range(3):
             r = ws.active[k, ka.FIRST_ROW] + m
@@ -859,11 +882,17 @@ def gains_energy(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Works
 
 
 @internal_kernel
-def drop_restitution(law, s: SteppingArrays, ws: Workspace):
-    """Remove restitution from landings, as event-driven methods do if Newton's restitution contradicts friction."""
+def drop_restitution(law, s: SteppingArrays, ws: Workspace, island):
+    """Remove restitution from the landings of an island, as event-driven methods do if it contradicts friction.
+
+    Returns whether any landing had it.
+    """
+    dropped = False
     for k in range(ws.contacts.shape[0]):
-        if bounces(law, s, ws, k):
+        if bounces(law, s, ws, k) and not is_elsewhere(s, ws.active[k, ka.FIRST_ROW], island):
+            dropped = dropped or s.turn[k, kt.ADDED] != s.turn[k, kt.TURNED]
             s.turn[k, kt.ADDED] = s.turn[k, kt.TURNED]
+    return dropped
 
 
 @internal_kernel

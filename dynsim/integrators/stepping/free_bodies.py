@@ -23,8 +23,9 @@ from dynsim.integrators.stepping import tables as kt
 from dynsim.integrators.stepping.tables import SteppingArrays
 from dynsim.jit.kernel import internal_kernel
 
-# Maximum number of iterations for ω'; each one reduces the error by a factor of about h |ω|.
-MOST_ITERATIONS = 30
+# Maximum number of iterations for ω'; each one changes the error by a factor of about h |ω| √(I_max/I_min)/2. If the
+# factor is above 1, a slender body turns too fast for the step, and the midpoint equation is kept.
+MOST_ITERATIONS = 60
 
 
 def free_bodies(model: ModelArrays) -> np.ndarray:
@@ -91,7 +92,7 @@ def balance_momentum(model: ModelArrays, s: SteppingArrays, ws: Workspace, h):
             before[2] + moment[2] + h * gyroscopic[2],
         )
         at_midpoint, inverse = rotation_by(start, 0.5 * h), inverted(I)
-        stop = start[0] + change[0], start[1] + change[1], start[2] + change[2]
+        stop, converged = (start[0] + change[0], start[1] + change[1], start[2] + change[2]), False
         for _ in range(MOST_ITERATIONS):
             mean = (
                 start[0] + s.theta * (stop[0] - start[0]),
@@ -102,8 +103,11 @@ def balance_momentum(model: ModelArrays, s: SteppingArrays, ws: Workspace, h):
             # R'ᵀ R_m = (Rᵀ R')ᵀ (Rᵀ R_m)
             stop = times_inertia(inverse, rotate_back(rotation_by(mean, h), rotate(at_midpoint, total)))
             off = stop[0] - last[0], stop[1] - last[1], stop[2] - last[2]
-            if dot_vector(off, off) <= 1e-32 * dot_vector(stop, stop):
+            converged = dot_vector(off, off) <= 1e-32 * dot_vector(stop, stop)
+            if converged:
                 break
+        if not converged:
+            continue
         more = stop[0] - start[0] - change[0], stop[1] - start[1] - change[1], stop[2] - start[2] - change[2]
         mean = 0.5 * (start[0] + stop[0]), 0.5 * (start[1] + stop[1]), 0.5 * (start[2] + stop[2])
         s.statistics[kt.BALANCED] += dot_vector(mean, times_inertia(I, more))

@@ -21,6 +21,7 @@ from dynsim.integrators.contacts import events as ke
 from dynsim.integrators.events import take_ticks
 from dynsim.integrators.run import Run, fill_drives, fill_energies, sampled_now, steady_torque, watch, write_output
 from dynsim.integrators.stepping import tables as kt
+from dynsim.integrators.stepping.articulated_contacts import end_rates
 from dynsim.integrators.stepping.contacts import (
     book_soft_contact,
     book_ties,
@@ -30,6 +31,7 @@ from dynsim.integrators.stepping.contacts import (
     remember,
     restart_memory,
     slip_of_rates,
+    solve_compliant,
     solve_contacts,
     strikes,
     tangent_rows,
@@ -278,13 +280,17 @@ def solve_step(system: System, model: ModelArrays, ws: Workspace, run: Run):
         add_loads(model, system.loads, t + s.theta * h, ws, run.stage[1], layout.load)
     tangent_rows(system, s, ws)
     factor(model, ws)
-    constraint_rates(model, ws, y, layout.v, s.rate[0])
+    solved = False
     if ws.counts[ka.ROWS] > 0:
-        row_system(model, ws)
-        solve_contacts(system.contacts.law, system.unilateral, s, ws, h)
+        solved = solve_compliant(s.articulated, model, system, s, ws, h)
+        if not solved:
+            constraint_rates(model, ws, y, layout.v, s.rate[0])
+            row_system(model, ws)
+            solve_contacts(None, model, system, s, ws, h)
+            add_row_forces(model, ws)
         note_stop_forces(system.unilateral, ws)
-        add_row_forces(model, ws)
-    accelerate(model, ws)
+    if not solved:
+        accelerate(model, ws)
     balance_momentum(model, s, ws, h)
     run.count[ki.EVALUATIONS] += 1
     for i in range(joints.shape[0]):
@@ -294,7 +300,10 @@ def solve_step(system: System, model: ModelArrays, ws: Workspace, run: Run):
     for i in range(joints.shape[0]):
         y_new[layout.v + i] = v0[i] + h * last[i]
         joints[i, ka.QDD] = last[i]
-    constraint_rates(model, ws, y_new, layout.v, s.rate[1])
+    if solved:
+        end_rates(s.articulated, s, ws, h)
+    else:
+        constraint_rates(model, ws, y_new, layout.v, s.rate[1])
     for a in range(ws.motors.shape[0]):
         k, j = system.drives.table[a, ka.CIRCUIT], system.drives.table[a, ka.DRIVEN]
         if k >= 0:
@@ -552,7 +561,7 @@ def sample_moreau(system: System, ws: Workspace, run: Run):
 @internal_kernel
 def commands_due(system: System, ws: Workspace, run: Run):
     """Sample commands if they are due; return whether control must return to the caller."""
-    due = take_ticks(run)
+    due = take_ticks(run, system.drives.input)
     if due & ki.TAKE_COMMANDS:
         place_state(system, ws, run.y)
         take_commands(system.drives, system.reference, run.clock[ki.TIME], ws)

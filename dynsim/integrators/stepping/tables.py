@@ -35,6 +35,9 @@ from dynsim.jit.kernel import integers, internal_kernel, reals
 # Residuals of contact problems [m/s]: target of a search, acceptable residual, and residual above which a solve counts
 # as capped. Below the last value, a touching point does not count as leaving, and a sticking point not as slipping.
 GOOD, FAIR, BAD = 1e-11, 1e-10, 1e-8
+# Fraction of GOOD up to which impulses are kept after a step in which they were not: a step that stops a motion needs
+# more impulse than the next one, and the surplus would start the opposite motion.
+LEFT = 0.1
 # Number of starts in the last search, and total number of starts in all searches.
 LAST_ROUNDS = 12
 MOST_ROUNDS = 1 + 2 * kc.NEAR_STEPS + LAST_ROUNDS
@@ -72,7 +75,8 @@ MOST_TAKEN, MADE = 9, 10
 STIFFEST = 11  # largest stiffness times mobility of a compliant row [1/s²]
 # Work of the changes of free bodies' rates in this step, which no force does [J].
 BALANCED = 12
-STATISTICS_SIZE = 13
+CYCLED = 13  # number of solves by articulated inertias that failed, so that the step was solved by a dense matrix
+STATISTICS_SIZE = 14
 # SteppingArrays.before: rates at the start; rates used for the velocity products; acceleration of the last step, which
 # the acceleration of this step replaces; applied torques at the start, without loads; rates at the end of the last
 # accepted step; acceleration of the last step without an impact.
@@ -89,6 +93,18 @@ MECHANICAL, MAGNETIC = 0, 1
 # step had an impact; length of the step to which ``impulse`` belongs, zero before the first step [s].
 GRID_START, GRID_STEPS, LENGTH_LAST, POWER_LAST, POWER_NOW, HELD_STEPS, IMPACT_LAST, IMPULSE_STEP = range(8)
 GRID_SIZE = 8
+# SteppingArrays.group, for each row: first row of its island; 1 in the first row of an island whose last impulses have
+# solved this step. Then, for the rows of the island being solved: row and kind.
+ISLAND, KEPT, ROW, KIND = 0, 1, 2, 3
+# SteppingArrays.part, for the rows of the island being solved.
+RIGHT, IMPULSE, RATE, MU = 0, 1, 2, 3
+
+
+class ArticulatedArrays(NamedTuple):
+    """Working arrays of dynsim.integrators.stepping.articulated_contacts for n links and c contact candidates."""
+
+    link: np.ndarray  # (n + 1, LINK_SIZE); row n, or −1, is the world: its motion and matrices remain zero
+    contact: np.ndarray  # (c, CONTACT_SIZE)
 
 
 class SteppingArrays(NamedTuple):
@@ -116,10 +132,13 @@ class SteppingArrays(NamedTuple):
     logged_motion: np.ndarray  # (c,) int: motion in the last accepted step; −1 before the first
     memory: np.ndarray  # (2, c, MEMORY_SIZE) LAST and NOW
     turn: np.ndarray  # (c, TURN_SIZE)
-    room: np.ndarray  # (CONE_ROOM, p, p)
+    room: np.ndarray  # (CONE_ROOM + 1, p, p) scratch of the solver, and W of the island being solved
+    group: np.ndarray  # (4, p) int: see ISLAND and following
+    part: np.ndarray  # (4, p): see RIGHT and following
     statistics: np.ndarray  # (STATISTICS_SIZE,)
     grid: np.ndarray  # (GRID_SIZE,)
     free: np.ndarray  # (k,) int: first rotational rows of free bodies, if bodies touch each other
+    articulated: ArticulatedArrays | None  # None if bodies touch each other
 
 
 def stepping_arrays(
@@ -129,6 +148,7 @@ def stepping_arrays(
     joint_rows: int,
     theta: float,
     free: np.ndarray | None = None,
+    articulated: ArticulatedArrays | None = None,
 ) -> SteppingArrays:
     """Allocate :class:`SteppingArrays` for ``joint_rows`` rows of joints, and the rows of all candidates."""
     n, c = model.body.shape[0], contacts.link.shape[0]
@@ -156,10 +176,13 @@ def stepping_arrays(
         logged_motion=integers(np.full(c, -1)),
         memory=np.zeros((2, c, MEMORY_SIZE)),
         turn=np.zeros((c, TURN_SIZE)),
-        room=np.zeros((kc.CONE_ROOM, p, p)),
+        room=np.zeros((kc.CONE_ROOM + 1, p, p)),
+        group=integers(np.zeros((4, p))),
+        part=np.zeros((4, p)),
         statistics=np.zeros(STATISTICS_SIZE),
         grid=np.zeros(GRID_SIZE),
         free=integers(np.zeros(0) if free is None else free),
+        articulated=articulated,
     )
 
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, Literal, Self
+from itertools import pairwise
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import Field, field_validator, model_validator
+from pydantic import Discriminator, Field, Tag, field_validator, model_validator
 
-from dynsim.compile.bracing import MIN_N
+from dynsim.compile.bracing import MIN_N, RAMP, PressingBrace
 from dynsim.compile.control import PLANNED, BasePath, HandPath, JointControl, MovedPath, targets_on
 from dynsim.compile.hand_posture import hand_turn
 from dynsim.compile.model import Model
@@ -17,7 +18,7 @@ from dynsim.compile.protocols import BuildContext
 from dynsim.compile.references.inverse_kinematics import follow, planned_voltages
 from dynsim.compile.references.splines import clamped_cubic, quintic_coefficients, rolled, wheel_angles
 from dynsim.compile.references.teleop import TeleopOptions
-from dynsim.config.base import NonNegative, Positive, StrictConfig, Vector3, check_waypoints, default, error_at
+from dynsim.config.base import NonNegative, Pair, Positive, StrictConfig, Vector3, check_waypoints, default, error_at
 from dynsim.config.problems import errors_at, suggest
 from dynsim.errors import ModelError
 from dynsim.library import families
@@ -131,6 +132,41 @@ class TorquePath(StrictConfig):
         return self
 
 
+class BraceForce(StrictConfig):
+    """Planned normal force of one brace."""
+
+    force_N: Positive | None = default(None, "normal force; default: the force of least heat, at least `min_N`")
+    during_s: list[Pair] | None = default(
+        None,
+        "intervals in which the brace presses, increasing and apart; the force rises and falls within 0.1 s at their "
+        "ends; default: the whole run",
+        min_length=1,
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        intervals = self.during_s or []
+        ends = [0.0, *(time for interval in intervals for time in interval)]
+        if any(later < time for time, later in pairwise(ends)) or any(b - a < 2.0 * RAMP for a, b in intervals):
+            raise error_at(
+                "during_s", f"must be increasing intervals of at least {2.0 * RAMP:g} s, e.g. [[0, 2], [3, 5]]"
+            )
+        return self
+
+
+def _kind(value: Any) -> str:
+    """Return the tag of a branch of a union; the branch of mappings has the tag "", which messages omit."""
+    return "" if isinstance(value, Mapping | BraceForce) else "other"
+
+
+BraceForces = dict[
+    str, Annotated[Annotated[Positive, Tag("other")] | Annotated[BraceForce, Tag("")], Discriminator(_kind)]
+]
+BraceChoice = Annotated[
+    Annotated[Literal["optimal"], Tag("other")] | Annotated[BraceForces, Tag("")], Discriminator(_kind)
+]
+
+
 class Config(StrictConfig):
     """PD controller of the joints; joints without a reference hold their initial position.
 
@@ -156,12 +192,12 @@ class Config(StrictConfig):
         "planned voltages of DC motors along the references, added to the PD: none, for gravity, or for "
         "the full dynamics",
     )
-    brace: Literal["optimal"] | dict[str, Positive] | None = default(
+    brace: BraceChoice | None = default(
         None,
-        "normal forces [N] of the named contacts, or `optimal` for forces of least heat; voltages are "
+        "normal forces [N] of the named contacts, or `optimal` for forces of least heat of all contacts; voltages are "
         "then planned for the full dynamics with these forces; default: no planned forces",
     )
-    min_N: NonNegative = default(MIN_N, "minimum normal force of each brace with `brace: optimal`")
+    min_N: NonNegative = default(MIN_N, "minimum normal force of each brace whose force is of least heat")
     sample_time_s: Positive | None = default(
         None, "sampling period of the commands, held in between; default: continuous"
     )
@@ -173,6 +209,8 @@ class Config(StrictConfig):
         """Raise one error for a value of an invalid type, and a different error that names an invalid force."""
         if isinstance(value, Mapping) and value:
             for name, force in value.items():
+                if isinstance(force, Mapping | BraceForce):
+                    continue
                 if isinstance(force, bool) or not isinstance(force, int | float) or not 0.0 < force < np.inf:
                     raise error_at(str(name), "must be a normal force above 0 N; remove contacts that must not press")
         elif value not in (None, "optimal"):
@@ -195,8 +233,10 @@ class Config(StrictConfig):
                 )
         if self.brace is not None and self.feed_forward != "none":
             raise error_at("feed_forward", "conflicts with brace, which plans the full dynamics; remove feed_forward")
-        if self.min_N != MIN_N and self.brace != "optimal":
-            raise error_at("min_N", "requires brace: optimal; remove min_N")
+        forces = self.brace.values() if isinstance(self.brace, dict) else ()
+        optimal = self.brace == "optimal" or any(isinstance(f, BraceForce) and f.force_N is None for f in forces)
+        if self.min_N != MIN_N and not optimal:
+            raise error_at("min_N", "requires brace: optimal, or a brace without force_N; remove min_N")
         return self
 
 
@@ -277,13 +317,22 @@ def _planned(config: Config, context: BuildContext, times: Array, positions: dic
     """Return the voltages of the motors along the references, (T, na)."""
     if config.brace is None:
         return planned_voltages(context.model, times, positions, {}, whole=config.feed_forward == "dynamics")
-    forces = dict.fromkeys(context.declared) if config.brace == "optimal" else dict(config.brace)
+    forces: dict[str, Any] = dict.fromkeys(context.declared, BraceForce())
+    if config.brace != "optimal":
+        forces = {n: f if isinstance(f, BraceForce) else BraceForce(force_N=f) for n, f in config.brace.items()}
     for name in context.disabled:
         if name in forces:
             text = f"controller.brace: contact {name!r} is disabled and cannot press; enable it, or remove it here"
             raise ModelError(text, keys=("controller",))
-    braces = {name: (_contact(context, name, "brace"), force) for name, force in forces.items()}
+    braces = {
+        name: PressingBrace(_contact(context, name, "brace"), force.force_N, _intervals(force))
+        for name, force in forces.items()
+    }
     return planned_voltages(context.model, times, positions, braces, config.min_N)
+
+
+def _intervals(force: BraceForce) -> tuple[tuple[float, float], ...] | None:
+    return None if force.during_s is None else tuple((start, end) for start, end in force.during_s)
 
 
 def _contact(context: BuildContext, name: str, key: str) -> Contact:

@@ -155,6 +155,7 @@ def build(config: Config, context: BuildContext) -> Robot:
         p_PJ=np.array([*base.position_m, 0.0]),
         damping=wheel.damping_N_m_s_per_rad,
         shapes=(*_shapes(base), *(shape.placed(mount[1], turned) for shape in arm.fixed_shapes)),
+        solids=(_shapes(base)[0], *(shape.placed(mount[1], turned) for shape in arm.fixed_solids)),
         armature=axle,
     )
     rows = wheeled(body, wheel.radius_m, base.track_m)

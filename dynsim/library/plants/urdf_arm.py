@@ -1,4 +1,4 @@
-"""Arm on a fixed base with bodies and joints from a URDF file and motors from the scenario."""
+"""Arm on a fixed or floating base with bodies and joints from a URDF file and motors from the scenario."""
 
 from __future__ import annotations
 
@@ -127,7 +127,9 @@ class Config(StrictConfig):
     lock_deg: dict[str, float] = default({}, "angles of the named revolute joints that are locked")
     lock_m: dict[str, float] = default({}, "positions of the named prismatic joints that are locked")
     hand: BodyPoint | None = default(
-        None, "controlled point on a body or in a frame; default: the tip of the longest chain"
+        None,
+        "controlled point on a body or in a frame; default: the link `hand` if it moves, "
+        "otherwise the tip with the most moving joints",
     )
 
     @model_validator(mode="after")

@@ -22,4 +22,4 @@ class Config(SurfaceConfig):
 def build(config: Config, context: BuildContext) -> Quadric:
     """Return the plane as a quadric with Q = 0."""
     normal = unit_vector(config.normal, "normal")
-    return Quadric(np.zeros((3, 3)), normal, -float(normal @ config.point_m))
+    return Quadric(np.zeros((3, 3)), normal, -float(normal @ config.point_m), middle=np.array(config.point_m))

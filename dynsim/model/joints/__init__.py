@@ -75,7 +75,12 @@ def turned(axis: Array, angle: Array) -> Array:
     """Return the rotations, (3, 3, T), about a unit axis by angles (T,)."""
     x, y, z = axis
     K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.eye(3)[:, :, None] + np.sin(angle) * K[:, :, None] + (1.0 - np.cos(angle)) * (K @ K)[:, :, None]
+    R = unturned(len(angle))
+    # Most entries of the matrices are zero for an axis of the frame.
+    for part, matrix in ((np.sin(angle), K), (1.0 - np.cos(angle), K @ K)):
+        for i, j in np.argwhere(matrix).tolist():
+            R[i, j] += part * matrix[i, j]
+    return R
 
 
 def unturned(count: int) -> Array:

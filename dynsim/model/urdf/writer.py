@@ -31,9 +31,7 @@ def write_urdf(robot: Robot) -> str:
     root = ElementTree.Element("robot", name=robot.name)
     frames = [frame for frame in robot.frames if frame.name != HAND]
     taken = {link.name for link in robot.links} | {frame.name for frame in frames}
-    # The root link of the robot's original file is its first frame.
-    rooted = next((f.name for f in frames if f.body is None and not f.p.any() and np.array_equal(f.R, np.eye(3))), None)
-    base = rooted or next(name for name in (WORLD, "base_link", "root_link") if name not in taken)
+    base = robot.root or next(name for name in (WORLD, "base_link", "root_link") if name not in taken)
     stand = ElementTree.SubElement(root, "link", name=base)
     add_shapes(stand, robot.fixed_shapes)
     add_shapes(stand, robot.fixed_solids, "collision")

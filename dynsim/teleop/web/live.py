@@ -14,6 +14,7 @@ import numpy as np
 
 from dynsim.draw.geometry.robot import reaction_name
 from dynsim.draw.page import page
+from dynsim.dynamics import tables as ka
 from dynsim.errors import DynsimError, SimulationStopped
 from dynsim.record import Record
 from dynsim.record.scene import WORLD
@@ -261,7 +262,7 @@ class LiveDrive:
         }
 
     def _contacts(self, frame: LiveFrame) -> dict[str, Any]:
-        """Return the contact forces for the page: normal force, normal vector, tangential force and contact mode.
+        """Return the forces of closed contacts for the page: normal force, normal, tangential force and contact mode.
 
         If a body carries the surface, there is also the force on this body, and the place of both.
         """
@@ -270,7 +271,7 @@ class LiveDrive:
             return forces
         for point in scene.contacts:
             touch = frame.touching.get(point.name)
-            if touch is None:
+            if touch is None or touch.mode == ka.OPEN:
                 continue
             signs = {point.name: 1.0}
             if point.carrier != WORLD:
@@ -281,7 +282,7 @@ class LiveDrive:
                     "normal": np.round(sign * touch.normal, 5).tolist(),
                     "tangent": np.round(sign * (touch.vector - touch.force * touch.normal), 3).tolist(),
                     "mode": touch.mode,
-                    **({} if point.carrier == WORLD else {"at": np.round(touch.position, 5).tolist()}),
+                    **({} if scene.surface(point.surface) else {"at": np.round(touch.position, 5).tolist()}),
                 }
         return forces
 

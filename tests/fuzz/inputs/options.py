@@ -31,11 +31,13 @@ ODD = ("--keep-records all", "--seed -1", "--count 0", "--variants x", "--seed 1
 OPTIONS = {
     "compare": {"--jobs": "1", "--format": "png pdf svg gif", "--set": "integrator.rtol=1e-7 a=1"},
     "plan": {
-        "*--count": "0:1 1:1 1:1 0:0 1:2", "*--starts": "1", "*--jobs": "1",
+        "*--count": "0:1 1:1 1:1 0:0 1:2", "--phases": "1:2 2:2 0:1 5", "*--starts": "1", "*--jobs": "1",
         "*--candidates": "link_4 link_7 link_4:link_5 elbow_4 link_4,elbow_7 link_99",
         "--along": "0.5 1", "--radius": "0.01 0", "--surface": "floor x",
         "--weight": "peak=0.1 peak=0 peak=-1 x=1 peak=nan", "--clearance": "0.005 0", "--min-force": "0.5 2",
         "--gains": "500 500,50 0 x", "--seed": "3", "--friction-error": "0.1", "--explain": "", "--exhaustive": "",
+        "--require": "hand_error_m=0.01 heat_ratio=2 mass_error=0.1 mass_error=1 rating_share=1 x=1",
+        "--vary": "contacts.friction=0.05:0.2:2 surfaces.floor.point_m.2=-0.01,0 contacts.friction=0:1:x a=1 x",
     },
     "view": {"*--out": "page.html page.html x/y.html ä.html . page", "*--no-open": "", "--ghost": "", "--trust": ""},
     "plot": {"*--out": "figures f/g ä", "--format": "svg pdf x", "--trust": ""},

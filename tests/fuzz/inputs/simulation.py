@@ -44,6 +44,7 @@ EXTRA = (
     "integrator.solver=m_star", "contacts.law=unilateral", "contacts.friction=0.4", "integrator.theta=0.7",
     "sensors.encoders.rate_hz=100", "sensors.encoders.delay_s=0.01", "sensors.encoders.noise_deg=0.05",
     "sensors.seed=7", "initial.equilibrium=true", "surface_error.friction_factor=0.8", "integrator.step_max_s=0.001",
+    "mass_error.robot_factor=1.2",
 )  # fmt: skip
 QUIET = ("--no-figures", "--quiet")
 

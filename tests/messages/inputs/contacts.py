@@ -198,6 +198,17 @@ TABLES = [
             ("pair with a body that does not exist", "[links, box]", "[links, bocks]"),
             ("pair of one body", "[links, box]", "[box]"),
             ("ignored pair of one body", "{bodies: [links, box]}", "{bodies: [links, box], ignore: [[link_1]]}"),
+            (
+                "ignored pair that is not in its entry",
+                "{bodies: [links, box]}",
+                "{bodies: [links, box], ignore: [[link_1, crate]]}",
+            ),
+            ("entry without pairs", "[links, box]", "[link_1, link_2]"),
+            (
+                "further contact of a pair on its surface",
+                "integrator:",
+                "initial: {on_surface: [link_4-box_2]}\nintegrator:",
+            ),
             ("bodies that overlap at the start", "[0.5, 0, 0.1]", "[0.05, 0, 0.1]"),
             (
                 "links that overlap at the start",

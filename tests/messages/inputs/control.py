@@ -92,6 +92,8 @@ TABLES = [
                 circle("radius_m: 0.1, normal: [0, 0, 0]"),
             ),
             ("brace with a negative force", "  brace: {elbow: -1}\n"),
+            ("brace with times that overlap", "  brace: {elbow: {during_s: [[0, 2], [1, 3]]}}\n"),
+            ("brace with an unknown key", "  brace: {elbow: {during: [[0, 2]]}}\n"),
             ("brace that is not a contact", "  brace: {elbo: 1}\n"),
             ("brace of an unknown kind", "  brace: best\n"),
             (

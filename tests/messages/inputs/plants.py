@@ -145,6 +145,10 @@ TABLES = [
             ("limit in metres of a hinge", {"plant.joints": {"elbow_pitch": {"limit_m": [0, 1]}}}),
             ("density and mass of a link", {"plant.links": {"forearm": {"mass_kg": 1, "density_kg_m3": 1000}}}),
             ("radius of a link that is fixed to another", {"plant.links": {"gripper": {"radius_m": 0.02}}}),
+            (
+                "pair with a link that is fixed to another",
+                {"contacts": {"law": "unilateral", "between": [{"bodies": ["gripper", "links"]}]}},
+            ),
             ("impossible moments of a link", {"plant.links": {"forearm": {"inertia_kg_m2": [1, 0, 0, 1, 0, 3]}}}),
             ("base that moves otherwise", {"plant.base": "mobile"}),
             ("motor without inductance of an arm from URDF", {"plant.motor.inductance_H": 0}),

@@ -20,6 +20,7 @@ TABLES = [
             ("command that is a text", "simulation.set_command('joint_1', 'a')"),
             ("reference of a joint that does not exist", "simulation.set_reference('joint_x', 0.0)"),
             ("reference that is infinite", "simulation.set_reference('joint_1', math.inf)"),
+            ("reference of motor 99", "simulation.set_lines(np.array([99]), [[0.0, 0.0]])"),
             ("wrench on a body that does not exist", "simulation.set_wrench('hand')"),
             ("force of a single component", "simulation.set_wrench('link_1', force=[1.0])"),
             ("event that does not exist", "simulation.watch('angle', 'joint_1')"),

@@ -26,6 +26,18 @@ plant:
   chain: [{axis: y, length_m: 0.5, initial_deg: 89, limit_deg: [-90, 90]}]
 metrics: {settle_s: 0}
 """
+COLLIDING = """\
+duration_s: 0.1
+plant: {type: serial_arm, gravity_m_s2: [0, 0, 0], chain: [{length_m: 0.3}]}
+objects:
+  a: {mass_kg: 1, size_m: [0.1, 0.1, 0.1], position_m: [-0.3, 5, 0]}
+  b: {mass_kg: 2, size_m: [0.1, 0.1, 0.1], position_m: [0, 5.01, 0.01]}
+loads:
+  push: {type: samples, body: a, times_s: [0, 0.01], force_N: [[300, 0, 0], [300, 0, 0]], interpolation: linear}
+contacts: {law: unilateral, between: [{bodies: [a, b]}]}
+integrator: {method: time_stepping}
+metrics: {settle_s: 0}
+"""
 
 TABLES = [
     Overrides(
@@ -71,6 +83,13 @@ TABLES = [
                 "law: unilateral",
                 "law: unilateral, candidates: joints",
             ),
+            (
+                "surfaces on links only",
+                "floor: {type: plane}, thing: {type: plane, point_m: [0, 0, 0.55]}",
+                "lid: {type: plane, on: link_2}",
+                "law: unilateral",
+                "law: unilateral, candidates: links",
+            ),
         ],
         keyed=False,
     ),
@@ -79,6 +98,22 @@ TABLES = [
         {"arm.yaml": SWINGING},
         [
             ("joint that passes its limit", "duration_s: 0.1", "duration_s: 0.3"),
+        ],
+        keyed=False,
+        measured=True,
+    ),
+    Edits(
+        'dynsim.simulate(dynsim.load_scenario("arm.yaml"))',
+        {"arm.yaml": COLLIDING},
+        [
+            ("bodies that pass through each other", "[[300, 0, 0], [300, 0, 0]]", "[[3000, 0, 0], [3000, 0, 0]]"),
+            (
+                "edges that are compressed beyond their rounding",
+                "[0, 5.01, 0.01]",
+                "[0, 5.03, 0.02], rpy_deg: [5, 0, 40]",
+                "[a, b]",
+                "[a, b], stiffness_N_per_m: 50000",
+            ),
         ],
         keyed=False,
         measured=True,

@@ -2,20 +2,26 @@
 
 MuJoCo gets the exported tree of bodies, the voltage laws of the servos, and the piecewise linear references that the
 controller produced in dynsim's run. The commands are therefore the same; MuJoCo computes forces, friction and contacts.
+dynsim runs with its controller, and also with the recorded commands alone, so that both programs do the same work.
 """
 
 from __future__ import annotations
 
 import math
 import time
+from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.dynamics import tables as ka
-from dynsim.engine.simulation import Prepared, Simulation
+from dynsim.engine.prepare import EVERY_STEP
+from dynsim.engine.simulation import Prepared, Simulation, prepare
 from dynsim.engine.snake_pilot import roll_pitch_yaw
+from dynsim.engine.stopping import copied
+from dynsim.integrators import driver
 from dynsim.integrators import run as ki
 from dynsim.model.description import Robot
 from dynsim.record import Record
@@ -28,13 +34,14 @@ Array = NDArray[np.float64]
 
 SCENARIO = "snake_positioning_dynamic"
 DYNSIM = "dynsim 2.5 ms, with its controller"
+COMMANDED = "dynsim 2.5 ms, commands given"
 # Step [s], and whether dry friction has the maximum stiffness that MuJoCo accepts; at 2.5 ms it is unstable.
 MUJOCO = {
     "MuJoCo 2.5 ms": (2.5e-3, False),
     "MuJoCo 2 ms, stiff friction": (2e-3, True),
     "MuJoCo 1 ms, stiff friction": (1e-3, True),
 }
-SNAKES = (DYNSIM, *MUJOCO)
+SNAKES = (DYNSIM, COMMANDED, *MUJOCO)
 Z, BETA = 2, 4
 # MuJoCo's default softness of limits and friction: solref and solimp.
 SOFT = [0.02, 1.0], [0.9, 0.95, 0.001, 0.5, 2.0]
@@ -107,12 +114,17 @@ def measure(rounds: int, *, with_mujoco: bool) -> list[dict[str, Any]]:
     duration = 0.0
     for name in TABLE_III:
         scenario = load_scenario(SCENARIO, name)
-        commands, own = run_dynsim(scenario, rounds)
+        commands, own = run_dynsim(scenario)
         duration += scenario.duration_s
-        outcomes.setdefault(DYNSIM, []).append(own)
+        programs = {DYNSIM: lambda scenario=scenario, own=own: own._replace(seconds=time_dynsim(scenario))}
+        programs[COMMANDED] = partial(run_commands, commanded(scenario, commands))
         for program, (step, stiff) in MUJOCO.items() if with_mujoco else ():
             model = build_snake(commands.prepared, step, stiff)
-            outcomes.setdefault(program, []).append(run_mujoco(model, commands, scenario.duration_s, rounds))
+            programs[program] = partial(run_mujoco, model, commands, scenario.duration_s)
+        # The programs take turns, so that other processes slow all of them down.
+        turns = [{program: run() for program, run in programs.items()} for _ in range(rounds)]
+        for program in programs:
+            outcomes.setdefault(program, []).append(min((turn[program] for turn in turns), key=lambda run: run.seconds))
     published = np.array([moved.mean for moved in TABLE_III.values()])
     rows = []
     for program, runs in outcomes.items():
@@ -131,9 +143,9 @@ def measure(rounds: int, *, with_mujoco: bool) -> list[dict[str, Any]]:
     return rows
 
 
-def run_dynsim(scenario: Scenario, rounds: int) -> tuple[Commands, Manoeuvre]:
-    """Run a scenario in dynsim; return its commands and its result, timed in separate runs."""
-    simulation, seconds = Simulation(scenario, duration=math.inf), math.inf
+def run_dynsim(scenario: Scenario) -> tuple[Commands, Manoeuvre]:
+    """Run a scenario in dynsim; return its commands, and its result without a time."""
+    simulation = Simulation(scenario, duration=math.inf)
     assert simulation.operator is not None
     q, lines, period = simulation.state.q, [], simulation.operator.period
     for k in range(round(scenario.duration_s / period)):
@@ -141,17 +153,45 @@ def run_dynsim(scenario: Scenario, rounds: int) -> tuple[Commands, Manoeuvre]:
         simulation.advance((k + 0.5) * period)
         lines.append(simulation._prepared.system.drives.input[:, ka.LINE_START : ka.LINE_RATE + 1].copy())
     simulation.advance(scenario.duration_s)
-    for _ in range(rounds):
-        alone = Simulation(scenario, duration=math.inf)
-        started = time.thread_time()
-        alone.advance(scenario.duration_s)
-        seconds = min(seconds, time.thread_time() - started)
     steps = int(simulation._prepared.run.count[ki.STEPS])
-    own = Manoeuvre(seconds, steps, displacement(simulation.record(scenario, pictured=False)))
+    own = Manoeuvre(math.inf, steps, displacement(simulation.record(scenario, pictured=False)))
     return Commands(simulation._prepared, q, period, np.array(lines)), own
 
 
-def run_mujoco(model: Any, commands: Commands, duration: float, rounds: int) -> Manoeuvre:
+def time_dynsim(scenario: Scenario) -> float:
+    """Return the CPU seconds of a run in dynsim with its controller."""
+    simulation = Simulation(scenario, duration=math.inf)
+    started = time.thread_time()
+    simulation.advance(scenario.duration_s)
+    return time.thread_time() - started
+
+
+def commanded(scenario: Scenario, commands: Commands) -> Prepared:
+    """Return the scenario prepared with the commands as planned references, without its controller."""
+    prepared = prepare(scenario)
+    ticks, motors, _ = commands.lines.shape
+    coefficients = np.zeros((ticks, motors, 6))
+    coefficients[:, :, :2] = commands.lines
+    reference = prepared.system.reference._replace(
+        spline=np.arange(motors), grid=np.array([0.0, commands.period]), coefficients=coefficients
+    )
+    return replace(prepared, system=prepared.system._replace(reference=reference))
+
+
+def run_commands(prepared: Prepared) -> Manoeuvre:
+    """Run the same commands in dynsim, in one compiled call."""
+    prepared, model, (body, point) = copied(prepared), prepared.model, prepared.model.robot.hand
+    run = prepared.run
+    # Load the kernel.
+    driver.advance(prepared.system, prepared.workspace, run, -1)
+    started = time.thread_time()
+    driver.advance(prepared.system, prepared.workspace, run, EVERY_STEP)
+    seconds = time.thread_time() - started
+    poses = [model.body_pose(body, q) for q in run.states("q")]
+    return _manoeuvre(seconds, int(run.count[ki.STEPS]), run.sample_time, [(p + R @ point, R) for R, p in poses])
+
+
+def run_mujoco(model: Any, commands: Commands, duration: float) -> Manoeuvre:
     """Run the same commands in MuJoCo, from the same posture at rest."""
     import mujoco
 
@@ -163,17 +203,20 @@ def run_mujoco(model: Any, commands: Commands, duration: float, rounds: int) -> 
     rates = commands.prepared.system.drives.table[:, ka.SERVO_MODE] == ka.VELOCITY_MODE
     controls[:, rates] = commands.lines[k][:, rates, 1]
     data, start = mujoco.MjData(model), state_of(model, positions(model, commands.prepared.model.robot, commands.q))
-    seconds = math.inf
-    for _ in range(rounds):
-        started = time.thread_time()
-        path, _, _ = roll_out(model, data, start, controls)
-        seconds = min(seconds, time.thread_time() - started)
-    w = np.zeros((len(path), 6))
-    for q, row in zip(path, w, strict=True):
+    started = time.thread_time()
+    path, _, _ = roll_out(model, data, start, controls)
+    seconds, poses = time.thread_time() - started, []
+    for q in path:
         data.qpos[:] = q
         mujoco.mj_kinematics(model, data)
         hand = data.site("hand")
-        row[:3], row[3:] = hand.xpos, roll_pitch_yaw(hand.xmat.reshape(3, 3))
-    record = Record((np.arange(len(path)) + 1) * step)
+        poses.append((hand.xpos.copy(), hand.xmat.reshape(3, 3).copy()))
+    return _manoeuvre(seconds, len(path), (np.arange(len(path)) + 1) * step, poses)
+
+
+def _manoeuvre(seconds: float, steps: int, times: Array, poses: list[tuple[Array, Array]]) -> Manoeuvre:
+    """Return the result of a run with positions and rotations of the controlled point."""
+    record = Record(times)
+    w = np.array([np.concatenate([p, roll_pitch_yaw(R)]) for p, R in poses])
     record.add("w", w, "m, rad", labels=COORDINATES)
-    return Manoeuvre(seconds, len(path), displacement(record))
+    return Manoeuvre(seconds, steps, displacement(record))

@@ -373,8 +373,9 @@ class App {
   showStatus(pairs) {
     const lines = [];
     for (const [actor] of pairs) {
-      // A live page has no table of contacts.
-      const parts = (this.live ? actor.contacts : []).map(({ state }) => state.force === null || state.state === "open" ? `${state.name}: open`
+      // A live page has no table of contacts. If there are many, open ones are not listed.
+      const listed = (this.live ? actor.contacts : []).filter(({ state }, _, all) => all.length <= CONES || (state.force !== null && state.state !== "open"));
+      const parts = listed.map(({ state }) => state.force === null || state.state === "open" ? `${state.name}: open`
         : `${state.name}: ${D.number(state.force, 3)} N, ${state.state}`);
       // For a live gripper, only open or closed is known.
       if (actor.data.states && !actor.live) parts.unshift(`gripper: ${actor.data.states[actor.shown.gripper]}`);

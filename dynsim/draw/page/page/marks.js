@@ -93,7 +93,7 @@ M.Contact = class {
     this.cone.material.color.set(colours.friction);
     const state = mode === null ? (pulls ? "pulls" : "pushes") : ["open", "slips", "sticks"][mode];
     const dot = mode === null ? colour : [colours.open, colours.slip, colours.stick][mode];
-    this.dot.visible = layers.forces;
+    this.dot.visible = layers.forces && !now.hidden;
     this.dot.position.copy(this.at);
     this.dot.material.color.set(dot);
     this.dot.material.opacity = open ? 0.45 : 1;

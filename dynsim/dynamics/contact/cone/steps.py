@@ -311,6 +311,8 @@ NEWTON_STEPS, FULL_STEPS, HALVINGS = 20, 6, 8
 ROUNDS, SWEEPS, SWEPT_ROUNDS = 200, 10, 40
 # Number of starts before a proof is tried, and for each problem in the proof.
 FEW_ROUNDS = 8
+# Largest proximal term of Newton steps from the first start, unless the caller chooses another.
+FEW_PROXIMAL = 1e-6
 # Proximal-point method: number of steps, first and smallest ε.
 NEAR_STEPS, FIRST_EPSILON, LEAST_EPSILON = 60, 1e-3, 1e-9
 # A proof covers all forces up to PROVED_FORCE times |b| / mobility; its problem is regularised by PROOF_SHIFT.
@@ -350,23 +352,26 @@ def solve_cones(W, b, kind, mu, p, f, room, tolerance):
         return residual
     if impossible(W, b, kind, mu, p, room):
         return NO_SOLUTION
-    return approach(W, b, kind, mu, p, f, room, tolerance, ROUNDS)
+    return approach(W, b, kind, mu, p, f, room, tolerance, ROUNDS, FEW_PROXIMAL)
 
 
 @internal_kernel
 def approach_or_proximal_point(W, b, kind, mu, p, f, room, tolerance, rounds):
     """Solve as :func:`solve_cones` without a proof: one start, :func:`proximal_point`, then up to ``rounds`` starts."""
-    residual = approach(W, b, kind, mu, p, f, room, tolerance, 1)
+    residual = approach(W, b, kind, mu, p, f, room, tolerance, 1, FEW_PROXIMAL)
     if not residual <= tolerance:
         residual = proximal_point(W, b, kind, mu, p, f, room, tolerance)
     if not residual <= tolerance:
-        residual = approach(W, b, kind, mu, p, f, room, tolerance, rounds)
+        residual = approach(W, b, kind, mu, p, f, room, tolerance, rounds, FEW_PROXIMAL)
     return residual
 
 
 @internal_kernel
-def approach(W, b, kind, mu, p, f, room, tolerance, rounds):
-    """Solve as :func:`solve_cones` by Newton's method from up to ``rounds`` starts: f, then swept or random forces."""
+def approach(W, b, kind, mu, p, f, room, tolerance, rounds, share):
+    """Solve as :func:`solve_cones` by Newton's method from up to ``rounds`` starts: f, then swept or random forces.
+
+    ``share`` is the largest proximal term of the steps from f; it is relative to the mobilities.
+    """
     best, swept, mobility = room[BEST, 0], room[SWEPT, 0], room[MOBILITY, 0]
     mobilities(W, kind, p, room)
     residual, merit = measure(W, b, kind, mu, p, f, room)
@@ -391,6 +396,7 @@ def approach(W, b, kind, mu, p, f, room, tolerance, rounds):
             residual, merit = measure(W, b, kind, mu, p, f, room)
         # Alternate between values: a value that is too small for some problems is too large for others.
         most = 1e-6 if attempt % 6 < 2 else 1e-3 if attempt % 6 < 4 else 1e-9
+        most = share if attempt == 0 else most
         for step in range(NEWTON_STEPS + 1):
             # The comparison is written so that NaN is never the best residual.
             if residual < least:
@@ -470,7 +476,7 @@ def proximal_point(W, b, kind, mu, p, f, room, tolerance):
     epsilon, inner = FIRST_EPSILON, max(0.1 * tolerance, 1e-14 * scale)
     for _ in range(NEAR_STEPS):
         shift(W, b, p, room, epsilon)
-        left = approach(shifted, right, kind, mu, p, f, room, inner, 1)
+        left = approach(shifted, right, kind, mu, p, f, room, inner, 1, FEW_PROXIMAL)
         # Restore the mobilities, because ``approach`` has left those of the shifted problem.
         mobilities(W, kind, p, room)
         residual, _ = measure(W, b, kind, mu, p, f, room)
@@ -506,7 +512,7 @@ def impossible(W, b, kind, mu, p, room):
     shift(W, b, p, room, PROOF_SHIFT)
     # Repeat for the remaining motion. Each time, a millionth of the motion that forces can cause remains.
     for _ in range(PROOF_STEPS):
-        approach(room[SHIFTED], right, kind, none, p, proof, room, 1e-9 * scale, FEW_ROUNDS)
+        approach(room[SHIFTED], right, kind, none, p, proof, room, 1e-9 * scale, FEW_ROUNDS, FEW_PROXIMAL)
         mobilities(W, kind, p, room)
         for k in range(p):
             free = kind[k] == TANGENT or kind[k] == BOX

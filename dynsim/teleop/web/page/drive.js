@@ -23,7 +23,8 @@ const PAD_HOLD = [4, 5], PAD_GRIP = 0;
 const STICKS = [["turn", "ahead"], ["y", "x"], ["gamma", "z"], ["alpha", "beta"]];
 const TOUCH = matchMedia("(hover: none)");
 
-const NOTHING = { force: NaN, normal: [0, 0, 1], tangent: [0, 0, 0], mode: null };
+// An open contact, which is not drawn.
+const NOTHING = { force: NaN, normal: [0, 0, 1], tangent: [0, 0, 0], mode: 0, hidden: true };
 
 class Drive {
   constructor() {
@@ -214,8 +215,11 @@ class Drive {
     this.drawnAt = now;
     this.newest = null;
     this.frames++;
+    // Arrows are scaled to the largest forces so far; a single impact counts little.
+    const actor = dynsim.app.actors[0], most = Math.max(0, ...Object.values(frame.contacts).map((c) => Math.abs(c.force)));
+    actor.scale += 0.1 * Math.max(most - actor.scale, 0);
     dynsim.frame({ time: frame.time, poses: frame.poses, pressure: null, ...(frame.wheels ? { wheels: frame.wheels } : {}),
-      contacts: dynsim.app.actors[0].contacts.map((c) => frame.contacts[c.contact.name] ?? NOTHING), ...(frame.gripper === undefined ? {} : { gripper: frame.gripper }) });
+      contacts: actor.contacts.map((c) => frame.contacts[c.contact.name] ?? NOTHING), ...(frame.gripper === undefined ? {} : { gripper: frame.gripper }) });
     this.last = frame;
     this.state = frame.state;
     this.showStatus();
