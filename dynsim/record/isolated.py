@@ -39,10 +39,14 @@ isolated.serve(decode, path, limits, sys.stdout.buffer)
 def search_path() -> list[str]:
     """Return the folders in which a child process searches for modules, with the working directory last.
 
-    So a ``json.py`` in the working directory does not replace the standard module.
+    So a ``json.py`` in the working directory does not replace the standard module. The folder of this dynsim precedes
+    all folders that contain another one: a checkout in the working directory, an installed dynsim.
     """
     here = ("", os.curdir, os.getcwd() if os.path.isdir(os.curdir) else "")
-    return sorted((folder for folder in sys.path if isinstance(folder, str)), key=lambda folder: folder in here)
+    path = sorted((folder for folder in sys.path if isinstance(folder, str)), key=lambda folder: folder in here)
+    with_dynsim = (number for number, folder in enumerate(path) if os.path.isdir(os.path.join(folder, "dynsim")))
+    path.insert(next(with_dynsim, len(path)), str(Path(__file__).parents[2]))
+    return path
 
 
 def scale(size: int) -> float:

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
+from importlib.machinery import PathFinder
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -16,6 +17,7 @@ from support.messages import check_message, mentions, raises
 from support.processes import wait_for
 from support.sweep_work import REFUSED, busy, pid, says, square, unsendable
 
+from dynsim.record import isolated
 from dynsim.studies import processes
 from dynsim.studies.processes import START, STARTS, WorkerError, end_workers, run_in_processes
 
@@ -182,9 +184,30 @@ def test_what_work_prints_and_reads_is_not_what_it_is_sent(capfd: pytest.Capture
     taken: dict[int, Any] = {}
     run_in_processes(says, range(3), 1, lambda number, result: taken.update({number: result()}))
     assert taken == dict.fromkeys(range(3), "")
-    printed = capfd.readouterr()
-    assert printed.out == ""
-    assert printed.err.count("printed") == 3
+    # A thread forwards the output, perhaps after the result.
+    printed = [capfd.readouterr()]
+
+    def is_complete() -> bool:
+        printed.append(capfd.readouterr())
+        return "".join(more.err for more in printed).count("printed") == 3
+
+    wait_for(is_complete)
+    assert all(more.out == "" for more in printed)
+
+
+def test_workers_import_the_dynsim_of_their_parent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Not an installed dynsim, if the parent runs in a checkout."""
+    (tmp_path / "dynsim").mkdir()
+    (tmp_path / "dynsim" / "__init__.py").touch()
+    own = Path(processes.__file__).parents[2]
+    monkeypatch.chdir(own)
+    others = [folder for folder in sys.path if folder and not (Path(folder) / "dynsim").is_dir()]
+    monkeypatch.setattr(sys, "path", ["", *others, str(tmp_path)])
+    path = isolated.search_path()
+    spec = PathFinder.find_spec("dynsim", path)
+    assert spec is not None
+    assert spec.origin == str(own / "dynsim" / "__init__.py")
+    assert path[: len(others)] == others
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGSTOP"), reason="no signal stops a process here")
