@@ -55,9 +55,10 @@ _STALLED_S = 10.0
 _SIGNAL_S, _JOIN_S = 0.1, 0.7
 # Number of lines of a worker's stderr that are reported if it cannot start.
 _LAST_LINES = 12
-# The parent starts a worker for each ALONE_S of remaining work [s of processor time], because the start of a worker
-# takes about one second. It leaves a task to the workers after HERE_S of processor time, or STUCK_S.
-ALONE_S, HERE_S, STUCK_S = 2.0, 0.5, 5.0
+# The parent starts a worker for each ALONE_S of remaining work [s of processor time]. The start of a worker takes about
+# one second of time and of processor time; with less work, it would save less time than it costs processor time. The
+# parent leaves a task to the workers after HERE_S of processor time, or STUCK_S.
+ALONE_S, HERE_S, STUCK_S = 3.0, 0.5, 5.0
 # Number of tasks that a worker has if the parent works too: it gets the next one while the parent is busy.
 _AHEAD = 2
 # Time after which unused workers end [s].
