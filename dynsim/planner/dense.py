@@ -19,7 +19,7 @@ from dynsim.errors import ModelError
 from dynsim.jit.kernel import reals
 from dynsim.model.description import Array, Contact
 from dynsim.planner.compiled.retract import ON
-from dynsim.planner.problem import FINAL_SLIP_SCALE, LIFTING, BraceSchedule, BraceSet, Clear, Task, contact_names
+from dynsim.planner.problem import LIFTING, BraceSchedule, BraceSet, Clear, Task, contact_names
 from dynsim.scenario import build
 
 # Minimum number of instants per pass along the path (at least two per knot), and maximum time between instants [s].
@@ -161,7 +161,7 @@ def statics(task: Task, schedule: BraceSchedule, times: Array, q: Array, rests: 
     named = contacts(task, schedule.braces).items()
     placed = {name: PressingBrace(contact, None, times) for (name, contact), times in zip(named, during, strict=True)}
     try:
-        planner, tables, shares = pressing(model, fine, whole, rates, placed, task.options.min_N, FINAL_SLIP_SCALE)
+        planner, tables, shares = pressing(model, fine, whole, rates, placed, task.options.min_N)
     except ModelError as error:
         return f"the postures jump between knots: {error}"
     torques, forces, solved = planner.least_heat(whole, rates, accelerations, tables, shares)

@@ -13,6 +13,7 @@ from dynsim.compile.bracing import RAMP
 from dynsim.compile.control import HandPath
 from dynsim.compile.model import Model
 from dynsim.compile.protocols import BuildContext
+from dynsim.compile.references.inverse_kinematics import SLIP_SCALE
 from dynsim.compile.solids import Solid, solids_of
 from dynsim.errors import ModelError
 from dynsim.jit.kernel import integers, reals
@@ -36,10 +37,9 @@ REST_SPEED, INSTANT = 1e-2, 1e-4
 ALONG = (0.33, 0.67)
 # Clearance of these points [m].
 LINK_CLEARANCE = 2e-3
-# Slip v_s [m/s] at which friction approaches its full value. With the final value, a creeping brace has the full
-# friction. Planned voltages use smoother friction, so that they do not oscillate. The search starts with larger values,
-# which allow long steps and have few local optima.
-FINAL_SLIP_SCALE, FINE_SLIP_SCALE, COARSE_SLIP_SCALE = 1e-3, 3e-3, 1e-2
+# Slip v_s [m/s] at which friction approaches its full value. The final value is the value of planned voltages. The
+# search starts with larger values, which allow long steps and have few local optima.
+FINAL_SLIP_SCALE, FINE_SLIP_SCALE, COARSE_SLIP_SCALE = SLIP_SCALE, 3e-3, 1e-2
 # Fraction of the time that the knots cover, within which braces may be close to their surfaces before and after they
 # touch.
 LIFTING = 0.13

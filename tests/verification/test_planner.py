@@ -293,6 +293,16 @@ def test_plans_run_as_planned_and_bear_errors_of_the_scene(searched) -> None:  #
     assert min(nominal.closed_fraction.values()) == pytest.approx(1.0, abs=1e-6)
 
 
+@pytest.mark.long
+def test_slowly_sliding_braces_need_the_planned_heat() -> None:
+    """Three braces that creep at about 1 mm/s have the friction of the plan."""
+    made = task(scene_scenario(7), Options(count=(3, 3), budget_s=0.0))
+    plan = Search(made).run()[3][0]
+    nominal = Verifier(made, Tolerances(friction=(1.0,), shift_m=(0.0,))).verify([(plan.braces, plan.dense)])[0].nominal
+    assert nominal is not None
+    assert nominal.heat_W == pytest.approx(plan.heat, rel=0.05)
+
+
 def test_both_treatments_of_contacts_see_the_same_run_of_a_plan(searched) -> None:  # type: ignore[no-untyped-def]
     """Steps of one length, which verify plans, and events that are located: heat to 1e-4, hand to a micrometre."""
     search, planned = searched

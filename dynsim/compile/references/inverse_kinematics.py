@@ -182,7 +182,8 @@ def _passed_limits(model: Model, joints: Sequence[str], times: Array, positions:
 
 
 # Smoothing speed v_s of planned friction [m/s], μ s/√(s² + v_s²); a jump in friction would make the voltages oscillate.
-SLIP_SCALE = 5e-3
+# With a larger value, braces that creep would have less friction in the plan than in the run.
+SLIP_SCALE = 1e-3
 # Slip speed s below which the plan contains no friction [m/s].
 SLIP_MIN = 1e-9
 # Maximum distance of a brace from its surface, above or below, along the references [m]; a larger distance is an error.
@@ -254,12 +255,11 @@ def pressing(
     v: Array,
     braces: Mapping[str, PressingBrace],
     min_N: float = MIN_N,
-    slip_scale: float = SLIP_SCALE,
 ) -> tuple[BracePlanner, Array, Array | None]:
     """Return the planner for braces that press along references, their kernel tables and their shares.
 
     The tables have shape (T, c, BRACE_SIZE), the shares (T, c); None if all braces press during the whole run.
-    Friction opposes the slip that the references prescribe: μ f_n v/√(v² + v_s²), with v_s = ``slip_scale`` [m/s].
+    Friction opposes the slip that the references prescribe: μ f_n v/√(v² + v_s²), with v_s = 1 mm/s.
     """
     attached = []
     for name, brace in braces.items():
@@ -293,7 +293,7 @@ def pressing(
         speed = np.linalg.norm(slip, axis=1)
         slip[speed <= SLIP_MIN] = 0.0
         # Plan no friction for a point that does not slide, because its friction depends on its history.
-        friction = np.where(speed > SLIP_MIN, contact.friction * speed / np.hypot(speed, slip_scale), 0.0)
+        friction = np.where(speed > SLIP_MIN, contact.friction * speed / np.hypot(speed, SLIP_SCALE), 0.0)
         commanded = np.nan if brace.force is None else brace.force
         tables[:, k] = brace_rows(touching, normals, friction, min_N, commanded, slip)
     return planner, tables, shares if any(brace.during is not None for brace in braces.values()) else None
