@@ -116,11 +116,11 @@ def references(task: Task, braces: BraceSet | BraceSchedule, knots: Array, Q: Ar
         single.course.target[0] = target
         row = q[k : k + 1]
         if idle[k].any():
-            # Braces rise and land without a jump of their velocity.
-            rise = np.minimum(idle[k] / near, 1.0)
+            # Braces rise and land without jumps of their position and velocity.
+            rise, clearance = np.minimum(idle[k] / near, 1.0), task.options.clearance_m
             single.evaluate(row, np.zeros((1, len(rise))))
-            single.course.apart[0] = rise**2 * (3.0 - 2.0 * rise) * np.maximum(single.work.gap[0, : len(rise)], 0.0)
-            single.course.apart[0, rise == 1.0] = task.options.clearance_m
+            single.course.apart[0] = rise**2 * (3.0 - 2.0 * rise) * np.maximum(single.work.gap[0, : len(rise)], clearance)
+            single.course.apart[0, rise == 1.0] = clearance
         single.course.guided[0] = idle[k] < near
         if (left := single.retract(row, 20, 0.1 * ON)) > ON:
             return (

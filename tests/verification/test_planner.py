@@ -648,6 +648,16 @@ def test_heat_at_more_instants_of_a_hand_over_equals_the_plan(changing) -> None:
 
 
 @pytest.mark.long
+def test_lifted_braces_reach_their_clearance_without_a_jump(changing) -> None:  # type: ignore[no-untyped-def]
+    """Between the knots, a brace rises to 3 cm, of which the knots know nothing; joints moved by 0.16 rad at once."""
+    search, plan = changing[0], changing[1][2][0]
+    higher = replace(search.task, options=replace(search.task.options, clearance_m=0.03))
+    dense = references(higher, plan.dense.schedule, plan.times, plan.local.Q, 8)
+    assert not isinstance(dense, str), dense
+    assert np.abs(np.diff(dense.q, axis=0)).max() < 0.03
+
+
+@pytest.mark.long
 def test_plans_with_hand_overs_run_as_planned_and_tolerate_errors(changing) -> None:  # type: ignore[no-untyped-def]
     """Bounds of the issue: 10 % of the plan, and all corners."""
     search, plan = changing[0], changing[1][2][0]
