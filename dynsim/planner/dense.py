@@ -119,7 +119,8 @@ def references(task: Task, braces: BraceSet | BraceSchedule, knots: Array, Q: Ar
             # Braces rise and land without jumps of their position and velocity.
             rise, clearance = np.minimum(idle[k] / near, 1.0), task.options.clearance_m
             single.evaluate(row, np.zeros((1, len(rise))))
-            single.course.apart[0] = rise**2 * (3.0 - 2.0 * rise) * np.maximum(single.work.gap[0, : len(rise)], clearance)
+            top = np.maximum(single.work.gap[0, : len(rise)], clearance)
+            single.course.apart[0] = rise**2 * (3.0 - 2.0 * rise) * top
             single.course.apart[0, rise == 1.0] = clearance
         single.course.guided[0] = idle[k] < near
         if (left := single.retract(row, 20, 0.1 * ON)) > ON:
