@@ -671,6 +671,20 @@ def planned_gains() -> str:
     return lines(heads, rows)
 
 
+def planned_phases() -> str:
+    """Return the heat of fixed braces, of braces that change, and of their runs."""
+    rows = []
+    for row in data("planner/phases.json"):
+        chosen = "→" in row["chosen"]
+        runs = (number(row["simulated_W"]), number(row["worst_W"])) if chosen else (NONE, NONE)
+        verdict = NONE if not chosen else "yes" if row["survives"] else "no"
+        change = number(row["changing_W"]) + ("" if chosen else " (not chosen)")
+        seeds = f"{number(min(row['seeds_W']))} … {number(max(row['seeds_W']))}"
+        rows.append((row["path"], number(row["fixed_W"]), change, seeds, *runs, verdict))
+    heads = ("path of the hand", "fixed braces", "changing braces", "five seeds", "run", "worst run", "survives")
+    return lines(heads, rows)
+
+
 def planned_scenes() -> str:
     """Return the answer of each scene of the planner."""
     rows = []
@@ -979,7 +993,7 @@ TABLES: dict[str, Callable[[], str]] = {
         elbows, glued_and_real, overturning_holds, overturning_drives, assumptions, ledger,
         snake_table_iii, snake_table_iv, snake_table_v, time_stepping, endings, right_hand_side, ratios, job, precision,
         sweeps, snake_bench, touching_bodies, falling_dominoes,
-        scenario_keys, combinations, comparison, faults, planned_arm, planned_gains, planned_scenes,
+        scenario_keys, combinations, comparison, faults, planned_arm, planned_gains, planned_phases, planned_scenes,
         brace_pads, snake_positioning, snake_limits,
         snake_ways, snake_circles, snake_order, snake_areas, snake_on_servos, snake_tasks, modules,
     )

@@ -68,11 +68,11 @@ RowsOption = Annotated[
 FiguresOption = Annotated[bool, typer.Option("--no-figures", help="Skip the figures and view.html.")]
 
 
-def parsed_overrides(texts: list[str] | None) -> dict[str, Any]:
-    """Return the values passed with ``--set``, by key."""
-    from dynsim.scenario import SetOptions, parse_override
+def parsed_overrides(texts: list[str] | None, name: str = "--set", inside: str = "") -> dict[str, Any]:
+    """Return the values passed with an option, by key; keys are inside a section."""
+    from dynsim.scenario import parse_override
 
-    return SetOptions(parse_override(text) for text in texts or ())
+    return dict(parse_override(text, name, inside) for text in texts or ())
 
 
 def folder_option(default: str) -> Any:

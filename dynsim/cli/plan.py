@@ -121,8 +121,8 @@ def plan(
     from dynsim.scenario import load_scenario, read_scenario
 
     look = Look.of(size, font, style, title=not no_title, caption=not no_caption)
-    overrides = [*(overrides or ()), *(f"requirements.{text}" for text in require or ())]
-    loaded = load_scenario(scenario, variant, parsed_overrides(overrides))
+    values = parsed_overrides(overrides) | parsed_overrides(require, "--require", "requirements.")
+    loaded = load_scenario(scenario, variant, values)
     folder = out or Path("results", loaded.name, loaded.variant, "plan")
     least, most = _numbers("count", count, "0:3")
     fewest, largest = _numbers("phases", phases, "1:2")
@@ -136,7 +136,7 @@ def plan(
     from dynsim.planner.files import check_plan_folder, save_plan
     from dynsim.planner.problem import Options
     from dynsim.planner.vary import vary_plans
-    from dynsim.planner.verify import Tolerances
+    from dynsim.planner.verify import Tolerances, Verification
     from dynsim.studies.processes import cores
     from dynsim.studies.sweep_plan import Axis, Plan
 
@@ -150,26 +150,27 @@ def plan(
         tuple(names), tuple(along or ()), radius, (least, most), tuple(surface or ()), peak, clearance, min_force,
         starts, seed, budget, exhaustive, (fewest, largest),
     )  # fmt: skip
-    runs = Plan(read_scenario(scenario), (variant,), parsed_overrides(overrides), axes) if axes else None
+    verification = Verification(tolerances, verify, explain, jobs or cores())
+    runs = Plan(read_scenario(scenario), (variant,), values, axes) if axes else None
     variation = None
     with plan_progress(quiet) as tell:
         if runs is None:
-            result = plan_with(loaded, options, tolerances, verify, explain, jobs or cores(), tell)
+            result = plan_with(loaded, options, verification, tell)
         else:
-            variation = vary_plans(runs, options, tolerances, verify, explain, jobs or cores(), tell)
+            variation = vary_plans(runs, options, verification, tell)
             result = variation.chosen[1]
         tell("writing", 0.98)
         save_plan(result, folder, not no_figures, format_.value, look, variation)
     if not quiet:
         if variation is not None:
             print_variation(variation)
-        print_plan(result)
+        print_plan(result, variation)
         print_written(folder)
         if result.best is not None:
             print_line(f"Run the best plan: dynsim run {escaped(folder / 'plan.yaml')}")
     if result.best is None:
         raise UnreachableReference(f"no plan: {escaped(result.sizes[0].reason)}")
-    if result.tally.ended == "interrupted":
+    if result.tally.ended == "interrupted" or (variation is not None and variation.interrupted):
         raise typer.Exit(SimulationInterrupted.exit_code)
 
 
@@ -219,9 +220,10 @@ MORE, HAND_ERROR = 1.05, 5e-3
 _SURVIVES = {True: "yes", False: "no", None: "not verified"}
 
 
-def print_plan(plan: BracePlan) -> None:
+def print_plan(plan: BracePlan, variation: Variation | None = None) -> None:
     """Print a table row for each number of braces, then the reasons why plans were rejected or not found.
 
+    A line states that an interrupt or the budget ended the searches, of all values if there are several.
     Reasons that do not fit on the screen are only in ``plan.json``.
     """
     from dynsim.record.quantities import summary_quantity
@@ -234,17 +236,13 @@ def print_plan(plan: BracePlan) -> None:
         *required, "survives",
     )  # fmt: skip
     for head in heads:
-        table.add_column(head, justify="left" if head in ("on", "survives") else "right")
+        table.add_column(escaped(head), justify="left" if head in ("on", "survives") else "right")
     for size in plan.sizes:
         fewer = plan.no_gain(size)
         table.add_row(*_cells(size, None if fewer is None else fewer.count, len(required)))
     console.print(table, width=min(width, console.width))
-    if plan.tally.ended != "agreed":
-        ends = {
-            "budget": "the time budget ended before two searches agreed for each number of braces; increase --budget",
-            "interrupted": "interrupted: the best plans so far, without verification",
-        }
-        print_line(ends[plan.tally.ended])
+    if text := _ended(plan, variation):
+        print_line(text)
     best = plan.best
     if best is not None:
         label = escaped(best.label) if best.braces else "no braces"
@@ -266,6 +264,21 @@ def print_plan(plan: BracePlan) -> None:
         print_line(
             f"no posture found for {missed} of {missed + reached} sets tried; this does not prove that none exists"
         )
+
+
+def _ended(plan: BracePlan, variation: Variation | None) -> str:
+    """Return a sentence if an interrupt or the budget ended the searches; otherwise an empty text."""
+    ended, at = plan.tally.ended, ""
+    if variation is not None:
+        many, late = len(variation.points), variation.ended("budget")
+        if variation.interrupted:
+            best = [plan.best for plan in variation.plans if not isinstance(plan, str)]
+            verified = sum(each is not None and each.nominal is not None for each in best)
+            return f"interrupted: the best plans so far; {verified} of {many} values are verified"
+        ended, at = "budget" if late else "agreed", f", for {late} of {many} values"
+    if ended == "budget":
+        return f"the time budget ended before two searches agreed for each number of braces{at}; increase --budget"
+    return "interrupted: the best plans so far, without verification" if ended == "interrupted" else ""
 
 
 def print_variation(variation: Variation) -> None:

@@ -43,6 +43,17 @@ def errors_at(*keys: int | str) -> Iterator[None]:
         raise ModelError(f"{dotted(keys)}: {error}", keys=keys) from error
 
 
+class OptionKey(str):
+    """Dotted key that an option of a command overrides; errors refer to it with this option."""
+
+    def __new__(cls, key: str, option: str = "--set") -> OptionKey:
+        self = super().__new__(cls, key)
+        self.option = option
+        return self
+
+    option: str
+
+
 @dataclass(frozen=True)
 class Origin:
     """Origin of the values of a scenario or servo map, from which messages determine the line of a key.
@@ -55,19 +66,20 @@ class Origin:
         Mappings that were read from the file and merged: first the changes of the variant, then the rest of the file.
     overrides : tuple of str
         Dotted keys that were overridden.
-    overriding : str
-        How these keys were overridden, for example the name of a command-line option.
     """
 
     file: Path | str
     mappings: tuple[Any, ...] = ()
     overrides: tuple[str, ...] = ()
-    overriding: str = "overrides"
 
-    def sets(self, keys: Sequence[int | str]) -> bool:
-        """Return True if an override set the value at ``keys``, a value inside it, or a mapping that contains it."""
+    def overriding(self, keys: Sequence[int | str]) -> str:
+        """Return how the value at ``keys``, a value inside it, or a mapping that contains it was overridden, or "".
+
+        How: the name of a command-line option, or "overrides".
+        """
         own = ".".join(map(str, keys))
-        return any(own == key or own.startswith(key + ".") or key.startswith(own + ".") for key in self.overrides)
+        matching = (k for k in self.overrides if own == k or own.startswith(k + ".") or k.startswith(own + "."))
+        return next(map(overriding, matching), "")
 
     def line(self, keys: Sequence[int | str]) -> int:
         """Return the line of the deepest of the nested ``keys`` found in the file; 0 if not even the first is found."""
@@ -77,9 +89,14 @@ class Origin:
 
     def location(self, keys: Sequence[int | str]) -> str:
         """Return ``file:line`` of a key; if the key was overridden, return how, see :attr:`overriding`."""
-        if self.sets(keys):
-            return self.overriding
+        if how := self.overriding(keys):
+            return how
         return f"{self.file}:{line}" if (line := self.line(keys)) else str(self.file)
+
+
+def overriding(key: str) -> str:
+    """Return how a key is overridden: the name of a command-line option, or "overrides"."""
+    return key.option if isinstance(key, OptionKey) else "overrides"
 
 
 def unknown_keys(

@@ -18,7 +18,7 @@ from dynsim.planner.dense import Dense, nearest
 from dynsim.planner.problem import BraceSchedule, Candidate, Options, Task, task, without_objects
 from dynsim.planner.requirements import check, check_ratings, with_requirements
 from dynsim.planner.search import SEGMENTS, Planned, Search, Tally
-from dynsim.planner.verify import Corner, Requirement, Tolerances, Verdict, Verifier
+from dynsim.planner.verify import Corner, Requirement, Tolerances, Verdict, Verification, Verifier
 from dynsim.record import Record
 from dynsim.scenario import Scenario, require_scenario
 from dynsim.scenario.reading import largest_magnitude
@@ -371,7 +371,7 @@ def _row(task: Task, size: Size) -> dict[str, Any]:
         "reason": size.reason,
     }
     for r in size.requirements:
-        row |= {r.key: _number(r.value), f"{r.key}_margin": _number(r.margin), f"{r.key}_met": not r.reason}
+        row |= {r.key: _number(r.value), f"{r.key}_margin": _number(r.margin), f"{r.key}_met": r.met}
     if size.tolerance is not None:
         row |= {"holds_surface_m": size.tolerance[0], "holds_friction": size.tolerance[1]}
     return row
@@ -526,26 +526,22 @@ def plan_braces(
         tuple(candidates), tuple(along), radius_m, count, tuple(surfaces), peak_W_per_N_m, clearance_m, min_N, starts,
         seed, budget_s, exhaustive, phases,
     )  # fmt: skip
-    return plan_with(scenario, options, tolerances or Tolerances(), verify, explain, jobs, tell)
+    return plan_with(scenario, options, Verification(tolerances or Tolerances(), verify, explain, jobs), tell)
 
 
-def plan_with(
-    scenario: Scenario,
-    options: Options,
-    tolerances: Tolerances,
-    verify: bool = True,
-    explain: bool = False,
-    jobs: int = 1,
-    tell: Tell | None = None,
-) -> BracePlan:
+def plan_with(scenario: Scenario, options: Options, verification: Verification, tell: Tell | None = None) -> BracePlan:
     """Return :func:`plan_braces` with the arguments as options."""
-    check_arguments(options, tolerances, jobs)
-    tell = tell or (lambda text, share: None)
+    check_arguments(options, verification)
+    tell = tell or silent
     with named(scenario):
-        return answered(searched(scenario, options, tell), tolerances, verify, explain, jobs, tell)
+        return answered(searched(scenario, options, tell), verification, tell)
 
 
-def check_arguments(options: Options, tolerances: Tolerances, jobs: int) -> None:
+def silent(text: str, share: float) -> None:
+    """Ignore the progress."""
+
+
+def check_arguments(options: Options, verification: Verification) -> None:
     """Raise ScenarioError if an option of the planner is out of range."""
     least, most = options.count
     if not 0 <= least <= most:
@@ -553,12 +549,14 @@ def check_arguments(options: Options, tolerances: Tolerances, jobs: int) -> None
     fewest, largest = options.phases
     if not 1 <= fewest <= largest <= SEGMENTS:
         raise ScenarioError(f"phases = {fewest}:{largest}: must be 1 to {SEGMENTS}, with minimum ≤ maximum")
-    for key, number, smallest in (("starts", options.starts, 1), ("seed", options.seed, 0), ("jobs", jobs, 1)):
+    whole = ("starts", options.starts, 1), ("seed", options.seed, 0), ("jobs", verification.jobs, 1)
+    for key, number, smallest in whole:
         if number < smallest:
             raise ScenarioError(f"{key} = {number}: must be at least {smallest}")
     positive = {
         "radius_m": options.radius_m, "peak_W_per_N_m": options.peak, "clearance_m": options.clearance_m,
-        "min_N": options.min_N, "budget_s": options.budget_s, "shift_m": tolerances.most_shift,
+        "min_N": options.min_N, "budget_s": options.budget_s,
+        "shift_m": verification.tolerances.most_shift,
     }  # fmt: skip
     for key, value in positive.items():
         limit = largest_magnitude(key)
@@ -620,16 +618,18 @@ def searched(scenario: Scenario, options: Options, tell: Tell) -> Searched:
     return Searched(search, search.run())
 
 
-def answered(known: Searched, tolerances: Tolerances, verify: bool, explain: bool, jobs: int, tell: Tell) -> BracePlan:
+def answered(known: Searched, verification: Verification, tell: Tell) -> BracePlan:
     """Choose the plan of each number of braces, see :func:`plan_braces`."""
     search, ranked = known.search, known.ranked
     problem, (least, most) = search.task, search.task.options.count
-    tolerances = with_requirements(tolerances, problem.scenario.config.requirements)
+    required = problem.scenario.config.requirements
+    tolerances = with_requirements(verification.tolerances, required)
     sizes = [_answered(search, size, ranked[size]) for size in range(least, most + 1)]
-    verify = verify and search.tally.ended != "interrupted"
-    if verify or problem.scenario.config.requirements is not None:
+    verify = verification.verify and search.tally.ended != "interrupted"
+    if verify or required is not None:
         try:
-            sizes = _verified(problem, search, sizes, ranked, tolerances, jobs if verify else 0, explain, tell)
+            how = replace(verification, tolerances=tolerances, verify=verify)
+            sizes = _verified(search, sizes, ranked, how, tell)
         except (KeyboardInterrupt, SimulationInterrupted):
             # The plans are kept without their runs.
             interruption.answered()
@@ -648,17 +648,24 @@ def _ranked(size: Size, planned: Sequence[Planned]) -> list[tuple[str, float]]:
 
 def _answered(search: Search, count: int, ranked: Sequence[Planned]) -> Size:
     """Return the best plan for a number of braces before verification, or the reason why there is no plan."""
-    tally = search.tally
-    agreed, searches = tally.agreed(count), len(tally.heats.get(count, []))
     if ranked:
-        agreed = 0 if ranked[0].dense.schedule.borders else agreed
-        return Size(count, ranked[0], None, agreed, searches, bound=search.bounds.get(count, math.nan))
-    return Size(count, None, reason=_failure(search, count), searches=searches)
+        size = Size(count, ranked[0], bound=search.bounds.get(count, math.nan))
+        return _counted(search.tally, size)
+    return Size(count, None, reason=_failure(search, count), searches=len(search.tally.heats.get(count, [])))
+
+
+def _counted(tally: Tally, size: Size) -> Size:
+    """Return the plan with the numbers of searches that agree and of all searches; a single search changes braces."""
+    if size.dense.schedule.borders:
+        return replace(size, agreed=1, searches=1)
+    return replace(size, agreed=tally.agreed(size.count), searches=len(tally.heats.get(size.count, [])))
 
 
 def _failure(search: Search, count: int) -> str:
     """Return the reason why no plan was found for a number of braces."""
     tally, options = search.tally, search.task.options
+    if tally.ended == "interrupted":
+        return "interrupted before a plan was found"
     if not tally.drawn_on:
         if within := search.never_clear():
             return f"none of {tally.drawn} random postures could be projected onto the hand path: {within[0]}"
@@ -685,25 +692,19 @@ def _failure(search: Search, count: int) -> str:
 
 
 def _verified(
-    problem: Task,
-    search: Search,
-    sizes: Sequence[Size],
-    ranked: dict[int, list[Planned]],
-    tolerances: Tolerances,
-    jobs: int,
-    explain: bool,
-    tell: Tell,
+    search: Search, sizes: Sequence[Size], ranked: dict[int, list[Planned]], how: Verification, tell: Tell
 ) -> list[Size]:
     """Choose the set whose run needs the least heat for each number of braces, among the sets that survive.
 
     If a set is rejected because a link touches, it is planned again with the clearance that the errors require.
-    Without ``jobs``, only the requirements of the scenario are checked that need no simulation.
+    If plans are not verified, only the requirements of the scenario are checked that need no simulation.
     """
-    require = partial(check, problem, tolerances.heat)
-    verifier = Verifier(problem, tolerances, jobs, require)
+    tolerances, verify = how.tolerances, how.verify
+    require = partial(check, search.task, tolerances)
+    verifier = Verifier(search.task, tolerances, how.jobs, require)
     open_ = {size.count: list(ranked[size.count]) for size in sizes if size.planned is not None}
     tell("verifying", 0.0)
-    rival = RIVAL if jobs else 0.0
+    rival = RIVAL if verify else 0.0
     rivals = [
         (count, search.finest(plan))
         for count, plans in open_.items()
@@ -722,8 +723,8 @@ def _verified(
         tell("verifying", min((turn + 1) / 4.0, 0.95))
         turn += 1
         batch = [(count, search.finest(waiting.pop(0))) for count, waiting in open_.items()]
-        made = [(planned.braces, planned.dense) for _, planned in batch]
-        judged = verifier.verify(made) if jobs else [Verdict(K_P, (), require(*each, K_P, ())) for each in made]
+        pairs = [(planned.braces, planned.dense) for _, planned in batch]
+        judged = verifier.verify(pairs) if verify else [Verdict(K_P, (), require(*each, K_P, ())) for each in pairs]
         for (count, planned), verdict in zip(batch, judged, strict=True):
             verdicts[count].append((planned, verdict))
             if verdict.kind == "touch":
@@ -741,10 +742,9 @@ def _verified(
         planned, verdict = tried[chosen]
         cheaper = tuple((p.label, v.reason) for p, v in tried[:chosen] if p.dense.schedule != planned.dense.schedule)
         tolerance = None
-        if explain and verdict.reason and verdict.sound:
+        if how.explain and verdict.reason and verdict.sound:
             tell("bisecting", 0.95)
             tolerance = verifier.tolerance(planned.braces, planned.dense, verdict.k_p)
-        answered.append(
-            replace(size, planned=planned, verdict=verdict, reason=verdict.reason, tolerance=tolerance, cheaper=cheaper)
-        )
+        made = replace(size, planned=planned, verdict=verdict, reason=verdict.reason, tolerance=tolerance)
+        answered.append(_counted(search.tally, replace(made, cheaper=cheaper)))
     return answered

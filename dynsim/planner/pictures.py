@@ -142,7 +142,7 @@ def _corner(corner: Corner, nominal: float, tolerances: Tolerances) -> CornerRun
     """Return a run with the limits that it must meet, relative to the heat of the nominal run; NaN: no limit."""
     label = corner.label.replace("-", "−")
     most = np.nan if label == "as planned" else tolerances.heat
-    allowed = np.nan if tolerances.hand_m is None else 1e3 * (abs(corner.surface_shift_m) + tolerances.hand_m)
+    allowed = np.nan if tolerances.hand_m is None else 1e3 * tolerances.hand_limit(corner)
     return CornerRun(label, corner.heat_W / nominal, most, 1e3 * corner.hand_rms_m, allowed, corner.reason)
 
 

@@ -228,10 +228,9 @@ class Search:
                 number += 1
                 self._merge(searched, paths)
                 searched = {}
-                if number >= TWICE and tally.solves >= EFFORT and all(self._agreed(size) for size in sizes):
-                    break
-                if self._late:
-                    tally.ended = "budget"
+                agree = number >= TWICE and all(self._agreed(size) for size in sizes)
+                if self._late or (agree and tally.solves >= EFFORT):
+                    tally.ended = "agreed" if agree else "budget"
                     break
         except KeyboardInterrupt:
             if searched:
@@ -241,14 +240,26 @@ class Search:
             interruption.answered()
             tally.ended = "interrupted"
         planned: dict[int, list[Planned]] = {}
-        for size in range(least, most + 1):
-            self._tell("refining", 0.8 + 0.2 * size / (most + 1))
-            chosen: dict[BraceSet | BraceSchedule, list[PosturePath]] = {
-                braces: some for braces, some in paths.items() if len(braces) == size
-            }
-            planned[size] = [] if self.task.options.phases[0] > 1 else self._refined(chosen)
-            if tally.ended != "interrupted" and (changing := self._changing(paths, size)):
-                planned[size] = sorted(planned[size] + self._refined(changing), key=_heat)
+        for size in sizes:
+            try:
+                planned[size] = self._planned(paths, size)
+            except KeyboardInterrupt:
+                if tally.ended == "interrupted":
+                    raise
+                interruption.answered()
+                tally.ended = "interrupted"
+                planned[size] = self._planned(paths, size)
+        return planned
+
+    def _planned(self, paths: Mapping[BraceSet, list[PosturePath]], size: int) -> list[Planned]:
+        """Refine the paths with a number of braces; after an interrupt, braces that change are not searched."""
+        self._tell("refining", 0.8 + 0.2 * size / (self.task.options.count[1] + 1))
+        chosen: dict[BraceSet | BraceSchedule, list[PosturePath]] = {
+            braces: some for braces, some in paths.items() if len(braces) == size
+        }
+        planned = [] if self.task.options.phases[0] > 1 else self._refined(chosen)
+        if self.tally.ended != "interrupted" and (changing := self._changing(paths, size)):
+            planned = sorted(planned + self._refined(changing), key=_heat)
         return planned
 
     def _merge(self, searched: Mapping[BraceSet, list[PosturePath]], paths: dict[BraceSet, list[PosturePath]]) -> None:
@@ -596,19 +607,32 @@ class Search:
                         walks += self._walks(schedule, starts)
         walks.sort(key=lambda walk: walk[0])
         done = dict[BraceSchedule, PosturePath]()
+        try:
+            self._optimise(walks, done, edges[-1])
+        except KeyboardInterrupt:
+            interruption.answered()
+            self.tally.ended = "interrupted"
+        reached = {schedule: path.local for schedule, path in done.items() if path.local is not None}
+        heats = [*profiles.values(), *(self._profile(schedule, local) for schedule, local in reached.items())]
+        self.bounds[size] = float(np.mean(np.min(heats, axis=0))) if heats else math.nan
+        return {schedule: [PosturePath(local.cost, local)] for schedule, local in reached.items()}
+
+    def _optimise(
+        self,
+        walks: Sequence[tuple[float, BraceSchedule, Array]],
+        done: dict[BraceSchedule, PosturePath],
+        intervals: int,
+    ) -> None:
+        """Optimise the first schedules, then move the borders of the best; add all to ``done``."""
         for _, schedule, Q in walks[:OPTIMISED]:
             self._keep(done, schedule, Q)
         improved = True
         while improved:
             improved = False
             for schedule, path in sorted(done.items(), key=lambda item: item[1].coarse)[:KEPT]:
-                for moved in self._moved(schedule, edges[-1]):
+                for moved in self._moved(schedule, intervals):
                     if moved not in done and path.local is not None:
                         improved |= self._keep(done, moved, path.local.Q, path.coarse)
-        reached = {schedule: path.local for schedule, path in done.items() if path.local is not None}
-        heats = [*profiles.values(), *(self._profile(schedule, local) for schedule, local in reached.items())]
-        self.bounds[size] = float(np.mean(np.min(heats, axis=0))) if heats else math.nan
-        return {schedule: [PosturePath(local.cost, local)] for schedule, local in reached.items()}
 
     def _changes(self, schedule: BraceSchedule) -> bool:
         """Return whether neighbouring phases have different sets and all phases have time for two hand-overs."""

@@ -105,6 +105,10 @@ class Tolerances:
             cases += [Case(**{key: 1.0 + signed}) for signed in (error, -error) if error > 0.0]
         return cases
 
+    def hand_limit(self, case: Case) -> float:
+        """Return the maximum rms error of the hand in a run [m]; infinite without a limit."""
+        return float("inf") if self.hand_m is None else abs(case.surface_shift_m) + self.hand_m
+
     @property
     def most_shift(self) -> float:
         """Maximum error of the surface height [m]."""
@@ -114,6 +118,28 @@ class Tolerances:
     def most_friction(self) -> float:
         """Maximum relative error of friction."""
         return max((abs(factor - 1.0) for factor in self.friction), default=0.0)
+
+
+@dataclass(frozen=True)
+class Verification:
+    """Which plans are verified, and how.
+
+    Attributes
+    ----------
+    tolerances : Tolerances
+        Errors and limits.
+    verify : bool
+        Whether corner cases are simulated. Requirements that need no run are always checked.
+    explain : bool
+        Whether the largest errors that rejected plans tolerate are determined.
+    jobs : int
+        Number of worker processes.
+    """
+
+    tolerances: Tolerances = field(default_factory=Tolerances)
+    verify: bool = True
+    explain: bool = False
+    jobs: int = 1
 
 
 @dataclass(frozen=True)
@@ -153,6 +179,11 @@ class Corner(Case):
     rated_joint: str = ""
     reason: str = ""
 
+    @property
+    def hand_error_m(self) -> float:
+        """Rms error of the hand, in addition to the displacement of the surfaces [m]."""
+        return self.hand_rms_m - abs(self.surface_shift_m)
+
 
 @dataclass(frozen=True)
 class Requirement:
@@ -167,13 +198,18 @@ class Requirement:
     limit : float
         Maximum value.
     reason : str
-        Reason why the requirement is not met; empty if it is met.
+        Reason why the requirement is not met; empty if it is met, or if the reasons of the runs contain it.
     """
 
     key: str
     value: float
     limit: float
     reason: str = ""
+
+    @property
+    def met(self) -> bool:
+        """Whether the requirement is met."""
+        return self.value <= self.limit
 
     @property
     def margin(self) -> float:
@@ -208,7 +244,7 @@ class Verdict:
     @property
     def hand_m(self) -> float:
         """Largest rms error of the hand, in addition to the displacement of the surface [m]; NaN without runs."""
-        errors = [c.hand_rms_m - abs(c.surface_shift_m) for c in self.corners if np.isfinite(c.hand_rms_m)]
+        errors = [c.hand_error_m for c in self.corners if np.isfinite(c.hand_rms_m)]
         return max(errors, default=np.nan)
 
     @property
@@ -238,6 +274,7 @@ class Verifier:
         self._require = require or (lambda *plan: ())
         # Runs by references, gain and errors; the references are kept, so that their identity is unique.
         self._known: dict[tuple[int, float, Case], tuple[Dense, Corner]] = {}
+        self._first: dict[int, tuple[Dense, int]] = {}
 
     def verify(self, plans: Sequence[tuple[tuple[Candidate, ...], Dense]]) -> list[Verdict]:
         """Return the verdict on each plan for the first gain with which it survives, or for the best gain tried.
@@ -277,8 +314,11 @@ class Verifier:
 
     def _first_gain(self, braces: tuple[Candidate, ...], dense: Dense) -> int:
         """Return the index of the largest gain that tolerates the errors according to statics, or of the last."""
-        gains = self.tolerances.gains
-        return next((k for k, k_p in enumerate(gains) if self._tolerates(braces, dense, k_p)), len(gains) - 1)
+        if id(dense) not in self._first:
+            gains = self.tolerances.gains
+            tolerated = (k for k, k_p in enumerate(gains) if self._tolerates(braces, dense, k_p))
+            self._first[id(dense)] = dense, next(tolerated, len(gains) - 1)
+        return self._first[id(dense)][1]
 
     def _runs(self, runs: Sequence[tuple[tuple[Candidate, ...], Dense, float, Case]]) -> list[Corner]:
         """Simulate corner cases of several plans in parallel, except for known ones."""
@@ -359,7 +399,7 @@ class Verifier:
         share, rated = max(_rated_shares(record), default=(0.0, ""))
         kind, reason = "", ""
         least = np.inf if nominal is None else nominal.heat_W
-        allowed = np.inf if tolerances.hand_m is None else abs(shift) + tolerances.hand_m
+        allowed = tolerances.hand_limit(case)
         if touching := self._touches(schedule, record, shift):
             kind, reason = "touch", touching
         elif heat > tolerances.heat * least:

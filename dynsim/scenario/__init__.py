@@ -3,7 +3,6 @@
 from dynsim.scenario.build import build_model as build_model
 from dynsim.scenario.build import require_scenario as require_scenario
 from dynsim.scenario.reading import ScenarioFile as ScenarioFile
-from dynsim.scenario.reading import SetOptions as SetOptions
 from dynsim.scenario.reading import find_scenario as find_scenario
 from dynsim.scenario.reading import json_schema as json_schema
 from dynsim.scenario.reading import load_scenario as load_scenario

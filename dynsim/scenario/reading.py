@@ -17,7 +17,18 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from dynsim.config.problems import INDEX, Origin, dotted, explain, key_text, suggest, unknown_keys, value_text
+from dynsim.config.problems import (
+    INDEX,
+    OptionKey,
+    Origin,
+    dotted,
+    explain,
+    key_text,
+    overriding,
+    suggest,
+    unknown_keys,
+    value_text,
+)
 from dynsim.errors import ScenarioError, brief
 from dynsim.scenario.schema import Scenario, ScenarioConfig
 from dynsim.system.arguments import names_wrong_types
@@ -216,11 +227,10 @@ class ScenarioFile:
         if not isinstance(difference, Mapping):
             line = f":{variants.lines[variant]}" if isinstance(variants, YamlMapping) and variant is not None else ""
             raise ScenarioError(f"{self.path}{line}: variant {value_text(variant)} must be a mapping of differences")
-        overriding = "--set" if isinstance(overrides, SetOptions) else "overrides"
-        origin = Origin(self.path, (difference, shared), tuple(overrides), overriding)
+        origin = Origin(self.path, (difference, shared), tuple(overrides))
         merged = _plain(merged_with(shared, difference))
         for key, value in overrides.items():
-            _override(merged, key, _plain(value), overriding, variant)
+            _override(merged, key, _plain(value), variant)
         if merged.get("name") in (None, ""):
             merged["name"] = self.path.stem
         if variant is not None:
@@ -260,12 +270,10 @@ def scenario_from_resolved(resolved: Mapping[str, Any]) -> Scenario:
     return Scenario(config.name, config.variant, config)
 
 
-class SetOptions(dict[str, Any]):
-    """Overrides from ``--set`` on the command line; errors refer to them as ``--set``."""
+def parse_override(text: str, option: str = "--set", inside: str = "") -> tuple[str, Any]:
+    """Split ``a.b.c=VALUE``, the value of a command-line option, into the key and the YAML value.
 
-
-def parse_override(text: str) -> tuple[str, Any]:
-    """Split ``a.b.c=VALUE`` into the key and the YAML value.
+    The key starts with ``inside``. Errors refer to it with the name of the option.
 
     Raises
     ------
@@ -275,8 +283,10 @@ def parse_override(text: str) -> tuple[str, Any]:
     key, separator, value = text.partition("=")
     key = key.strip()
     if not separator or not key:
-        raise ScenarioError(f"--set {key_text(text)}: must look like integrator.rtol=1e-8")
-    return key, _plain(parse_yaml(value, ScenarioError, f"--set {key_text(key)}", line_numbers=False))
+        example = "rating_share=1" if inside else "integrator.rtol=1e-8"
+        raise ScenarioError(f"{option} {key_text(text)}: must look like {example}")
+    number = _plain(parse_yaml(value, ScenarioError, f"{option} {key_text(key)}", line_numbers=False))
+    return OptionKey(f"{inside}{key}", option), number
 
 
 def _read(path: Path) -> YamlMapping:
@@ -318,10 +328,10 @@ def merged_with(base: Any, difference: Any) -> Any:
     return merged
 
 
-def _override(data: Any, key: str, value: Any, overriding: str, variant: str | None) -> None:
+def _override(data: Any, key: str, value: Any, variant: str | None) -> None:
     """Set the dotted ``key`` in nested mappings and lists."""
     node, parts = data, str(key).split(".")
-    location = f"{overriding} {key_text(key)}"
+    location = f"{overriding(key)} {key_text(key)}"
     if "" in parts:
         raise ScenarioError(f"{location}: part of the key is empty; write it like integrator.rtol")
     if len(parts) > DEPTH_LIMIT:

@@ -1173,6 +1173,6 @@ class Scenario:
         """
         line, overridden = 0, ""
         if keys and self.origin is not None:
-            overridden = f": {self.origin.overriding}" if self.origin.sets(keys) else ""
+            overridden = f": {how}" if (how := self.origin.overriding(keys)) else ""
             line = 0 if overridden else self.origin.line(keys)
         return f"{self.source or self.name}{f':{line}' if line else ''}{variant}{overridden}"

@@ -14,8 +14,9 @@ from typing import Any
 
 import numpy as np
 
+from dynsim.config.problems import OptionKey
 from dynsim.errors import ScenarioError
-from dynsim.scenario import Scenario, ScenarioFile, SetOptions
+from dynsim.scenario import Scenario, ScenarioFile
 from dynsim.system.inputs import parse_yaml
 
 # Maximum number of runs; a larger number is rejected as a mistake.
@@ -171,17 +172,18 @@ class Plan:
         A key may vary a part of an earlier key: for example, ``plant.link`` is in a grid, and one of its numbers is
         sampled.
         """
-        # Overrides from Python may be varied, because they only define the base of the sweep; a value from --set must
-        # not change.
-        overrides = self.overrides if isinstance(self.overrides, SetOptions) else {}
-        options = [("--set", key, [key]) for key in overrides]
+        # Overrides from Python may be varied, because they only define the base of the sweep; a value from an option
+        # must not change.
+        options: list[tuple[str, str, list[str]]] = [
+            (key.option, key, [key]) for key in self.overrides if isinstance(key, OptionKey)
+        ]
         options += [(axis.option, axis.key, self._entries(axis.key)) for axis in self.grid]
         options += [("--sample", law.key, self._entries(law.key)) for law in self.laws]
         # Option that set each key; there is also an entry for every key that contains it.
         inside: dict[str, str] = {}
         for option, key, entries in options:
             # Later overrides replace earlier ones, as in every command.
-            for entry in entries if option != "--set" else []:
+            for entry in [] if isinstance(key, OptionKey) else entries:
                 if (key_path := _plain(entry)) in inside:
                     other = inside[key_path]
                     fix = f", or replace {ANY} by the entries that are set only once" if ANY in key + other else ""

@@ -63,6 +63,8 @@ def test_plans_for_several_values_leave_a_table_a_figure_and_the_best_plan(small
     result = CliRunner().invoke(app, [*command, *require, *vary, "--out", str(out)])
     assert result.exit_code == 0, result.output
     assert mentions(" ".join(result.output.split()), "surfaces.floor.point_m.2", "hand sag")
+    # Both tables have the unit: that of the values, and that of the best plan.
+    assert result.output.count("[mm]") == 2
     table = json.loads((out / "vary_table.json").read_text(encoding="utf-8"))
     values = [(row["surfaces.floor.point_m.2"], row["contacts.friction"]) for row in table]
     assert values == [(-0.02, 0.1), (-0.02, 0.2), (0.0, 0.1), (0.0, 0.2)]

@@ -118,7 +118,7 @@ NAMES: dict[str, Any] = {
     "replayed": replayed,
     "resumed": resumed,
     "scenario": scenario,
-    "set_options": lambda text: scenario.SetOptions([scenario.parse_override(text)]),
+    "set_options": lambda text: dict([scenario.parse_override(text)]),
     "written": written,
 }
 # Functions that make the objects of these names, because inputs change them.

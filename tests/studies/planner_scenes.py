@@ -4,11 +4,13 @@
     PYTHONPATH=tests python -m studies.planner_scenes --study reference --effort 100 --out results/planner
     PYTHONPATH=tests python -m studies.planner_scenes --study gains --out results/planner
     PYTHONPATH=tests python -m studies.planner_scenes --study posture --out results/planner
+    PYTHONPATH=tests python -m studies.planner_scenes --study phases --out results/planner
 
 The first command plans each scene. The second searches each scene with ``--effort`` times the usual rounds, for the
 best known answer; rows of other scenes in its file are kept. The third runs the best plans, and those of the published
 arm, on surfaces displaced by 5 mm, with stiff to soft gains. The fourth computes the least heat of the published arm at
-the postures of its scenario, which no plan has chosen, over all forces at its elbows of at least 0.5 N.
+the postures of its scenario, which no plan has chosen, over all forces at its elbows of at least 0.5 N. The fifth plans
+arms of nine joints with two fixed braces and with braces that change once, with several seeds.
 
 Arms of 7 to 10 joints whose hand moves back and forth along a short path, over a floor, a pipe, a box, or with a joint
 about a third axis. The seed of a scene is its number; the constants of the search were chosen on the first twenty.
@@ -42,6 +44,15 @@ from dynsim.system.files import write_json
 OTHER_SEED = 1000
 # Gains k_p of ``--study gains`` [V/rad].
 GAINS = (500.0, 200.0, 100.0, 50.0, 20.0)
+# Number of seeds of ``--study phases``, and paths of the hand from a point to another and back [m], with the surfaces
+# next to the floor: those of the scenario tall_path, or a table whose edge is at 1.1 m.
+SEEDS = 5
+TABLE = {"type": "box", "center_m": [0.7, 0.0, 0.15], "edges_m": [0.8, 2.0, 0.3], "edge_radius_m": 0.02}
+PATHS: dict[str, tuple[tuple[Any, Any] | None, dict[str, Any]]] = {
+    "rises from 0.16 to 1.1 m (`tall_path`)": (None, {}),
+    "1 m, from above a table to beyond its edge": (([0.8, 0.0, 0.6], [1.8, 0.0, 0.6]), {"table": TABLE}),
+    "0.8 to 1.8 m over a flat floor": (([0.8, 0.0, 0.35], [1.8, 0.0, 0.35]), {}),
+}
 KINDS = ("floor", "pipe", "box", "third_axis")
 PERIOD_S = 10.0
 LIMIT_DEG = [-120.0, 120.0]
@@ -284,11 +295,43 @@ def posture_heat(friction: float, instants: int = 200) -> dict[str, Any]:
     return {"friction": friction, "heat_W": _rounded(float(np.mean(heat)))}
 
 
+def changing(name: str, jobs: int) -> dict[str, Any]:
+    """Return the heat of two fixed braces, of two that change once, and of its runs, for one of ``PATHS``."""
+    ends, surfaces = PATHS[name]
+    overrides: dict[str, Any] = {f"surfaces.{key}": surface for key, surface in surfaces.items()}
+    if ends is not None:
+        points = [ends[0], ends[1], ends[0]]
+        overrides["controller.hand.path"] = {"type": "waypoints", "times_s": [0, 10, 20], "points_m": points}
+    scenario, heats = load_scenario("tall_path", overrides=overrides), list[Any]()
+    plans = [
+        plan_braces(scenario, count=(0, 2), phases=(1, 2), seed=seed, verify=seed == 0, jobs=jobs)
+        for seed in range(SEEDS)
+    ]
+    fixed = plan_braces(scenario, count=(0, 2), verify=False)
+    for plan in plans:
+        some = [heat for label, heat in plan.ranked[2] if "→" in label]
+        heats.append(_rounded(min(some, default=math.inf)))
+    size = plans[0].size(2)
+    corners = () if size.verdict is None else size.verdict.corners
+    row = {
+        "path": name,
+        "fixed_W": fixed.size(2).heat,
+        "changing_W": heats[0],
+        "seeds_W": heats,
+        "chosen": size.label,
+        "simulated_W": corners[0].heat_W if corners else math.nan,
+        "worst_W": max((corner.heat_W for corner in corners), default=math.nan),
+        "survives": size.survives,
+        "reason": size.reason,
+    }
+    return {key: _rounded(value) for key, value in row.items()}
+
+
 def main() -> None:
     """Plan scenes, or search them for long, and write their numbers."""
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("--out", type=Path, default=Path("results/planner"), metavar="FOLDER")
-    parser.add_argument("--study", choices=("scenes", "reference", "gains", "posture"), default="scenes")
+    parser.add_argument("--study", choices=("scenes", "reference", "gains", "posture", "phases"), default="scenes")
     parser.add_argument("--effort", type=int, default=100, metavar="N", help="multiple of the usual rounds")
     parser.add_argument("--scenes", type=int, nargs=2, default=(1, 20), metavar=("FIRST", "LAST"))
     chosen = parser.parse_args()
@@ -299,7 +342,7 @@ def main() -> None:
     if chosen.study == "scenes":
         # Compilation and loading do not count as time of a scene.
         planned(first, 1)
-    for seed in range(first, last + 1) if chosen.study != "posture" else ():
+    for seed in range(first, last + 1) if chosen.study not in ("posture", "phases") else ():
         if chosen.study == "gains":
             rows += stiffness(scene_scenario(seed), (), along_of(seed))
         elif chosen.study == "reference":
@@ -314,6 +357,10 @@ def main() -> None:
         rows += [row for friction in (0.1, 0.0) for row in stiffness(published(friction), range(1, 5))]
     if chosen.study == "posture":
         rows = [posture_heat(friction) for friction in (0.0, 0.1)]
+    if chosen.study == "phases":
+        for name in PATHS:
+            rows.append(changing(name, cores()))
+            print(json.dumps(rows[-1]), flush=True)
     chosen.out.mkdir(parents=True, exist_ok=True)
     write_json(chosen.out / f"{chosen.study}.json", rows)
 

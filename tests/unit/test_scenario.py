@@ -9,10 +9,10 @@ import pytest
 from support.messages import raises
 
 import dynsim
+from dynsim.config.problems import OptionKey
 from dynsim.engine import check
 from dynsim.errors import DynsimError, ModelError, ScenarioError, UnreachableReference
 from dynsim.scenario import (
-    SetOptions,
     build,
     build_model,
     find_scenario,
@@ -251,7 +251,7 @@ def test_errors_of_contacts_name_key_and_line(tmp_path: Path, change: tuple[str,
 
 def test_errors_of_overridden_contacts_say_so(tmp_path: Path):
     path = write(tmp_path, CONTACT + "variants: {one: {}}\n")
-    overrides = SetOptions({"contacts.points.tip.surface": "flor"})
+    overrides = {OptionKey("contacts.points.tip.surface"): "flor"}
     with raises(ModelError, f"{path} (one): --set: contacts.points.tip.surface = 'flor'"):
         check(load_scenario(path, overrides=overrides))
 
@@ -422,7 +422,7 @@ def test_parse_override():
 )
 def test_every_override_is_one_clear_error(text: str, names: tuple):
     with raises(ScenarioError, *names) as caught:
-        load_scenario("elbow_comparison", overrides=SetOptions([parse_override(text)]))
+        load_scenario("elbow_comparison", overrides=dict([parse_override(text)]))
     assert str(caught.value).isprintable()
     assert len(str(caught.value)) < 1000
 
@@ -461,7 +461,7 @@ def test_overrides_are_called_as_they_were_given():
     with raises(ScenarioError, re.compile(r"^overrides duration_s\.x: ")):
         load_scenario("single_pendulum", overrides={"duration_s.x": 1})
     with raises(ScenarioError, re.compile(r"^--set: duration_s = -1: ")):
-        load_scenario("single_pendulum", overrides=SetOptions({"duration_s": -1}))
+        load_scenario("single_pendulum", overrides={OptionKey("duration_s"): -1})
 
 
 def test_a_list_is_no_scenario(tmp_path: Path):

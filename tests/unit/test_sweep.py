@@ -32,6 +32,7 @@ from support.sweep_work import DEADLY, REFUSED, attentive, deaf, leaves, once_de
 import dynsim
 from dynsim.cli import sweep as sweep_command
 from dynsim.cli.sweep import drawn_table
+from dynsim.config.problems import OptionKey
 from dynsim.draw.figures import style
 from dynsim.draw.figures import sweep as pictures
 from dynsim.draw.figures.look import Look
@@ -39,7 +40,7 @@ from dynsim.errors import DynsimError, ScenarioError
 from dynsim.record import Record
 from dynsim.record.quantities import ENERGY, Quantity
 from dynsim.record.sensitivity import sensitivities, spread
-from dynsim.scenario import SetOptions, read_scenario
+from dynsim.scenario import read_scenario
 from dynsim.studies import batch
 from dynsim.studies import sweep as module
 from dynsim.studies.processes import WorkerInterrupted, WorkerLost, run_in_processes
@@ -149,7 +150,7 @@ def test_a_key_that_replaces_another_is_refused(
     axes = tuple(Axis(key, (0.1, 0.2)) for key in grid)
     laws = tuple(Law(key, "normal", (0.1, 0.01)) for key in drawn)
     with raises(ScenarioError, replacing, replaced) as refused:
-        Plan(CHAIN, (None,), SetOptions(fixed), axes, laws)
+        Plan(CHAIN, (None,), {OptionKey(key): value for key, value in fixed.items()}, axes, laws)
     message = str(refused.value)
     assert message.startswith(f"{replacing}: ")
     # What the other leaves of the entries that * stands for is said.
@@ -161,7 +162,7 @@ def test_a_part_of_what_was_given_may_be_varied():
         Axis("plant.link", ({"length_m": 0.1}, {"length_m": 0.2})),
         Law("plant.link.mass_kg", "normal", (1.0, 0.1)),
     )
-    assert Plan(CHAIN, (None,), SetOptions({"plant": {}}), (whole,), (law,)).runs == 2
+    assert Plan(CHAIN, (None,), {OptionKey("plant"): {}}, (whole,), (law,)).runs == 2
     # The base of a sweep from Python.
     assert Plan(CHAIN, (None,), {FIFTH: 0.1}, (Axis(FIFTH, (0.1, 0.2)),)).runs == 2
 

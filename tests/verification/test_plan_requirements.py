@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -11,15 +12,16 @@ from studies.planner_scenes import scene
 from support.messages import mentions, raises
 
 import dynsim
+from dynsim.cli.plan import _ended
 from dynsim.errors import ModelError, ScenarioError
-from dynsim.planner import planned_scenario, vary
-from dynsim.planner.answer import BracePlan, Searched, answered, plan_with, searched
+from dynsim.planner import answer, planned_scenario, vary
+from dynsim.planner.answer import BracePlan, Searched, answered, plan_with, searched, silent
 from dynsim.planner.dense import Dense
 from dynsim.planner.problem import BraceSchedule, Options, Task, task
 from dynsim.planner.requirements import displaced
 from dynsim.planner.search import Planned
 from dynsim.planner.vary import vary_plans
-from dynsim.planner.verify import Tolerances
+from dynsim.planner.verify import Tolerances, Verification
 from dynsim.scenario import build, read_scenario, to_yaml
 from dynsim.scenario.reading import scenario_from_resolved
 from dynsim.studies.sweep_plan import Axis, Plan
@@ -269,6 +271,13 @@ def test_an_unmet_requirement_rejects_the_plan(requirements: dict[str, Any], nam
     (size,) = unbraced(**requirements).sizes
     assert size.survives is False
     assert mentions(size.reason, name)
+    assert not all(requirement.met for requirement in size.requirements)
+    # Each violation is stated once: by its run, or by the requirement.
+    stated = [reason.partition(": ")[2] or reason for reason in size.verdict.reasons]  # type: ignore[union-attr]
+    assert len(stated) == len(set(stated))
+    runs = [corner for corner in size.verdict.corners if corner.reason]  # type: ignore[union-attr]
+    assert len(stated) == len(runs) + sum(bool(requirement.reason) for requirement in size.requirements)
+    assert bool(runs) != any(requirement.reason for requirement in size.requirements)
 
 
 def test_requirements_without_runs_are_checked_without_verification() -> None:
@@ -351,6 +360,7 @@ def varied(tmp_path, *axes: Axis) -> Plan:  # type: ignore[no-untyped-def]
     return Plan(read_scenario(path), (None,), {}, axes)
 
 
+UNVERIFIED = Verification(verify=False)
 # A single search for each value.
 OPTIONS = Options(("link_6",), count=(0, 1), starts=2, budget_s=0.0)
 
@@ -358,10 +368,10 @@ OPTIONS = Options(("link_6",), count=(0, 1), starts=2, budget_s=0.0)
 def test_each_value_has_a_plan_at_most_as_costly_as_alone(tmp_path) -> None:  # type: ignore[no-untyped-def]
     """The heat changes little between values that differ little, since neighbours continue each other's postures."""
     runs = varied(tmp_path, Axis("surfaces.floor.point_m.2", (-0.02, -0.01, 0.0), "--vary"))
-    variation = vary_plans(runs, OPTIONS, Tolerances(), verify=False)
+    variation = vary_plans(runs, OPTIONS, UNVERIFIED)
     heats = []
     for point, plan in zip(variation.points, variation.plans, strict=True):
-        alone = plan_with(runs.scenario(point), OPTIONS, Tolerances(), verify=False)
+        alone = plan_with(runs.scenario(point), OPTIONS, UNVERIFIED)
         assert isinstance(plan, BracePlan)
         assert plan.size(1).heat <= alone.size(1).heat
         heats.append(plan.size(1).heat)
@@ -373,35 +383,86 @@ def test_each_value_has_a_plan_at_most_as_costly_as_alone(tmp_path) -> None:  # 
 def test_a_plan_is_continued_from_a_neighbour(tmp_path) -> None:  # type: ignore[no-untyped-def]
     """A search that found nothing continues the plan for a floor 5 mm lower, with at most 10 % more heat."""
     runs = varied(tmp_path, Axis("surfaces.floor.point_m.2", (-0.005, 0.0)))
-    first, second = (searched(runs.scenario(point), OPTIONS, lambda text, share: None) for point in runs.points())
+    first, second = (searched(runs.scenario(point), OPTIONS, silent) for point in runs.points())
     own = second.ranked[1][0].heat
     second.ranked[1].clear()
     second.add(first)
     (plan,) = second.ranked[1]
     assert isinstance(plan, Planned)
     assert plan.heat < 1.1 * own
-    size = answered(second, Tolerances(), False, False, 1, lambda text, share: None).size(1)
+    size = answered(second, UNVERIFIED, silent).size(1)
     assert size.planned is plan
 
 
 def test_a_value_without_a_plan_has_a_reason(tmp_path) -> None:  # type: ignore[no-untyped-def]
     runs = varied(tmp_path, Axis("plant.base.position_m.2", (9.0, scene(11)["plant"]["base"]["position_m"][2])))
-    variation = vary_plans(runs, OPTIONS, Tolerances(), verify=False)
+    variation = vary_plans(runs, OPTIONS, UNVERIFIED)
     assert mentions(variation.table[0]["reason"], "path")
     assert variation.json["best"] == dict(variation.points[1].values)
 
 
-def test_values_before_an_interrupt_are_kept(tmp_path, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+def friction(tmp_path) -> Plan:  # type: ignore[no-untyped-def]
+    return varied(tmp_path, Axis("contacts.friction", (0.1, 0.2, 0.3)))
+
+
+@pytest.mark.parametrize("complete", [True, False])
+def test_values_before_an_interrupt_are_kept(tmp_path, monkeypatch, complete: bool) -> None:  # type: ignore[no-untyped-def]
+    """The second search is interrupted, after its first paths or before. No plan is verified then."""
+    known: list[Searched] = []
+
     def interrupted(*arguments: Any) -> Searched:
-        known = searched(*arguments)
-        known.search.tally.ended = "interrupted"
-        return known
+        if known and not complete:
+            raise KeyboardInterrupt
+        known.append(searched(*arguments))
+        if len(known) == 2:
+            known[1].search.tally.ended = "interrupted"
+        return known[-1]
 
     monkeypatch.setattr(vary, "searched", interrupted)
-    runs = varied(tmp_path, Axis("contacts.friction", (0.1, 0.2)))
-    variation = vary_plans(runs, OPTIONS, Tolerances(), verify=False)
+    variation = vary_plans(friction(tmp_path), OPTIONS, Verification())
+    assert variation.interrupted
+    assert variation.json["interrupted"]
     assert isinstance(variation.plans[0], BracePlan)
-    assert mentions(variation.table[1]["reason"], "interrupted")
+    assert variation.plans[0].size(1).survives is None
+    assert isinstance(variation.plans[1], BracePlan) == complete
+    assert all(mentions(row["reason"], "interrupted") for row in variation.table[1 + complete :])
+    assert mentions(_ended(variation.plans[0], variation), "interrupted", "0 of 3")
+
+
+def test_values_verified_before_an_interrupt_stay_verified(tmp_path, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    verified = answer.Verifier.verify
+
+    def verify(self: answer.Verifier, *arguments: Any) -> Any:
+        if self.task.friction == 0.2:
+            raise KeyboardInterrupt
+        return verified(self, *arguments)
+
+    monkeypatch.setattr(answer.Verifier, "verify", verify)
+    variation = vary_plans(friction(tmp_path), OPTIONS, Verification(Tolerances(friction=(1.0,), shift_m=(0.0,))))
+    best = [plan.best for plan in variation.plans if isinstance(plan, BracePlan)]
+    assert [size.survives for size in best if size is not None] == [True, None, None]
+    assert mentions(_ended(variation.chosen[1], variation), "interrupted", "1 of 3")
+
+
+def test_budget_that_ends_at_some_values_is_reported_whichever_is_the_best(tmp_path, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    """Each value may use an equal part of the time that is left."""
+    budgets: list[float] = []
+
+    def ended(scenario: Any, options: Options, tell: Any) -> Searched:
+        budgets.append(options.budget_s)
+        known = searched(scenario, replace(options, budget_s=0.0), tell)
+        known.search.tally.ended = "budget" if len(budgets) == 2 else "agreed"
+        return known
+
+    monkeypatch.setattr(vary, "searched", ended)
+    variation = vary_plans(friction(tmp_path), replace(OPTIONS, budget_s=900.0), UNVERIFIED)
+    first, second, third = budgets
+    # A search takes far less than its part of 300 s, which remains for the following values.
+    assert 290.0 < first < 300.0 < second < third
+    for plan in variation.plans:
+        assert isinstance(plan, BracePlan)
+        assert mentions(_ended(plan, variation), "budget", "1 of 3")
+    assert [point["ended"] for point in variation.json["points"]] == ["agreed", "budget", "agreed"]
 
 
 def test_invalid_variations_are_refused(tmp_path) -> None:  # type: ignore[no-untyped-def]
@@ -412,7 +473,7 @@ def test_invalid_variations_are_refused(tmp_path) -> None:  # type: ignore[no-un
         (varied(tmp_path, Axis("contacts.friction", (-1.0, 0.1), "--vary")), ("contacts.friction", "-1.0")),
     ):
         with raises(ScenarioError, *names):
-            vary_plans(runs, OPTIONS, Tolerances(), verify=False)
+            vary_plans(runs, OPTIONS, UNVERIFIED)
     with raises(ScenarioError, "--vary contacts.friction=0:1:x", "0:1:5"):
         Axis.parse("contacts.friction=0:1:x", "--vary", 5)
     assert Axis.parse("contacts.friction=0:1", "--vary", 5).values == (0.0, 0.25, 0.5, 0.75, 1.0)

@@ -21,6 +21,7 @@ from dynsim.compile.references.splines import clamped_cubic, quintic_rates
 from dynsim.errors import ModelError, ScenarioError
 from dynsim.jit.kernel import integers, reals
 from dynsim.model.surfaces import Box, HeightField, Quadric, shape_arrays
+from dynsim.planner import search as searching
 from dynsim.planner.answer import BracePlan, Size
 from dynsim.planner.arm import Problem, solve, workspace
 from dynsim.planner.compiled.tables import Arm, Course, Points
@@ -351,6 +352,37 @@ def test_search_ends_at_its_budget_or_an_interrupt_with_the_best_plan_so_far() -
     kept = second.run()
     assert second.tally.ended == "interrupted"
     assert [plan.heat for plan in kept[1]] == [plan.heat for plan in planned[1]]
+
+
+def test_agreement_in_the_last_search_within_the_budget_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The budget ends during the second search, after fewer local problems than usual."""
+    search = Search(task(scene_scenario(11), Options(("link_6",), count=(0, 1), starts=2, budget_s=60.0)))
+    monkeypatch.setattr(Search, "_late", property(lambda self: len(self.tally.heats.get(1, ())) > 1))
+    monkeypatch.setattr(searching, "EFFORT", 10**9)
+    monkeypatch.setattr(Tally, "agreed", lambda self, size: len(self.heats.get(size, ())))
+    search.run()
+    assert (len(search.tally.heats[1]), search.tally.ended) == (2, "agreed")
+
+
+@pytest.mark.parametrize("stage", ["_refined", "_changing", "_keep"])
+def test_an_interrupt_after_the_search_keeps_its_plans(monkeypatch: pytest.MonkeyPatch, stage: str) -> None:
+    """Refinement continues; braces that change are searched no further, but schedules so far are kept."""
+    made = task(scene_scenario(11), Options(count=(0, 1), starts=1, budget_s=0.0, phases=(1, 2)))
+    calls, own = list[int](), getattr(Search, stage)
+
+    def interrupted(self: Search, *arguments: Any) -> Any:
+        calls.append(1)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return own(self, *arguments)
+
+    monkeypatch.setattr(Search, stage, interrupted)
+    search = Search(made)
+    planned = search.run()
+    assert len(calls) >= 2
+    assert search.tally.ended == "interrupted"
+    assert planned[0]
+    assert planned[1]
 
 
 def test_the_hand_keeps_the_orientation_that_its_path_asks_for() -> None:

@@ -74,10 +74,10 @@ def draw(rng: Random, records: Path) -> Draft:
 
 def losses(overrides: list[str]) -> list[str]:
     """Return values of the file and the overrides that the scenario lacks."""
-    from dynsim.scenario import SetOptions, load_scenario, parse_override, variant_names
+    from dynsim.scenario import load_scenario, parse_override, variant_names
 
     name = next(iter(variant_names("scenario.yaml")), None)
-    scenario = load_scenario("scenario.yaml", name, SetOptions(parse_override(text) for text in overrides))
+    scenario = load_scenario("scenario.yaml", name, dict(map(parse_override, overrides)))
     tree = yaml_tree(Path("scenario.yaml").read_text(encoding="utf-8"))
     tree = merged(tree, (tree.get("variants") or {}).get(name) or {})
     for text in overrides:
