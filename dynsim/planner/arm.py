@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, get_type_hints
@@ -300,10 +301,15 @@ def workspace(n: int, points: Points, course: Course) -> Work:
     return Work(**arrays)
 
 
-def solve(problem: Problem, start: Array, turns: int = 40, tolerance: float = 1e-4) -> Local | None:
-    """Minimise the cost from start postures, (K, n); return None if they cannot be projected onto path and surfaces."""
+def solve(
+    problem: Problem, start: Array, turns: int = 40, tolerance: float = 1e-4, most: float = math.inf
+) -> Local | None:
+    """Minimise the cost from start postures, (K, n); return None if they cannot be projected onto path and surfaces.
+
+    The iteration ends early if the cost is unlikely to fall below ``most`` [W].
+    """
     Q, F = reals(start), np.zeros((len(problem.course.knot), len(problem.points.friction)))
     tables = problem.arm, problem.points, problem.course, problem.work
     problem.freeze_inertia(Q)
-    cost, heat, steps = local.solve(*tables, Q, F, problem.min_force, problem.peak, turns, tolerance)
+    cost, heat, steps = local.solve(*tables, Q, F, problem.min_force, problem.peak, turns, tolerance, most)
     return None if np.isnan(cost) else Local(Q, F, heat, cost, steps)

@@ -50,16 +50,19 @@ NEIGHBOURS = 5
 PROMISING = 1.25
 # Number of sets of each size whose postures are kicked, number of kicks in a row without success after which a set is
 # left, and range of their standard deviation [rad or m].
-KICKED, KICKS, KICK = 2, 12, (0.1, 1.2)
+KICKED, KICKS, KICK = 2, 16, (0.1, 1.2)
 # Relative difference below which two costs of a set belong to the same path; maximum ratio of a path's cost to the
 # least cost up to which the path is refined further; maximum number of refined paths per set.
 SAME_COST, NEAR, ALTERNATIVES = 1e-3, 1.1, 6
-# Relative difference of the heats at the knots below which two searches agree, number of searches that must agree, and
-# minimum number of local problems. In small problems, two searches may agree on a frequent local optimum.
+# Relative difference of the heats along dense references below which two searches agree, number of searches that must
+# agree, and minimum number of local problems. In small problems, two searches may agree on a frequent local optimum.
 AGREE, TWICE, EFFORT = 0.02, 2, 2000
 # Number of knots of closed paths and of other whole paths. For sets that may be the best, their number is doubled until
 # it exceeds the third number, or the dense references cost less than the last factor times the cost at the knots.
 CLOSED_KNOTS, PATH_KNOTS, MOST_KNOTS, CONVERGED = 24, 17, 100, 1.01
+# Ratio of the heats along the dense references and at the knots above which fewer knots are tried, and number of sets
+# of each size whose dense references are computed to compare searches.
+BRANCHES, COMPARED = 1.1, 2
 
 # Changing braces: number of segments of the path; number of sets per segment in schedules of two and of more phases;
 # number of schedules that are optimised; shortest phase [s], for two hand-overs.
@@ -118,7 +121,7 @@ class Tally:
     reached, missed : set
         Sets for which a posture was found, and sets for which none was found.
     heats : dict
-        Best heat of each search along the path, at the knots [W], by number of braces; inf if no path was found.
+        Best heat of each search along its dense references [W], by number of braces; inf if no path was found.
     ended : str
         Reason why no more searches started: ``agreed``, ``budget`` or ``interrupted``.
     refused : dict
@@ -149,6 +152,10 @@ class Search:
         self.single_heats: dict[BraceSet, float] = {}
         # Mean over instants of the least instant heat over all whole paths [W], by number of braces.
         self.bounds: dict[int, float] = {}
+        # Whole paths of each set in the present search, by their cost with smooth friction [W].
+        self._smooth: dict[BraceSet, dict[float, Local]] = {}
+        # Refined paths, or reasons why they are infeasible, by set and cost [W] of the path.
+        self._refinements: dict[tuple[BraceSet | BraceSchedule, float], Planned | str] = {}
         self._rng = np.random.default_rng(task.options.seed)
         self._began, self._budget = time.monotonic(), max(task.options.budget_s, 1e-9)
         self.coarse = 4 if task.kind == "closed" else 3
@@ -156,11 +163,12 @@ class Search:
 
     def solve(
         self, braces: BraceSet | BraceSchedule, start: Array, count: int, turns: int = 40,
-        slip_scale: float = COARSE_SLIP_SCALE, target: Array | None = None,
+        slip_scale: float = COARSE_SLIP_SCALE, target: Array | None = None, most: float = math.inf,
     ) -> Local | None:  # fmt: skip
         """Find the local optimum, starting from postures at other knots or from one posture."""
         self.tally.solves += 1
-        return solve(self.task.problem(braces, count, slip_scale, target), self.spread(start, count), turns)
+        problem = self.task.problem(braces, count, slip_scale, target)
+        return solve(problem, self.spread(start, count), turns, most=most)
 
     def spread(self, start: Array, count: int) -> Array:
         """Interpolate postures, shape (n,) or (K, n), linearly at ``count`` knots."""
@@ -264,9 +272,12 @@ class Search:
 
     def _merge(self, searched: Mapping[BraceSet, list[PosturePath]], paths: dict[BraceSet, list[PosturePath]]) -> None:
         """Add the paths of a search to the paths of all searches, and note its best heats."""
-        for size in range(self.task.options.count[1] + 1):
-            heats = [local.heat for local, _ in self._best(searched, size)]
-            self.tally.heats.setdefault(size, []).append(min(heats, default=math.inf))
+        heats = {
+            size: min(map(self._dense_heat, self._best(searched, size)[:COMPARED]), default=math.inf)
+            for size in range(self.task.options.count[1] + 1)
+        }
+        for size, heat in heats.items():
+            self.tally.heats.setdefault(size, []).append(heat)
         for braces, some in searched.items():
             known = paths.setdefault(braces, [])
             known += [path for path in some if not any(_same(path.coarse, other.coarse) for other in known)]
@@ -274,6 +285,7 @@ class Search:
     def _search(self, paths: dict[BraceSet, list[PosturePath]], number: int, most: int) -> None:
         """Run one search, which starts anew from random postures; add the paths of its sets."""
         rounds = self.task.options.starts
+        self._smooth.clear()
         for k in range(number * rounds, (number + 1) * rounds):
             if number and self._late:
                 return
@@ -452,13 +464,19 @@ class Search:
     def _whole(self, braces: BraceSet, Q: Array, most: float = math.inf) -> Local | None:
         """Solve a whole path from postures at few knots, first with smooth friction, which has fewer local optima.
 
-        Returns None if there is no path, or if its cost with smooth friction exceeds ``most`` [W].
+        Returns None if there is no path, or if its cost with smooth friction exceeds ``most`` [W]. Nearly equal costs
+        with smooth friction belong to the same path, which is solved once.
         """
-        half = (self.path + 1) // 2
-        local = self.solve(braces, Q, half, 30) or self._walked(braces, Q, half)
+        half, known = (self.path + 1) // 2, self._smooth.setdefault(braces, {})
+        local = self.solve(braces, Q, half, 30, most=most) or (None if known else self._walked(braces, Q, half))
         if local is None or local.cost > most:
             return None
-        return self.solve(braces, local.Q, self.path, 30, FINE_SLIP_SCALE) or local
+        for cost, path in known.items():
+            if _same(cost, local.cost):
+                return path
+        path = self.solve(braces, local.Q, self.path, 30, FINE_SLIP_SCALE) or local
+        known[local.cost] = path
+        return path
 
     def _refined(self, paths: Mapping[BraceSet | BraceSchedule, list[PosturePath]]) -> list[Planned]:
         """Refine the best paths of the best sets with more knots; return them sorted by heat along dense references."""
@@ -467,20 +485,15 @@ class Search:
         planned = []
         for braces in sorted(reached, key=lambda braces: reached[braces][0].cost)[: self.kept]:
             good, near = list[Planned](), math.inf
-            for local in reached[braces][: 2 * ALTERNATIVES]:
-                if len(good) == ALTERNATIVES or local.cost > near:
+            for local in reached[braces][:ALTERNATIVES]:
+                if local.cost > near:
                     break
-                plan = self._finer(braces, local, self.path)
-                if isinstance(plan, str) or not plan.converged:
-                    # Fewer knots are better if the postures of neighbouring knots are on different branches.
-                    fewer = self._finer(braces, local, (self.path + 1) // 2)
-                    if not isinstance(fewer, str) and (isinstance(plan, str) or fewer.heat < plan.heat):
-                        plan = fewer
+                plan = self._dense(braces, local)
                 if isinstance(plan, str):
                     self.tally.refused.setdefault(braces, plan)
                 else:
                     good.append(plan)
-                    near = min(near, NEAR * plan.heat)
+                    near = min(near, plan.heat)
             if good:
                 planned.append(min(good, key=_heat))
                 self.tally.refused.pop(braces, None)
@@ -493,6 +506,28 @@ class Search:
             finest.append(self.finest(plan) if plan.local.heat < least else plan)
             least = min(least, finest[-1].heat)
         return sorted(finest, key=_heat)
+
+    def _dense(self, braces: BraceSet | BraceSchedule, local: Local) -> Planned | str:
+        """Solve a whole path with twice the knots and its dense references, once; return the reason if this fails."""
+        if (braces, local.cost) not in self._refinements:
+            knots, plan = self.path, self._finer(braces, local, self._doubled(self.path))
+            while (isinstance(plan, str) or plan.heat > BRANCHES * local.cost) and knots > self.path // 4:
+                # Fewer knots are better if the postures of neighbouring knots are on different branches.
+                fewer = self._finer(braces, local, knots)
+                if not isinstance(fewer, str) and (isinstance(plan, str) or fewer.heat < plan.heat):
+                    plan = fewer
+                knots = (knots + 1) // 2
+            self._refinements[braces, local.cost] = plan
+        return self._refinements[braces, local.cost]
+
+    def _dense_heat(self, path: tuple[Local, BraceSet]) -> float:
+        """Return the heat of a path along its dense references [W]; inf if they are infeasible."""
+        plan = self._dense(path[1], path[0])
+        return math.inf if isinstance(plan, str) else plan.heat
+
+    def _doubled(self, knots: int) -> int:
+        """Return twice the number of knots of a path, without the end of a path that is not closed."""
+        return 2 * knots - (self.task.kind != "closed")
 
     def _finer(self, braces: BraceSet | BraceSchedule, coarse: Local, count: int) -> Planned | str:
         """Solve a path with more knots and its dense references; if they are infeasible, return the reason as text."""
@@ -510,7 +545,7 @@ class Search:
         """Double the number of knots, until the dense references cost the same as the knots."""
         best = plan
         while not best.finest and not plan.converged and len(plan.times) < MOST_KNOTS:
-            finer = self._finer(plan.dense.schedule, plan.local, 2 * len(plan.times) - (self.task.kind != "closed"))
+            finer = self._finer(plan.dense.schedule, plan.local, self._doubled(len(plan.times)))
             if isinstance(finer, str):
                 break
             plan = finer

@@ -14,6 +14,8 @@ from dynsim.planner.compiled.tables import Arm, Course, Points, Work
 
 # Initial damping of the steps and its bounds, relative to the cost.
 DAMPING, DAMPING_MIN, DAMPING_MAX = 1e-3, 1e-7, 1e6
+# Number of further decreases of the cost, each like the last one, that may still bring it below its limit.
+HOPE = 10
 # Kinds of step constraints.
 CLEAR, LOWER, UPPER, FORCE = 0, 1, 2, 3
 
@@ -130,10 +132,11 @@ def step(arm: Arm, points: Points, course: Course, work: Work, Q, F, min_force, 
 
 
 @kernel
-def solve(arm: Arm, points: Points, course: Course, work: Work, Q, F, min_force, peak, turns, tolerance):
+def solve(arm: Arm, points: Points, course: Course, work: Work, Q, F, min_force, peak, turns, tolerance, most):
     """Minimise the cost over postures Q, shape (K, n), and forces F, shape (E, c), in place, from a nearby start.
 
-    Returns cost [W], heat [W] and number of steps; NaN if the start cannot be projected onto path and surfaces.
+    The iteration ends early if the cost is unlikely to fall below ``most`` [W]. Returns cost [W], heat [W] and number
+    of steps; NaN if the start cannot be projected onto path and surfaces.
     """
     if project(arm, points, course, work, Q, 60, ON) > 2.0 * ON:
         return math.nan, math.nan, 0
@@ -176,7 +179,7 @@ def solve(arm: Arm, points: Points, course: Course, work: Work, Q, F, min_force,
         elif ratio < 0.25:
             damping *= 3.0
         quiet = quiet + 1 if before - cost < tolerance * max(cost, 1e-3) else 0
-        if quiet >= 2:
+        if quiet >= 2 or cost - HOPE * (before - cost) > most:
             break
     statics(arm, points, course, work, Q, F, min_force, False)
     return cost, heat, taken
