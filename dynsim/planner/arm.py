@@ -215,7 +215,8 @@ def axis_lines(arm: MovingArm, q: Array) -> Array:
 # Local solver: it finds postures along the path and brace forces of least heat for one set of braces.
 
 
-# Maximum number of constraints in one step.
+# Maximum number of constraints in one step. A few early steps (2 to 10 % where there are boxes) would need more, and
+# ignore the others; the projection that follows meets them, or the step is rejected.
 WORKING_SETS = 160
 
 
