@@ -44,15 +44,17 @@ from dynsim.system.files import write_json
 OTHER_SEED = 1000
 # Gains k_p of ``--study gains`` [V/rad].
 GAINS = (500.0, 200.0, 100.0, 50.0, 20.0)
-# Number of seeds of ``--study phases``, and paths of the hand from a point to another and back [m], with the surfaces
-# next to the floor: those of the scenario tall_path, or a table whose edge is at 1.1 m.
+# Number of seeds of ``--study phases``; ends of the path of the hand there and back [m], and overrides of the scenario
+# tall_path: the scenario itself, an arm on a base of 0.3 m next to a table that ends at 0.8 m, and a flat floor.
 SEEDS = 5
-TABLE = {"type": "box", "center_m": [0.7, 0.0, 0.15], "edges_m": [0.8, 2.0, 0.3], "edge_radius_m": 0.02}
+TABLE = {"type": "box", "center_m": [0.5, 0.0, 0.1], "edges_m": [0.6, 2.0, 0.2], "edge_radius_m": 0.02}
 PATHS: dict[str, tuple[tuple[Any, Any] | None, dict[str, Any]]] = {
     "rises from 0.16 to 1.1 m (`tall_path`)": (None, {}),
-    "1 m, from above a table to beyond its edge": (([0.8, 0.0, 0.6], [1.8, 0.0, 0.6]), {"table": TABLE}),
+    "1 m, from above a table to beyond its edge": (
+        ([0.75, 0.0, 0.5], [1.75, 0.0, 0.35]), {"plant.base.position_m": [0.0, 0.0, 0.3], "surfaces.table": TABLE},
+    ),
     "0.8 to 1.8 m over a flat floor": (([0.8, 0.0, 0.35], [1.8, 0.0, 0.35]), {}),
-}
+}  # fmt: skip
 KINDS = ("floor", "pipe", "box", "third_axis")
 PERIOD_S = 10.0
 LIMIT_DEG = [-120.0, 120.0]
@@ -297,8 +299,8 @@ def posture_heat(friction: float, instants: int = 200) -> dict[str, Any]:
 
 def changing(name: str, jobs: int) -> dict[str, Any]:
     """Return the heat of two fixed braces, of two that change once, and of its runs, for one of ``PATHS``."""
-    ends, surfaces = PATHS[name]
-    overrides: dict[str, Any] = {f"surfaces.{key}": surface for key, surface in surfaces.items()}
+    ends, changes = PATHS[name]
+    overrides = dict(changes)
     if ends is not None:
         points = [ends[0], ends[1], ends[0]]
         overrides["controller.hand.path"] = {"type": "waypoints", "times_s": [0, 10, 20], "points_m": points}
@@ -315,7 +317,7 @@ def changing(name: str, jobs: int) -> dict[str, Any]:
     corners = () if size.verdict is None else size.verdict.corners
     row = {
         "path": name,
-        "fixed_W": fixed.size(2).heat,
+        "fixed_W": min(size.heat for size in fixed.sizes),
         "changing_W": heats[0],
         "seeds_W": heats,
         "chosen": size.label,
