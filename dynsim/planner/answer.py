@@ -156,7 +156,7 @@ class BracePlan:
     >>> scenario = dynsim.load_scenario("pressing")
     >>> plan = dynsim.plan_braces(scenario, candidates=["link_6"], count=(0, 1), budget_s=0.0, verify=False)
     >>> plan
-    <BracePlan pressing (plain): 2 sizes, best: link_6 on floor, 19.87 W>
+    <BracePlan pressing (plain): 2 sizes, best: link_6 on floor, 19.82 W>
     >>> [(count, round(heat)) for count, heat in plan.pareto]
     [(0, 473), (1, 20)]
     """
@@ -296,7 +296,7 @@ class BracePlan:
         >>> plan = dynsim.plan_braces(scenario, candidates=["link_6"], count=(1, 1), budget_s=0.0, verify=False)
         >>> record = plan.record(1)
         >>> record["q"].shape, round(record.summary["joule_heat_J"])
-        ((2001, 10), 199)
+        ((2001, 10), 198)
         """
         return simulate(self.scenario(count))
 
@@ -519,7 +519,7 @@ def plan_braces(
     >>> scenario = dynsim.load_scenario("pressing")
     >>> plan = dynsim.plan_braces(scenario, candidates=["link_6"], count=(0, 1), budget_s=0.0, verify=False)
     >>> plan.best.label, round(plan.best.heat, 1)
-    ('link_6 on floor', 19.9)
+    ('link_6 on floor', 19.8)
     """
     require_scenario(scenario)
     options = Options(
