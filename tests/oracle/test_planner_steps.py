@@ -109,7 +109,7 @@ def collected(scenario: Scenario, options: Options, monkeypatch: pytest.MonkeyPa
     results = list[bool]()
     calls = iter(range(10**9))
 
-    def watched(problem: Problem, start: np.ndarray, turns: int = 40, *more: Any) -> Local | None:
+    def watched(problem: Problem, start: np.ndarray, turns: int = 40, **more: Any) -> Local | None:
         changing = len(start) > 1 and not problem.course.guided.all()
         if len(start) > 1 and changing == (options.phases[1] > 1) and (k := next(calls)) % EVERY == 0:
             before = solve(problem, start, TURNS[k // EVERY % len(TURNS)])
@@ -117,7 +117,7 @@ def collected(scenario: Scenario, options: Options, monkeypatch: pytest.MonkeyPa
                 results.append(compared(problem, before.Q.copy(), DAMPING[k // EVERY % len(DAMPING)]))
             if len(results) == COUNT:
                 raise Enough
-        return solve(problem, start, turns, *more)
+        return solve(problem, start, turns, **more)
 
     monkeypatch.setattr(searching, "solve", watched)
     with suppress(Enough):
