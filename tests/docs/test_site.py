@@ -8,6 +8,7 @@ import os
 import re
 import subprocess
 import sys
+from fcntl import LOCK_EX, flock
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlsplit
@@ -39,14 +40,18 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The site as the command builds it, with stills, figures and notebooks; a warning is an error."""
     folder = tmp_path_factory.mktemp("site")
     gallery = [sys.executable, "docs/site/gallery.py", "single_pendulum"]
-    subprocess.run(gallery, cwd=ROOT, check=True, timeout=1800, capture_output=True)
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "-f", "docs/site/mkdocs.yml"]
     package = str(Path(dynsim.__file__).parents[1])
     environment = {**os.environ, "NO_MKDOCS_2_WARNING": "1", "PYTHONPATH": package}
-    done = subprocess.run(
-        [*command, "-d", str(folder)],
-        cwd=ROOT, capture_output=True, text=True, timeout=1800, check=False, env=environment,
-    )  # fmt: skip
+    (ROOT / "build").mkdir(exist_ok=True)
+    # Workers of pytest build sites after one another: each draws the figures that are missing, into the same folder.
+    with (ROOT / "build" / "site.lock").open("w") as lock:
+        flock(lock, LOCK_EX)
+        subprocess.run(gallery, cwd=ROOT, check=True, timeout=1800, capture_output=True)
+        done = subprocess.run(
+            [*command, "-d", str(folder)],
+            cwd=ROOT, capture_output=True, text=True, timeout=1800, check=False, env=environment,
+        )  # fmt: skip
     assert done.returncode == 0, done.stderr
     return folder
 
